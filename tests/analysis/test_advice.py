@@ -101,7 +101,7 @@ def test_numbers_of_advice_are_those_of_an_error_in_closed_form(span: float) -> 
 
 
 class TestAchievedErrors:
-    @pytest.mark.tiers(0, 2)
+    @pytest.mark.rotated
     @pytest.mark.sampled(4)
     @pytest.mark.parametrize(
         ("method", "span", "tolerance"),
@@ -126,7 +126,7 @@ class TestAchievedErrors:
         error = achieved(system, advice, q, p, kepler_end(0.2, span), 1.0)
         assert_achieved(advice, error, tolerance)
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_advice_backward_with_parameters_and_time(self):
         system, span = problem("duffing").system, -40.0
         values = {"gamma": 0.3, "omega": 1.2}
@@ -177,7 +177,7 @@ class TestDegree:
         ]
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 class TestHonesty:
     def test_a_step_for_newton_alone_is_not_advised(self):
         """For a chain of springs, steps beyond the fixed-point limit meet the tolerance at ten times the cost."""
@@ -187,7 +187,7 @@ class TestHonesty:
         advice = advise(chosen.system, SVI(8), chosen.q, p, 200.0, 1e-6)
         iterated.integrate(chosen.q, p, h=advice.h, steps=advice.steps, save_every=advice.steps)
 
-    @pytest.mark.tiers(0, 2)
+    @pytest.mark.tiers(0, 1)
     @pytest.mark.parametrize("span", [100.0, 2000.0, 50_000.0])
     def test_tolerance_below_rounding_is_reported(self, span: float):
         system, (q, p) = problem("kepler").system, kepler_start(0.2)
@@ -278,7 +278,7 @@ class TestEnsembles:
         q, p = map(np.array, zip(*map(kepler_start, self.ECCENTRICITIES), strict=True))
         return advise(problem("kepler").system, SVI(6), q, p, 100.0, 1e-8)
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_step_is_that_of_the_worst_trajectory(self):
         """The errors of all trajectories, against the exact solution, are within the tolerance."""
         advice, system = self.advised(), problem("kepler").system

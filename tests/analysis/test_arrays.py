@@ -162,7 +162,7 @@ def test_planted_faults_are_detected(fault: str, monkeypatch: pytest.MonkeyPatch
     assert found.violated, found.to_text()
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_model_file_is_verified_and_run(tmp_path: Path) -> None:
     """Beside it lies the certificate; the exit status is 0. Plain sums differ by their rounding errors."""
     path = tmp_path / "oscillators.toml"

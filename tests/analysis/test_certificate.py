@@ -180,7 +180,6 @@ def test_inputs_are_certified_at_small_values(method) -> None:
     assert len(certificate.checks) > 15
 
 
-@pytest.mark.second
 def test_constraints_are_certified_with_constant_inputs() -> None:
     """Cubics of time would push with 5000 after 50 units of it, and steps fail."""
     pushed = sc.LagrangianSystem.from_text(

@@ -12,7 +12,7 @@ import scvi_codegen as sc
 from scvi_codegen.analysis.chaos.indicators import SERIES, InitialTangents
 from scvi_codegen.codegen.variants import TangentVectors
 
-pytestmark = pytest.mark.second
+pytestmark = pytest.mark.rotated
 
 REGULAR, CHAOTIC = ((0.0, 0.0), (0.5, 0.0)), ((0.0, -0.25), (0.42, 0.0))
 """Of Henon and Heiles near the energy 1/8: Skokos, Bountis & Antonopoulos, Physica D 231 (2007) 30, section 3."""
@@ -196,7 +196,6 @@ FORCED = sc.LagrangianSystem.from_text(
 OPEN = hamilton("open", "x y", "a**2/2 + b**2/3 + x**2*y + x**4 + y**2", momenta="a b")
 
 
-@pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("system", "method", "options"),

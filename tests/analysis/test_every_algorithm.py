@@ -198,14 +198,14 @@ def headers_of(name: str) -> Iterator[str]:
         yield from (header.removeprefix("support/") for header in used)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_every_stepping_algorithm_is_verified() -> None:
     """Those that one of the systems of this file includes; the list of others cannot grow unnoticed."""
     covered = {header for name in SYSTEMS for header in headers_of(name)}
     assert HEADERS - covered == set(OTHERS)
 
 
-@pytest.mark.tiers(0, 3)
+@pytest.mark.rotated
 @pytest.mark.sampled(8)
 @pytest.mark.parametrize("name", CERTIFIED)
 def test_certificates_are_satisfied(name: str) -> None:

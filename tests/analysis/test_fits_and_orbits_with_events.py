@@ -37,7 +37,6 @@ def multipliers_of_flights(orbit, amplitude):
     return len(speeds), matrix
 
 
-@pytest.mark.second
 def test_ball_on_a_vibrating_table_has_orbits_of_period_one_and_two(table):
     """Period one against its closed formula, tr M = (1 + e)^2 (1 - A sin phase) - 2 e; period two by its flights."""
     phase, speed = start_of_period_one(0.8)

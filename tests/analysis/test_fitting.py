@@ -65,7 +65,7 @@ def test_noise_free_data_give_the_true_values():
     assert np.abs(found.residuals).max() < 1e-9
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_estimates_and_errors_agree_with_curve_fit():
     """curve_fit integrates with DOP853 and uses finite differences."""
     measured = recorded(1)[0]
@@ -82,7 +82,7 @@ def test_estimates_and_errors_agree_with_curve_fit():
     assert "alpha = " in str(found)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_standard_errors_agree_with_the_covariance():
     """The sum of squares of 5 errors, in their own deviations, over 20 series of noise: chi squared, 100 +- 14."""
     true, total = np.array([*(TRUE[name] for name in SOME), 0.8, 0.1]), 0.0
@@ -132,7 +132,7 @@ def test_fit_with_known_start_and_tabulated_inputs(pushed, segments):
     assert_allclose(found.values, [1.5, 2.0], rtol=1e-8 if segments == 1 else 1e-7)
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -259,7 +259,7 @@ def test_chaotic_record_is_fitted_in_segments():
 BOUNDS = [{"delta": (0.25, 0.5)}, {"delta": (0.0, 1.0)}, {"alpha": (-0.95, 0.0), "x": (0.6, 0.75)}]
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("bounds", BOUNDS)
 def test_segments_with_bounds_agree_with_single_shooting(bounds):
     one = sc.fit(oscillator(), TIMES, recorded(3)[0], bounds=bounds, unknown=SOME, **GUESS)
@@ -310,7 +310,7 @@ def kepler():
     return sc.compile_stepper(system, sc.SVI(8), flags=QUICK_FLAGS)
 
 
-@pytest.mark.tiers(0, 2)
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("length", "time", "segments"), [(1.0, 1.0, 1), (1e6, 1e-6, 1), (1e-6, 1e6, 3), (1e6, 1e6, 1), (1e-6, 1e-6, 3)]

@@ -200,7 +200,7 @@ def driven():
     return compiled(["x"], "x_dot**2/2 - x**2/2 + u*x", inputs=["u"])
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_paths_between_attitudes_are_their_runs():
     """A rigid body, and one coupled with a position; with a given duration, and with a given energy."""
     for position, coupling in (([], "1"), (["x"], "x")):
@@ -253,7 +253,7 @@ def test_closed_paths_of_constraints_rotations_inputs_and_arrays():
     assert np.abs(rest.q["u"]).max() < 1e-6  # the minimum
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_constrained_index_is_that_of_the_angle():
     """A rod without gravity, motion in the plane of a half turn and more: conjugate after half a turn on the sphere."""
     rod = compiled(["x", "y", "z"], "(x_dot**2 + y_dot**2 + z_dot**2)/2", constraints=["x**2 + y**2 + z**2 - 1"])
@@ -355,7 +355,7 @@ def choreography(n, curve, steps, method):
     return stepper, path, float(stepper.energy(path.q[0], path.p[0]))
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_figure_eight_has_its_published_energy_and_multipliers():
     stepper, path, energy = choreography(3, lambda a: [1.1 * np.sin(a), 0.4 * np.sin(2 * a)], 16, "svi:6")
     published = float(

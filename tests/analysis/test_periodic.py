@@ -90,7 +90,7 @@ BUTTERFLY = [-1.0, 0.0, 1.0, 0.0, 0.0, 0.0], (0.3068934205, 0.1255065670), 6.234
 Lett. 110 (2013) 114301."""
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_an_accurate_guess_stays_accurate():
     """The butterfly, whose published digits close to 1e-10; 4000 equal steps move its period by 3e-5."""
     names = ["x1", "y1", "x2", "y2", "x3", "y3"]
@@ -129,7 +129,7 @@ def _monodromy(orbit):
     return np.array(columns).T
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("error", [0.01, -0.01, 0.02, -0.02, 0.05, -0.05])
 def test_unstable_orbit_is_found_from_an_inaccurate_velocity(restricted, error):
@@ -275,7 +275,7 @@ def test_orbits_are_found_from_a_guess_that_is_15_percent_off(planar, speed, dur
         assert orbit.period == pytest.approx(2.780186915, abs=1e-8)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_nonautonomous_orbits_have_a_period_of_the_system():
     """A forced oscillator closes after any time from some state, and goes elsewhere the next time round."""
     system = lagrange(

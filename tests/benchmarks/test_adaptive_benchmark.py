@@ -15,7 +15,7 @@ from scvi_codegen.common.errors import StateError
 needs_extended = pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="long double is no wider than double")
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(1)
 @needs_extended
 @pytest.mark.parametrize("e", [0.0, 0.9, 0.999])

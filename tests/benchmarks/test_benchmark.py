@@ -52,7 +52,7 @@ MOVED = (
 
 
 class TestCases:
-    @pytest.mark.tiers(2, 4)
+    @pytest.mark.tiers(2, 2)
     @pytest.mark.sampled(4)
     @pytest.mark.parametrize("name", MOVED)
     def test_hand_solved_accelerations_are_those_of_the_equations_of_motion(self, name):
@@ -72,7 +72,7 @@ class TestCases:
         assert mp.norm(masses * mp.matrix(accelerations) + others - forces) < 1e-12 * (1 + mp.norm(forces))
         assert any(force != 0 for force in system.forces) == name.startswith("forced")
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_published_end_of_the_suite_of_heyoka_is_reached(self):
         """Sun, Jupiter and Saturn after 100,000 years: positions of published quadruple precision, within 4e-9."""
         chosen = suite_case("heyoka:three-bodies")
@@ -162,7 +162,7 @@ class TestReference:
         exact = [2 * np.cos(t) - np.cos(2 * t), 2 * np.sin(2 * t) - 2 * np.sin(t)]
         assert np.abs(end[0] - exact).max() < 4e-18
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_reference_is_stored_and_reloaded(self, monkeypatch):
         chosen = short("planar-pendulum", 5.0)
         first = reference(chosen)
@@ -307,7 +307,7 @@ class TestCommand:
 
 
 class TestTables:
-    @pytest.mark.tiers(0, 3)
+    @pytest.mark.rotated
     @pytest.mark.parametrize(
         "section", ["scaling", "threads", "by-hand", "transforms", "newton", "derivatives", "builds"]
     )

@@ -14,7 +14,7 @@ from scvi_codegen.runs.compiler import compile_stepper
 pytestmark = pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="long double is no wider than double")
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize("name", ROTATIONS)
 def test_the_compiled_lagrangian_obeys_the_equations_derived_by_hand(name):
     chosen = replace(ROTATIONS[name](), span=5.0)

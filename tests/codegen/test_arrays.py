@@ -72,7 +72,7 @@ def test_generated_code_is_strict_c(name: str, method: str, tmp_path: Path) -> N
     check_arrays(rendered(name, method), tmp_path)
 
 
-@pytest.mark.tiers(0, 2)
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", ["bodies", "all forms", "lattices", "hamiltonian", "damped"])
 def test_newton_iteration_is_strict_c(name: str, tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ def test_newton_iteration_is_strict_c(name: str, tmp_path: Path) -> None:
     check_arrays(rendered(name, "svi:4", newton=True), tmp_path)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_single_file_with_a_list_of_neighbours_is_strict_c(tmp_path: Path) -> None:
     """Names of its functions differ from the fields of the lists, which its header declares."""
     liquid = either_system(

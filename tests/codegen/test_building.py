@@ -255,7 +255,7 @@ def of_another_system(_data: bytes) -> bytes:
 LOADING = "import test_building; print(test_building.answer())"
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("changed", [of_another_processor, of_another_system])
 @pytest.mark.skipif(sys.platform == "darwin", reason="the header is that of ELF files")
 def test_foreign_library_with_matching_manifest_is_rebuilt(changed, cache):

@@ -93,7 +93,6 @@ def share_of(method: str, share: int) -> list[Source]:
     return [source for source, _ in generated(method).values()][share::SHARES]
 
 
-@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(6)
 @pytest.mark.covering
 @pytest.mark.parametrize("share", range(SHARES))
@@ -107,7 +106,7 @@ def test_code_compiles_without_warnings(method, share, tmp_path):
             check_symbols(Path(file).stem, tmp_path)
 
 
-@pytest.mark.tiers(0, 2)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(6)
 @pytest.mark.covering
 @pytest.mark.parametrize("share", range(SHARES))
@@ -148,7 +147,7 @@ def check_symbols(prefix: str, folder: Path) -> None:
     assert line.split()[1:3] == ["0", "0"]  # data, bss
 
 
-@pytest.mark.tiers(0, 2)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("method", METHODS)
 def test_code_allocates_nothing_writes_nothing_and_has_no_static_state(method):
     for source, _ in generated(method).values():
@@ -273,7 +272,6 @@ def named_system(names: Sequence[str], name: str = "oscillators") -> sc.Lagrangi
     return sc.LagrangianSystem.from_text(name=name, coordinates=coordinates, lagrangian=lagrangian, parameters=values)
 
 
-@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("method", TESTED, ids=lambda method: method.name)
 def test_reserved_names_of_c_are_valid_coordinates(method, tmp_path):
     hostile = accepted(C_NAMES)
@@ -311,7 +309,7 @@ def test_title_cannot_end_its_comment(title, tmp_path):
     run([needs("gcc"), *STRICT, "-c", file], tmp_path)
 
 
-@pytest.mark.tiers(0, 3)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("prefix", ["fabs", "errno", "NULL", "main", "newton", "step", "int", "m", "b"])
 def test_reserved_prefixes_of_c_are_valid(prefix, tmp_path):

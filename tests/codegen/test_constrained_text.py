@@ -59,7 +59,7 @@ def test_constrained_code_compiles_without_warnings(compiler, tmp_path):
         check_strict(source, tmp_path, compiler=compiler)
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("s", [1, 2, 3])
 def test_steps_are_those_of_the_equations_in_60_digits(s):
     stepper = sc.compile_stepper(LINKAGE, lobatto(s))

@@ -392,7 +392,7 @@ def test_bodies_of_known_number_are_measured_one_by_one():
     assert not any(array.is_field for array in system.arrays)
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("name", ["kepler", "heavy top"])
 def test_tolerance_of_adaptive_steps_ends_the_iteration_early(name):
     """Half of the iterations, and momentum maps to their error, or to round-off with a criterion of one's own."""

@@ -74,7 +74,7 @@ def close(found, expected) -> bool:
     return bool(np.max(np.abs(np.concatenate(found) - np.concatenate(expected))) < ROUNDING)
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("system", [tangle(), pumped_cart_pole(), rotating()], ids=lambda system: system.name)
 def test_velocities_are_updated_by_the_full_mass_matrix_to_first_order(system):
     stepper, (force, momentum, mass) = iterated(system), functions(system)
@@ -91,7 +91,7 @@ def test_velocities_are_updated_by_the_full_mass_matrix_to_first_order(system):
         assert close(stepper.step(q0, p0, H, T, options=ONE_ITERATION), expected)
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(
     "system", [problem("charged-particle").system, leaning(), relativistic()], ids=lambda system: system.name
 )

@@ -40,7 +40,7 @@ def stepper(name: str, solver: str) -> Stepper:
     return compile_stepper(case(name).system, case(name).method(), solver=solver, flags=QUICK_FLAGS)
 
 
-@pytest.mark.tiers(0, 3)
+@pytest.mark.rotated
 @pytest.mark.sampled(5)
 @pytest.mark.parametrize(("name", "solver"), EXPECTED)
 def test_iteration_counts_are_those_recorded(name, solver):
@@ -52,7 +52,7 @@ def test_iteration_counts_are_those_recorded(name, solver):
     assert counts == pytest.approx([*expected.values()], rel=ROUNDING, abs=2)
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("name", ["kepler/svi-3", "cart/svi", "field/gauss"])
 def test_lanes_use_as_many_iterations_as_single_runs(name):
     """Lanes start from equal states; predictors from one and two steps are equally good in a block."""
@@ -77,7 +77,7 @@ def test_first_step_takes_few_trials(p, span):
     assert run.iterations <= 17
 
 
-@pytest.mark.tiers(3)
+@pytest.mark.tiers(3, 4)
 @pytest.mark.parametrize("name", CONTINUED)
 def test_predictor_from_two_steps_is_better_than_from_one(name):
     """Compare the residual of one iteration after the first and after the third step, which use different tables."""
@@ -104,7 +104,7 @@ def test_newton_factors_are_reused_in_the_next_short_step():
     assert run._memory.guess == 2
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("name", "expected"), [("double/svi", (78, 177)), ("tangle/scvi", (37, 95))])
 def test_adaptive_steps_use_the_predictor_of_the_preceding_step(name, expected):
     """Compare Newton steps and iteration counts with steps of equal size."""
@@ -113,7 +113,7 @@ def test_adaptive_steps_use_the_predictor_of_the_preceding_step(name, expected):
     assert (len(run.t), int(run.iterations.sum())) == pytest.approx(expected, rel=ROUNDING, abs=2)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_reused_factors_need_two_updates_at_convergence():
     """Factors of another point must reduce an update once before a small update indicates convergence."""
     own = problem("fput-chain").system

@@ -164,7 +164,7 @@ def test_integer_powers_are_products_and_others_are_calls():
     assert kernel_of(x**y).operation_counts() == {"pow": 1}
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_a_chain_of_256_masses_lowers_without_recursion():
     system = fput_chain(256)
     state = (*system.coordinates, *system.velocities)
@@ -220,7 +220,7 @@ def compiled_values(expressions: Sequence[Expression], tmp_path: Any) -> np.ndar
     return values
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_printed_c_evaluates_to_the_expression(tmp_path):
     expressions = level(level(LEAVES))
     sources = {"u": np.float64(POINT[0]), "w": np.float64(POINT[1])}

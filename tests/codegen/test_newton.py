@@ -51,7 +51,7 @@ def test_the_order_of_the_coordinates_does_not_matter(seed):
     np.testing.assert_allclose(found.energy(), expected.energy(), rtol=1e-14)
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize("method", [sc.SVI(2), sc.SCVI(2), sc.SpectralCollocation(2)], ids=lambda method: method.name)
 def test_rows_are_pivoted_within_the_band(method):
     """Masses x_dot y_dot have no diagonal: every diagonal pivot is zero. In u = x + y, w = x - y they have."""
@@ -90,11 +90,11 @@ def test_constant_masses_need_no_matrix():
 class TestReusedFactors:
     """Runs of a chain with enough unknowns that factors go from step to step."""
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_runs_reuse_enough_factors(self, method):
         assert chain(method).interface.unknowns >= LEAST_REUSED_UNKNOWNS
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_run_with_time_dependent_springs_split_anywhere_is_bitwise_equal(self, method):
         """Factors are made again where and when they were made: with all that their matrix depends on."""
         q, p = state()

@@ -68,7 +68,7 @@ def test_split_kernels_give_bitwise_equal_trajectories(name, solver, cut_after, 
         np.testing.assert_array_equal(many.q, many_cut.q)
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("method", "solver"), [("svi:3", "newton"), ("svi:3", "fixed-point"), ("stoermer-verlet", "fixed-point")]

@@ -44,7 +44,7 @@ def oscillators(kind, degree):
     return system, [mass] * len(names)
 
 
-@pytest.mark.tiers(0, 2)
+@pytest.mark.rotated
 @pytest.mark.covering
 @pytest.mark.parametrize("degree", [3, 9], ids=["one vector of points", "several"])
 @pytest.mark.parametrize("kind", ENERGIES)
@@ -78,7 +78,7 @@ def test_curves_of_rejected_steps_are_interpolated(kind):
             assert predicted == pytest.approx(sum(float(a) * x for a, x in zip(into, shorter, strict=False)), abs=1e-14)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_rejected_steps_cost_few_iterations():
     system = lagrange("kepler", "x y", "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)")
     run = sc.compile_stepper(system, "svi:8").integrate([1.5, 0.0], [0.0, 3**-0.5], t_end=2000.0, tolerance=1e-5)

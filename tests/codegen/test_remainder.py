@@ -47,7 +47,7 @@ def slope(system: LagrangianSystem, method: str, q: list[float], angle: float) -
     return float(abs(per_step / energy[0]) * 2**53)
 
 
-@pytest.mark.tiers(1, 4)
+@pytest.mark.tiers(1, 1)
 @pytest.mark.sampled(4)
 @pytest.mark.parametrize(("method", "angle"), WORST)
 def test_the_energy_of_an_oscillator_does_not_drift(method, angle):
@@ -56,7 +56,7 @@ def test_the_energy_of_an_oscillator_does_not_drift(method, angle):
 
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize(("method", "angle"), [("svi:4", 0.6), ("svi:8", 2.5)])
-@pytest.mark.second
+@pytest.mark.rotated
 def test_the_energy_of_a_lattice_does_not_drift(method, angle):
     assert slope(RING, method, [*np.sin(np.pi * 14 / 16 * (np.arange(16) + 0.5))], angle) <= LARGEST_SLOPE
 

@@ -70,7 +70,7 @@ CASES = [
 ]
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize(("make", "method"), CASES)
 @pytest.mark.usefixtures("few")
@@ -92,7 +92,7 @@ def test_steps_energies_and_ensembles_equal_those_of_unrolled_terms(make, method
     assert np.abs(many.q - others.q).max() < 1e-13 * np.abs(q).max()
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.usefixtures("few")
 def test_symmetries_equal_those_of_unrolled_terms(monkeypatch):
     rolled = symmetries(bodies("rolled", 14))
@@ -102,7 +102,7 @@ def test_symmetries_equal_those_of_unrolled_terms(monkeypatch):
     assert len(rolled) == 9
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.usefixtures("few")
 def test_the_number_of_operations_in_the_text_does_not_grow_with_the_number_of_terms():
     sizes = []

@@ -65,7 +65,7 @@ VARYING, CONSTANT = "(1 + y1**2)", "2"
 """Masses of rods."""
 
 
-@pytest.mark.tiers(1)
+@pytest.mark.tiers(1, 2)
 @pytest.mark.parametrize(
     ("method", "mass", "precision"),
     [

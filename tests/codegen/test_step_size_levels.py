@@ -49,7 +49,7 @@ def test_predictor_without_step_size_change_is_that_of_fixed_steps(system, degre
         assert np.allclose(found, expected, rtol=0.0, atol=1e-13 * np.abs(expected).max())
 
 
-@pytest.mark.tiers(2)
+@pytest.mark.tiers(2, 3)
 @pytest.mark.parametrize(
     ("method", "lanes"),
     [(sc.SVI(6), 8), (sc.SpectralCollocation(6), 8), (sc.SVI(18), 24), (sc.SpectralCollocation(18), 32)],

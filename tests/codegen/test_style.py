@@ -16,7 +16,7 @@ FOLDER = Path(__file__).parents[2] / "generated"
 SUPPORT = sorted((template_folder() / "support").glob("*/*.h"))
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_support_headers_and_generated_files_have_the_project_style(tmp_path):
     """As ``check_style``, in one process for all of them."""
     texts = [support_text(str(path.relative_to(template_folder()))) for path in SUPPORT]

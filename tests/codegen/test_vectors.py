@@ -48,7 +48,6 @@ int check(const double *x)
 """
 
 
-@pytest.mark.second
 def test_sums_of_eight_vectors_have_the_bits_of_single_ones(tmp_path):
     compiler = needs("cc")
     system = sc.LagrangianSystem.from_text(name="power", coordinates=["q"], lagrangian="q_dot**2/2 - q**4")
@@ -60,7 +59,6 @@ def test_sums_of_eight_vectors_have_the_bits_of_single_ones(tmp_path):
     assert ctypes.CDLL(str(tmp_path / "check.so")).check(x.ctypes.data_as(ctypes.c_void_p)) == 0
 
 
-@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize("flags", ["-march=native -O2", "-O2"])

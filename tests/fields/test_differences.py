@@ -78,7 +78,7 @@ def test_fields_have_order_m_plus_one_and_energy_does_not_drift(order, ends, mod
     assert errors[1] < {2: 3e-4, 4: 5e-5, 6: 8e-6, 8: 1e-6}[order]
 
 
-@pytest.mark.tiers(3)
+@pytest.mark.tiers(3, 3)
 @pytest.mark.parametrize("order", [2, 4, 6, 8])
 def test_frequencies_have_the_full_order(order):
     """Lowest but three of a string with one natural end, from a generalised eigenvalue problem."""

@@ -50,7 +50,7 @@ def _entry(energies, i, j):
     return energies[i, i] if i == j else (energies[i, j] - energies[i, i] - energies[j, j]) / 2
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize(("density", "function"), [MASS, STIFFNESS], ids=["mass", "stiffness"])
 def test_errors_fall_exponentially_where_a_coefficient_jumps_between_elements(density, function):
     exact = roots(function, 2)
@@ -59,7 +59,7 @@ def test_errors_fall_exponentially_where_a_coefficient_jumps_between_elements(de
         assert np.abs(found / exact - 1).max() < error
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_errors_fall_exponentially_where_the_stiffness_of_a_beam_jumps():
     """A beam on two supports, of which one half is four times as stiff: roots of its determinant."""
 

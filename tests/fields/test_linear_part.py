@@ -107,7 +107,7 @@ def pairs_on(name, hamiltonian, method=None, end=2.5, **options):
     return field.discretise(method or default, **(options or further))
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.covering
 @pytest.mark.parametrize("name", HAMILTONIANS)
 def test_one_correction_solves_linear_hamiltonians(name):

@@ -33,7 +33,7 @@ def change(mesh, state, *, to, by="svi:4", h=0.01, steps=100):
     return [float(np.abs(run.q[name][-1] - to * values).max()) for name, values in state.items()]
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("mode", [0, 1, 2])
 def test_string_with_a_mass_at_its_end_has_the_frequencies_of_the_transcendental_equation(mode):
     """m w = cot w for a string of length, density and tension 1."""
@@ -120,7 +120,7 @@ def test_highest_frequency_contains_points():
     assert mesh.highest_frequency(k=0.0) < 60
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_plane_with_a_mass_conserves_energy_and_is_derived():
     plane = sc.FieldSystem.from_text(
         "membrane",

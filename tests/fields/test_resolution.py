@@ -54,7 +54,7 @@ def test_recorded_pieces_and_ensembles_warn_of_unresolved_fields():
         stepper.integrate_ensemble({"u": members}, velocity={"u": 0 * members}, h=0.01, steps=4)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_recordings_contain_their_mesh(tmp_path):
     """A driven end, elements of several sizes, a parameter, a momentum and its weights: all from the folder."""
     field = sc.FieldSystem.from_text(

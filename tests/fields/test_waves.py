@@ -264,7 +264,7 @@ def test_differences_have_their_order(order):
     assert np.log2(one / two) == pytest.approx(order, abs=0.35)
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("method", "order"), [("svi:1", 2), ("svi:2", 4)])
 def test_order_in_time_is_twice_the_number_of_points(method, order):
     ends = []

@@ -47,7 +47,7 @@ def sanitizers_exist(folder: Path) -> bool:
     return not subprocess.run([*SANITIZED, "empty.c", "-o", "empty"], cwd=folder, capture_output=True).returncode
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(5)
 @pytest.mark.parametrize(
     "name", [*FEW_UNKNOWNS, *(name if name in QUICK else pytest.param(name, marks=pytest.mark.full) for name in CELLS)]

@@ -220,7 +220,7 @@ def test_model_files_with_arrays_of_known_sizes(tmp_path: Path) -> None:
         sc.load_model(path)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_generated_example_frees_memory_and_rejects_indices_out_of_range(
     net: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -46,7 +46,7 @@ TESTED_ELSEWHERE = ("verify", "path", "doctor")
 
 class TestHelp:
     @pytest.mark.parametrize("long", ["read", pytest.param("run", marks=pytest.mark.full)])
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_every_example_of_the_help_is_accepted(self, long):
         """Commands with tests of their own, which take long, are only parsed; in the full tier all but pages run."""
         texts = [output_of("--help"), *(output_of(command, "--help") for command in ABOUT)]
@@ -248,7 +248,7 @@ class TestRun:
             assert saved["q"][-1] == pytest.approx(whole.q["q"][-1], abs=1e-15)
         assert model.integrate().t[-1] == 1.0
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_equal_steps_of_recorded_runs_and_programs_end_elsewhere_with_a_warning(self):
         for words in (("run", "kepler", "-o", "a.run"), ("generate", "kepler", "-o", "program")):
             found = invoke(*words, "--step", "0.3", "--span", "1")
@@ -386,7 +386,7 @@ def test_a_run_with_a_closed_stream_writes_its_file(stream, tmp_path):
     assert ("q1 =" in ended.stdout) == (stream == "2")
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_unwritable_package_is_a_failure(tmp_path, monkeypatch):
     """Exit status 1, as for every file that cannot be written."""
 

@@ -116,7 +116,7 @@ def kepler_page(method: Any) -> str:
 
 
 class TestPage:
-    @pytest.mark.tiers(2, 5)
+    @pytest.mark.tiers(2, 3)
     @pytest.mark.sampled(5)
     @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
     def test_every_method_has_a_well_formed_self_contained_page(self, method):
@@ -172,7 +172,7 @@ class TestPage:
         assert f"/* .. {count - MOST_LINES} more lines */" in page
 
 
-@pytest.mark.tiers(0, 3)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("size", "scheme"), VIEWS)
 def test_page_renders_in_a_browser(browser, tmp_path, size, scheme):
     with opened(browser, kepler_page(sc.SCVI(2)), tmp_path / "kepler.html", size, scheme) as view:

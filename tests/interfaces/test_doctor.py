@@ -55,7 +55,7 @@ def test_trial_stepper_is_compiled_in_a_temporary_folder(tmp_path, monkeypatch):
     assert not (tmp_path / "cache").exists()
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_missing_compiler_names_what_to_install(tmp_path, monkeypatch):
     no_compiler(monkeypatch, tmp_path)
     status, report = doctor()
@@ -98,7 +98,7 @@ def test_unused_cache_is_named(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("without_trial")
-@pytest.mark.second
+@pytest.mark.rotated
 def test_extras_are_listed_with_missing_packages(monkeypatch):
     extras = tomllib.loads(PROJECT.read_text())["project"]["optional-dependencies"]
     before = findings()

@@ -96,7 +96,7 @@ steps = 5
 """
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("text", [STRING, SCHROEDINGER, PLANE, OSCILLATOR])
 @pytest.mark.filterwarnings("ignore::scvi_codegen.AccuracyWarning")
@@ -150,7 +150,7 @@ def test_invalid_files_are_rejected_by_name(old, new, message):
         parse_model(STRING.replace(old, new, 1)).start()
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_commands_accept_a_density(here):
     """Equations first; the folder runs and keeps the density."""
     Path("nls.toml").write_text(SCHROEDINGER)

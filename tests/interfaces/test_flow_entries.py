@@ -57,7 +57,7 @@ def test_failed_steps_are_reported_with_their_number_and_time(part):
     assert report.t == pytest.approx(OVERFLOWS[0, 8] + failing * OVERFLOWS[0, 9])
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_second_derivatives_of_batches():
     same, changes = np.tile(weights(), (2, SIZE, 1, 1)), np.tile(np.eye(SIZE), (2, 1, 1))
     found, library = np.zeros((2, SIZE, SIZE)), flow().second_library
@@ -108,7 +108,7 @@ def test_external_functions_of_casadi_are_exported():
         assert_allclose(pulled, np.tensordot(weights(), partials(row), 2), rtol=1e-11, atol=1e-11)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_second_derivatives_and_absent_adjoint_variables_of_casadi():
     """CasADi passes NULL for adjoint variables that are zero and for results that it does not need."""
     source, name = (

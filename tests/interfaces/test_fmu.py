@@ -69,7 +69,7 @@ MODELS = {
 }
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", MODELS)
 def test_states_equal_those_of_the_stepper_bitwise(name, tmp_path):
@@ -88,7 +88,7 @@ def test_states_equal_those_of_the_stepper_bitwise(name, tmp_path):
     assert_allclose(np.array(found), expected, rtol=0, atol=0)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_a_slave_locates_kinks_as_runs_do(tmp_path):
     system = lagrange("floor", "y", "y_dot**2/2 - 9.8*y - 1e4*positive_part(-y)**2")
     model = sc.Model(system=system, method=sc.SVI(4), q=(1.0,), velocity=(0.0,), h=H, steps=30)

@@ -44,7 +44,7 @@ def test_every_command_is_tested():
     assert {words[0] for words in QUIET_COMMANDS} == set(main.list_commands(click.Context(main)))
 
 
-@pytest.mark.tiers(2, 6)
+@pytest.mark.tiers(2, 2)
 @pytest.mark.parametrize("words", QUIET_COMMANDS, ids=lambda words: " ".join(words[:2]).replace("/", " "))
 def test_quiet_prints_nothing_and_json_prints_one_document(words):
     if words[0] == "page":
@@ -86,7 +86,7 @@ def test_errors_are_entries_of_the_document(words, status, error):
     assert all(type(found[name]) is type(value) for name, value in error.items())
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_json_of_lists_and_model_files():
     listed = json_of("systems")["systems"]
     assert [entry["name"] for entry in listed] == list(sc.PROBLEMS)

@@ -56,7 +56,7 @@ def test_step_size_of_another_time_is_not_reused(model: sc.Model) -> None:
         dump_model(sc.Model(system=changed, method=sc.SVI(4), q=(1.0, 0.0), p=(0.0, 1.0), h=0.1, steps=3))
 
 
-@pytest.mark.tiers(3)
+@pytest.mark.tiers(3, 4)
 @pytest.mark.parametrize("run", [{"tolerance": 1e-8}, {"tolerance": 1e-8, "span": -5.0}, {"step": 0.1}])
 @pytest.mark.parametrize("system", [{}, {"time_transformation": "frequency"}], ids=["t", "tau"])
 def test_single_step_functions_use_the_first_step_of_the_run(run: dict[str, float], system: dict[str, str]) -> None:

@@ -297,7 +297,7 @@ def springs(here: Path) -> Kind:
     return kind
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_every_field_and_line_of_an_ensemble_is_correct(springs):
     Path("grid.toml").write_text("[grid]\nx = [0.5, 1.0, 1.5]\nk = [0.5, 2.0]\n")
     words = ("run", "model.toml", *flags(springs.run, {"m": M, "c": C}), "--ensemble", "grid.toml")

@@ -96,7 +96,7 @@ def test_page_of_model_files_has_the_table_of_options():
     assert f"\n\n{table}\n\n" in PAGE
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("key", ["solver_tolerance", "max_iterations"])
 def test_generated_programs_warn_of_options_that_they_do_not_use(key, tmp_path):
     from scvi_codegen import MethodWarning, generate_package

@@ -61,7 +61,7 @@ def test_a_single_file_computes_the_same_bits(tmp_path):
     assert sc.load_package(single).step([0.5], [0.0], 0.1) == sc.load_package(many).step([0.5], [0.0], 0.1)
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["planar-pendulum", "kepler", "spherical-pendulum"])
 def test_package_steps_as_the_compiled_system_without_sympy(name, tmp_path):
@@ -144,7 +144,7 @@ def test_every_kind_of_folder_is_built_without_a_warning(words, tmp_path):
     assert (result.returncode, result.stderr) == (0, "")
 
 
-@pytest.mark.tiers(0, 2)
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", ["main.c", "pendulum_svi.c", "__init__.py", "README.md", "interface.json"])
 def test_foreign_and_edited_files_require_force(pendulum, tmp_path, name):

@@ -91,7 +91,7 @@ def without_compiler(monkeypatch):
     monkeypatch.setattr(pages, "webassembly", lambda folder, sources: "")
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.usefixtures("without_compiler")
 def test_a_page_has_no_address_no_text_as_code_and_the_licences(tmp_path):
     page = sc.page(written(tmp_path), ranges={"k": (0.5, 2.0)})
@@ -117,7 +117,7 @@ def test_a_page_has_no_address_no_text_as_code_and_the_licences(tmp_path):
     assert (tmp_path / "page.html").read_text(encoding="utf-8").rstrip("\n") == text.rstrip("\n")
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.usefixtures("without_compiler")
 def test_momenta_become_velocities(tmp_path):
     text = OSCILLATOR.replace("q_dot = [0.0, 0.5]", "p = [0.0, 1.0]").replace("m = 1.0", "m = 2.0")
@@ -167,7 +167,7 @@ plots = [["x", "p_x"], ["t", "energy"]]
 """
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.usefixtures("without_compiler")
 def test_the_section_page_sets_sliders_speed_and_plots_and_arguments_replace_it(tmp_path):
     path = written(tmp_path, OSCILLATOR + PAGE)
@@ -207,7 +207,7 @@ def test_mistakes_in_the_section_page_are_errors(tmp_path, old, new, message):
         sc.load_model(written(tmp_path, OSCILLATOR + PAGE.replace(old, new, 1)))
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.usefixtures("without_compiler")
 def test_a_system_with_its_motion_has_a_page(tmp_path):
     model = sc.load_model(written(tmp_path))
@@ -234,7 +234,7 @@ def boxed():
     return sc.Model(system=gas, method="svi:2", q=q, velocity=velocity, h=0.1, steps=1)
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(
     ("model", "read", "expected"),
     [

@@ -69,7 +69,7 @@ def test_failed_picture_leaves_no_file(kepler, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_dollar_signs_in_names_are_escaped(tmp_path):
     model = sc.Model.from_problem(sc.problem("planar-pendulum"))
     system = replace(model.system, name="a $ b $ {")

@@ -35,7 +35,7 @@ def spring(here: Path) -> Path:
     return path
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_final_state_is_exact_to_thirty_digits(spring: Path) -> None:
     """The text, the document and the file agree with the solution q = cos(t)/2 + sin(t)/4."""
     shown = output_of("run", spring, "-o", "states.npz")
@@ -76,7 +76,7 @@ def test_other_options_and_commands_are_refused(spring: Path, words: list[str], 
     assert sorted(path.name for path in spring.parent.iterdir()) == ["spring.toml"]
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_precision_of_error(spring: Path) -> None:
     """With "auto" a bound that double does not confirm is that of a run in two words; others are in double."""
     text = TEXT.replace("step = 0.125\nsteps = 16\n", "error = 3e-15\nspan = 200.0\n")
@@ -102,7 +102,7 @@ def test_precision_of_error(spring: Path) -> None:
 EXACT = {"q": "[0.1]", "q_dot": '["1/3"]', "w": "0.3"}
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("words", [[], ["--q", "1/10", "--velocity", "1/3", "--parameter", "w=3/10"]])
 def test_decimals_and_fractions_are_exact(spring: Path, words: list[str]) -> None:
     """Numbers of a file and of flags are exact decimals and fractions; in double they are the nearest doubles."""

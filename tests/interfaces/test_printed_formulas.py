@@ -405,7 +405,7 @@ def compiled_step(name: str) -> tuple[Any, Any]:
         return stepper.step([float(x) for x in q], [float(x) for x in p], h, t, PARAMETERS)
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(6)
 @pytest.mark.parametrize("name", NAMES)
 def test_the_printed_stage_equations_are_those_of_the_step(name):
@@ -773,7 +773,7 @@ def derived(name: str) -> Any:
         return derive(case.system, method)
 
 
-@pytest.mark.tiers(1, 2)
+@pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize("name", NAMES)
 def test_text_is_the_same_equations(name):
     """Read by Python itself: residuals that vanish, ends, first guesses, numbers of tables."""

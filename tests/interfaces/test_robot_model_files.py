@@ -83,7 +83,7 @@ def test_mistakes_in_the_section_of_a_robot_are_named(text, message):
         parse_model(text, folder=ROBOTS)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_formulas_of_large_robots_and_ball_joints_are_not_written():
     """Packages and recordings are then without a model file."""
     for name, message in (("ball.xml", r"write \[system\] robot = FILE"), ("figure.xml", "keep the file from which")):

@@ -44,7 +44,7 @@ def integral(coefficients: list[Fraction], start: Fraction, end: Fraction) -> Fr
     return sum((c * (end ** (k + 1) - start ** (k + 1)) / (k + 1) for k, c in enumerate(coefficients)), Fraction(0))
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @settings(max_examples=60, deadline=None)
 @given(points=point_sets, at=st.lists(rationals, min_size=1, max_size=4), start=rationals, data=st.data())
 def test_tables_reproduce_polynomials_on_any_points(

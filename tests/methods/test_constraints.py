@@ -92,7 +92,7 @@ TIERS = {
 }
 
 
-@pytest.mark.tiers(0, 0)
+@pytest.mark.rotated
 @pytest.mark.parametrize("name", [pytest.param(name, marks=TIERS.get(name, ())) for name in WITHOUT_NEWTON])
 def test_multipliers_are_solved_without_newton_iteration(name):
     """Compare with the states of Newton's iteration, for weak and strong forces, also with adaptive steps."""
@@ -140,14 +140,8 @@ VARYING = {
 }
 
 
-@pytest.mark.tiers(1)
-@pytest.mark.parametrize(
-    ("kind", "s"),
-    [
-        ("angles", 4),
-        *(pytest.param(*each, marks=pytest.mark.second) for each in (("damped", 8), ("all", 2), ("all", 1))),
-    ],
-)
+@pytest.mark.tiers(1, 1)
+@pytest.mark.parametrize(("kind", "s"), [("angles", 4), ("damped", 8), ("all", 2), ("all", 1)])
 def test_masses_of_positions_and_damping_need_no_newton_iteration(kind, s):
     """Compare with the states of Newton's iteration, for weak and for strong damping, also with adaptive steps."""
     case = dict(VARYING[kind])
@@ -485,7 +479,7 @@ def test_projected_momenta_have_admissible_velocities_for_any_kinetic_energy():
         assert np.abs(stepper.constraint_values(q, p, 1.0)).max() < 2e-15
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_ball_joints_of_rotations_need_no_newton_iteration():
     """Compare a body that is hung at a point by constraints with the states of Newton's iteration."""
     body = sc.LagrangianSystem.from_text(

@@ -44,7 +44,7 @@ def reference():
     ).sol
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_a_closed_loop_starts_from_rest_at_zero_at_any_step(method, reference):
     stepper = sc.compile_stepper(linkage(a="1"), method)
@@ -79,7 +79,7 @@ def test_a_closed_loop_at_an_equilibrium_stays_there(method):
         assert run.fallback_steps == 0
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("pivot", [(0.0, 0.0), (0.0, 1.0), (0.0, 100.0), (0.0, -1e3)], ids=str)
 def test_a_pendulum_hangs_and_swings_from_any_pivot(pivot):
     """Initial states that are exact, or nearly so, are accepted as they are, wherever the origin is."""

@@ -24,7 +24,7 @@ def largest_difference(left, right):
     return max(abs(mp.convert(str(a)) - b) for a, b in zip(left, right, strict=True))
 
 
-@pytest.mark.tiers(3, 4)
+@pytest.mark.tiers(3, 3)
 @pytest.mark.parametrize(("digits", "h"), [(1, "0.5"), (15, "0.5"), (30, "0.5"), (50, "0.5"), (30, "20"), (30, "-2")])
 def test_harmonic_oscillator_has_the_requested_digits(digits, h):
     h, m, k, q0, q1 = mp.mpf(h), mp.mpf(2), mp.mpf(3), mp.mpf(1), mp.mpf("0.3")
@@ -41,7 +41,7 @@ def test_harmonic_oscillator_has_the_requested_digits(digits, h):
     assert found.error < mp.mpf(10) ** -digits
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_kepler_ellipse_agrees_with_keplers_equation():
     """q = (cos E - e, sqrt(1 - e^2) sin E) with E - e sin E = t, from perihelion."""
     e, h = mp.mpf("0.5"), mp.mpf("0.75")
@@ -100,7 +100,7 @@ def all_but(long):
     return [pytest.param(name, marks=[pytest.mark.full] if name == long else []) for name in CASES]
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", all_but("double-pendulum"))
 def test_momenta_and_energy_are_the_derivatives_of_the_action(name):
@@ -123,7 +123,7 @@ def test_momenta_and_energy_are_the_derivatives_of_the_action(name):
     assert abs(derivative - expected) < mp.mpf("1e-18")
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", all_but("pumped-cart-pole"))
 def test_flow_connects_its_end_points_and_is_reversible(name):

@@ -7,7 +7,7 @@ from notation import lagrange
 import scvi_codegen as sc
 
 MASSES = (1.0, 1e-2, 1e-4, 1e-5, 3e-7, 1e-9)
-DEGREES = ["svi:4", pytest.param("svi:8", marks=pytest.mark.second)]
+DEGREES = ["svi:4", pytest.param("svi:8", marks=pytest.mark.rotated(8))]
 START = 1.0
 POSITION = [np.sin(START) / 2, -np.cos(START) / 2, START, np.sin(START), -np.cos(START)]
 
@@ -102,7 +102,7 @@ def test_ensembles_with_masses_of_zero_agree_with_single_runs(massless):
         assert np.abs(ensemble.q[-1, k] - run.q[-1]).max() <= 4 * 2**-52
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_a_bob_on_two_massless_rods_falls_freely():
     """A joint without mass transmits no force; the steps are those of a joint of 1e-9 of the mass."""
     joints = lagrange(
@@ -127,7 +127,7 @@ def test_a_bob_on_two_massless_rods_falls_freely():
     assert -np.cos(moved["a"][-1]) == pytest.approx(run.q[-1, 1], abs=1e-14)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_a_massless_rod_in_two_words():
     precise = sc.compile_stepper(rod_and_bob().with_parameters(m=0.0), "svi:4", precision="double-double")
     run = precise.integrate(POSITION, [0.0] * 5, h=0.01, steps=5)
@@ -148,7 +148,7 @@ def test_masses_times_powers_of_two_give_equal_bits(pendulum, power):
         assert np.abs(runs[0].q - runs[1].q).max() <= 4 * 2**-52
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_a_light_pinned_slider_is_no_light_body():
     """Its coordinate y = 0 has no size, forces and reactions cancel there, but no other coordinate is lost by it."""
     slider = lagrange(

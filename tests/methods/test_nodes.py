@@ -18,7 +18,7 @@ DEGREES = [1, 2, 3, 4, 5, 8, 13, 30, 47]
 FIFTY_DIGITS = mp.mpf("1e-50")
 
 
-@pytest.mark.tiers(56)
+@pytest.mark.tiers(56, 57)
 @pytest.mark.parametrize("name", NODE_FAMILIES)
 @pytest.mark.parametrize("degree", DEGREES)
 def test_every_family_gives_ascending_points_under_its_name(name: str, degree: int) -> None:

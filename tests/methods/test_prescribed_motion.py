@@ -57,7 +57,7 @@ def test_multipliers_are_the_forces_of_inverse_dynamics(method, solver):
     assert_allclose(run.at(between)[0], inverse_dynamics(between)[0], rtol=0, atol=1e-13)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_adaptive_steps_and_ensembles():
     stepper = sc.compile_stepper(linkage(), "svi:4")
     start = stepper.project(NEAR)
@@ -114,7 +114,7 @@ def test_dead_points_are_named_with_the_rank(span):
         stepper.integrate([0.0, 2.5], velocity=[0.0, 1.0], t=2.3, h=0.01, steps=1)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_impacts_are_impossible():
     stepper = sc.compile_stepper(linkage(), "svi:1")
     with pytest.raises(sc.EventError, match=r"changes of the state by 'x1' .* constraints leave no motion away"):

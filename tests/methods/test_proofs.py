@@ -126,7 +126,7 @@ def test_work_of_scvi_has_order_s_plus_1_on_chebyshev_lobatto_nodes_and_more_on_
     assert integral((X - fmpq(1, 2)) * NODES["gauss"](s)) == 0
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_leading_error_of_the_work_of_scvi_is_that_of_the_integral() -> None:
     """For q'' = -q - q', force -q', it is -h^4 v'' v'/24: the integral of (x - 1/2)^2 (x - 1) is -1/24."""
     damped = sc.LagrangianSystem.from_text("damped", ["q"], "q_dot**2/2 - q**2/2", forces={"q": "-q_dot"})

@@ -32,7 +32,7 @@ def by_accelerations(t, state):
     return [vx, vy, w, *found[:3]]
 
 
-@pytest.mark.tiers(0, 2)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(("s", "steps"), [(1, 20), (2, 10), (3, 10), (4, 5)])
 def test_the_order_is_2s_and_the_step_is_symmetric(s, steps):
@@ -50,7 +50,7 @@ def test_the_order_is_2s_and_the_step_is_symmetric(s, steps):
         assert_allclose(free.q[-1], end.y[:3, -1], rtol=0, atol=1e-11)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_chaplygin_sleigh_agrees_with_its_closed_form():
     """Without springs: speed V tanh(k t), rate of turning W sech(k t), k = m d V / J; from a turn on the spot."""
     m, j, d, turning = 1.3, 0.7, 0.2, 0.9
@@ -86,7 +86,7 @@ def test_rolling_disk_moves_in_circles_and_conserves_free_momenta():
     assert_allclose(run.multipliers().T, centripetal, rtol=0, atol=1e-11)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_holonomic_and_moving_nonholonomic_constraints_combine():
     """A slope x = 4 z equals the system with z eliminated; and a moving constraint x_dot = cos(t)."""
     common = {"parameters": {"m": 1.0, "J": 0.3, "g": 9.81}, "name": "sleigh on a slope"}
@@ -135,7 +135,7 @@ def test_a_blade_of_prescribed_direction_does_no_work():
     assert np.abs(run.energy() - 0.5).max() < 1e-12 < 0.1 < np.ptp(run.velocity[:, 0])
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_nonholonomic_constraints_from_sympy_mechanics():
     x, y, a = dynamicsymbols("x y a")
     m, j, d, k = sympy.symbols("m J d k")

@@ -38,7 +38,7 @@ def leapfrog(sequence, t, h, q, p):
     return q, p + h / 2 * force(t + h, q)
 
 
-@pytest.mark.tiers(1)
+@pytest.mark.tiers(1, 2)
 @pytest.mark.parametrize("sequence", ["kick-drift-kick", DRIFTS_FIRST])
 @pytest.mark.parametrize("make", [StoermerVerlet, lambda sequence: Composition(2, sequence)], ids=["verlet", "of two"])
 def test_a_step_is_a_leapfrog_step(sequence, make):
@@ -52,7 +52,7 @@ def test_a_step_is_a_leapfrog_step(sequence, make):
     assert np.abs(run.p[-1] - p).max() < 1e-13
 
 
-@pytest.mark.tiers(1, 3)
+@pytest.mark.tiers(1, 1)
 @pytest.mark.sampled(4)
 @pytest.mark.parametrize("system", [RELATIVISTIC, DUFFING], ids=["hamiltonian", "lagrangian"])
 @pytest.mark.parametrize("sequence", ["kick-drift-kick", DRIFTS_FIRST])
@@ -65,7 +65,7 @@ def test_explicit_steps_solve_the_equations(system, sequence, make):
         assert np.abs(np.subtract(explicit.step(q, p, h, 0.4), newton.step(q, p, h, 0.4))).max() < 1e-14
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("order", [2, 8, 10])
 def test_sequences_have_their_orders(order):
     start, end = (np.array([0.7, -0.4]), np.array([1.2, 0.3])), 4.0

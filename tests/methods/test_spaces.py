@@ -77,7 +77,7 @@ def test_too_few_points_for_the_intervals_warn() -> None:
 # Exactness and order.
 
 
-@pytest.mark.tiers(0, 2)
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize("degree", [2, 3, 4, 5])
@@ -89,7 +89,7 @@ def test_trigonometric_curves_are_exact_on_the_oscillator(degree: int, turn: flo
     assert np.abs(run.q[:, 0] - 0.3 * np.cos(run.t) - 0.8 * np.sin(run.t)).max() < 5e-12
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_the_order_of_trigonometric_curves_whose_frequency_shrinks_with_the_step() -> None:
     system, start = problem("planar-pendulum").system, ([1.0], [0.3])
     fine = stepper(system, SVI(10)).integrate(*start, h=0.25, steps=16)
@@ -137,7 +137,7 @@ def test_symplecticity_momentum_and_reversibility(method: SVI, solver: str) -> N
     assert (np.abs(back - z).max() < 1e-14) == method.symmetric
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("method", [SVI(3, "hermite:3"), SVI(4, "hermite-2:3")], ids=lambda method: method.name)
 def test_discrete_lagrangian_includes_derivatives(method: SVI) -> None:
     """L_d generates the step, p0 = -D1 L_d and p1 = D2 L_d by differences, and approximates the action."""

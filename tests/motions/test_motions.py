@@ -1,7 +1,5 @@
 """Every quantity, in systems and situations in which nothing is a default: a table, and a property for each column."""
 
-import zlib
-
 import pytest
 from tiers import cover
 
@@ -18,6 +16,8 @@ CASES = [
     if applies(Case(problem, method, situation))
 ]
 
+pytestmark = pytest.mark.long
+
 
 def identity(name: str, case: Case) -> str:
     scheme = case.scheme
@@ -25,8 +25,9 @@ def identity(name: str, case: Case) -> str:
     return f"{name}-{case.problem.name}-{method}-{scheme.solver}-{scheme.precision}-{case.situation}"
 
 
-def sample() -> list[tuple[str, Case]]:
-    """Cases with each property of each kind of run, each situation and each system, then the others by hash."""
+def sample() -> list[object]:
+    """Quick cases with each property of each kind of run, each situation and each system; the others rotate, those of a
+    stepper, which is compiled once, together."""
     kinds, names = [(name, problem.kind) for name in PROPERTIES for problem in PROBLEMS], [x.name for x in PROBLEMS]
     combinations = {
         (
@@ -37,12 +38,12 @@ def sample() -> list[tuple[str, Case]]:
         for name, case in reversed(CASES)
     }
     first = [combinations[x] for x in sorted(cover(sorted(combinations)))]
-    others = [case for case in CASES if case not in first]
-    return first + sorted(others, key=lambda case: zlib.crc32(identity(*case).encode()))
+    steppers = [*dict.fromkeys((case.problem, case.method) for _, case in CASES)]
+    marks = [[] if x in first else [pytest.mark.rotated(steppers.index((x[1].problem, x[1].method)))] for x in CASES]
+    return [pytest.param(*case, id=identity(*case), marks=of) for case, of in zip(CASES, marks, strict=True)]
 
 
-@pytest.mark.tiers(60, 200)
-@pytest.mark.parametrize(("name", "case"), [pytest.param(*case, id=identity(*case)) for case in sample()])
+@pytest.mark.parametrize(("name", "case"), sample())
 def test_quantities_are_those_of_independent_code(name: str, case: Case) -> None:
     check, _ = PROPERTIES[name]
     check(case)

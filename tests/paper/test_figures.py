@@ -91,7 +91,7 @@ def test_exact_orbits_stay_on_their_ellipse_and_period():
     assert run.revolutions == pytest.approx([2 * np.pi] * 5, abs=1e-3)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_spectral_collocation_with_two_points_falls_into_the_centre():
     run = SETTINGS["kepler-two-points"].run("sc2")
     assert run.failed
@@ -115,7 +115,7 @@ def test_area_changes_as_the_energy_of_an_oscillator():
     assert run.area == pytest.approx(np.exp(-np.log1p(1e-4) * 0.8 * 20_000) - 1.0, rel=0.02)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize(
     ("conditions", "verdict"),
     [
@@ -148,7 +148,7 @@ def test_defects_and_momenta_of_a_step(row, expected):
     assert abs(full.momentum) < 1e-14
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize("degree", [2, 3, 4, 5])
 def test_missing_term_lowers_the_order(degree):
     printed, full = (correction.measured(degree + 1, degree, variational=form) for form in (False, True))

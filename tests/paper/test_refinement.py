@@ -55,7 +55,7 @@ ORDERS = [
 """Powers of h by scheme for N = 2, 4, 6 and each quantity; on the circle q1 has the lines that the paper draws."""
 
 
-@pytest.mark.tiers(1, 2)
+@pytest.mark.tiers(1, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(("case", "quantities", "expected"), ORDERS)
 def test_convergence_orders_of_the_local_error(case, quantities, expected):

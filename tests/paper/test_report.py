@@ -122,7 +122,7 @@ class TestPage:
         assert document == draw(results["figure-4"].picture, "svg")
         assert len(parsed.all("caption")) == len(parsed.all("table")) == 4
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_page_is_self_contained(self, page):
         parsed = Page(page)
         assert parsed.all("script") == []

@@ -37,7 +37,7 @@ def test_picard_iteration_fails_where_the_tables_have_dashes(number, cells, by_p
     assert sum(h >= 1.0 and n > 2 for h, n, _ in wrong[0]) == 1
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("degree", [1, 4, 9, 19])
 def test_picard_iteration_converges_to_the_compiled_step(degree):

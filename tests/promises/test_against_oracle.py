@@ -134,7 +134,7 @@ def test_verlet_is_the_leapfrog_of_separable_systems(sample, compiled, name):
     assert relative(compiled(name, sc.StoermerVerlet()).step(q, p, H, T), expected) < TOLERANCE
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_oracle_distinguishes_neighbouring_methods_and_times(sample):
     """The comparison has teeth: neighbouring methods and a slightly other time are far outside the tolerance."""
     case = sample("pumped-cart-pole")

@@ -94,7 +94,7 @@ def test_concurrent_processes_compile_into_an_empty_cache(folder):
     assert all(building._is_intact(folder / name) for name in found)
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize("rounds", [1, pytest.param(12, marks=pytest.mark.full)])
 def test_entries_removed_during_loading_are_rebuilt(folder, rounds):
     """The cache has room for one entry, so each process removes the others' entries."""
@@ -124,7 +124,7 @@ def killed(folder: Path, seconds: float, generator: random.Random) -> None:
         process.kill()
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize("times", [3, pytest.param(40, marks=pytest.mark.full)])
 def test_killed_compilation_leaves_a_usable_cache(folder, times, monkeypatch):
     generator, left = random.Random(times), 0

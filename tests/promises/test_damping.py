@@ -19,7 +19,7 @@ GAMMA = 0.4 * 0.9
 """Rate of :func:`damped_pair`."""
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(3)
 @pytest.mark.covering
 @pytest.mark.parametrize("solver", ["auto", "newton"])
@@ -49,7 +49,7 @@ def test_a_step_is_that_of_the_scaled_lagrangian(method, solver):
         assert np.abs(p - grown_p / np.exp(GAMMA * (t + h))).max() < 4e-15
 
 
-@pytest.mark.tiers(1)
+@pytest.mark.tiers(1, 2)
 @pytest.mark.parametrize(
     "method", [sc.SVI(1), sc.SVI(3), sc.Gauss(2), sc.StoermerVerlet()], ids=lambda method: method.name
 )

@@ -177,7 +177,6 @@ def test_comet_returns_after_a_near_collision(output_of):
     assert max(errors) < 1e-11
 
 
-@pytest.mark.tiers(0, 1)
 def test_leapfrog_with_logarithmic_hamiltonian_preserves_an_ellipse(output_of):
     rows = [line.split() for line in output_of("logarithmic_hamiltonian").splitlines()[1:]]
     _, away, period = zip(*(map(float, row) for row in rows), strict=True)
@@ -214,7 +213,6 @@ def test_curves_and_quadratures_have_their_documented_advantages(output_of):
     assert more < 1e-7 < hermite < trapezoid
 
 
-@pytest.mark.tiers(0, 1)
 def test_import_generated_stepper_runs_without_sympy(output_of):
     output = output_of("import_generated_stepper")
     assert "pendulum_svi.c" in output

@@ -355,7 +355,7 @@ def test_elements_of_high_degree_are_assembled_in_bounded_work(degree: int, tmp_
         load_model(tmp_path / "model.toml")
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("name", ["model.toml", "u.csv", "v.npz", "grid.toml", "states.csv", "manifest.json"])
 @pytest.mark.parametrize("other", ["device", "pipe", "folder"])
 def test_only_regular_files_are_read(name: str, other: str, tmp_path: Path) -> None:

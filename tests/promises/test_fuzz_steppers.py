@@ -203,7 +203,7 @@ def check_oscillator(stepper: sc.Stepper, random: Random) -> bool:
     return True
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("solver", ["auto", "newton", "fixed-point"])
 @pytest.mark.parametrize("kind", ["lagrangian", "hamiltonian"])
@@ -215,7 +215,7 @@ def test_oscillator_of_any_size_with_any_step_is_correct_or_rejected(kind, solve
     assert done > 100
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_ensemble_with_any_sizes_is_correct_or_reports_failures():
     stepper = prepared(sc.compile_stepper(oscillator("lagrangian"), sc.SVI(2), flags=QUICK_FLAGS))
     random = Random(3)

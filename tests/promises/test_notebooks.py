@@ -54,7 +54,7 @@ def test_results_are_below_their_cells(tmp_path):
     assert page.count("```text\n2\n```") == page.count("```text\n3\n```") == page.count(":alt: a line") == 1
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_error_of_a_cell_names_it(tmp_path):
     process = notebooks.run_in_process(saved(tmp_path / "one.ipynb", "1", "1/0"))
     _, errors = process.communicate(timeout=60)

@@ -84,7 +84,7 @@ METHODS = (
 LOW = tuple(method for method in METHODS if method.order <= 6 and method not in SPECIAL)
 
 
-@pytest.mark.tiers(0, 2)
+@pytest.mark.rotated
 @pytest.mark.sampled(10)
 @pytest.mark.parametrize("method", first_of_each(METHODS, family), ids=lambda method: method.name)
 def test_global_error_on_kepler_has_the_claimed_order(compiled, sample, method):
@@ -121,7 +121,7 @@ OTHER_SYSTEMS = {"pumped-cart-pole": LOW, "forced-cart-pole": FORCED, "radial-fr
 FEW = {"pumped-cart-pole": LOW[:25:12], "forced-cart-pole": FORCED[:2], "damped-pair": DAMPED[1:3]}
 
 
-@pytest.mark.tiers(1, 5)
+@pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize(
     ("name", "method"), [pair(name, method) for name, methods in FEW.items() for method in methods]
 )
@@ -148,7 +148,7 @@ def test_compositions_have_their_order_with_forces_of_time(quickly_compiled):
     assert np.log2(errors[0] / errors[1]) == pytest.approx(8, abs=0.4), errors
 
 
-@pytest.mark.tiers(0, 2)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize("name", ["kepler", "planar-pendulum"])
@@ -159,7 +159,7 @@ def test_the_printed_shooting_equations_have_order_one_less_than_their_degree(co
     assert measured_order(compiled, sample, name, method) == pytest.approx(s - 1, abs=0.2)
 
 
-@pytest.mark.tiers(1)
+@pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize("method", [sc.SVI(2), sc.RadauIIA(3), sc.SCVI(2)], ids=lambda method: method.name)
 def test_the_reference_is_the_exact_solution_where_there_is_one(compiled, sample, method):
     """q'' = -q: the order from the closed form is equal, so errors of the reference would be detected."""

@@ -45,7 +45,6 @@ def test_momenta_are_conserved_to_round_off(run):
     assert np.abs(angular - angular[0]).max() < 1e-14 * np.abs(angular[0]).max()
 
 
-@pytest.mark.second
 def test_errors_are_those_of_the_readme(run, reference):
     text = " ".join((MODEL.parents[1] / "README.md").read_text(encoding="utf-8").split())
     stated = r"(\d+) steps of (\d+) days: relative energy error (\S+), final positions within (\S+) AU"

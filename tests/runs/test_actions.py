@@ -8,7 +8,7 @@ import scvi_codegen as sc
 from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.runs.results.joining import compensated_sums
 
-pytestmark = pytest.mark.second
+pytestmark = pytest.mark.rotated
 
 HENON_HEILES = sc.problem("henon-heiles").system
 START = np.array([0.0, -0.25, 0.42, 0.0])
@@ -24,7 +24,6 @@ def central(function, h=1e-3):
     return sum(w * (function(k * h) - function(-k * h)) for k, w in ((1, 0.75), (2, -0.15), (3, 1 / 60))) / h
 
 
-@pytest.mark.rotated
 def test_action_is_the_sum_of_discrete_lagrangians(stepper):
     run = stepper.integrate(START[:2], START[2:], h=0.2, steps=40)
     each = [stepper.discrete_lagrangian(*run.q[k : k + 2], 0.2) for k in range(40)]
@@ -90,12 +89,7 @@ SUMMED = [
 KINDS = ["gauss", "adaptive", "forces", "inputs", "constant input", "explicit", "scvi", "damping", "rod"]
 
 
-@pytest.mark.tiers(0, 0)
-@pytest.mark.parametrize(
-    ("arguments", "method", "steps"),
-    [pytest.param(*case, marks=pytest.mark.second if k > 5 else ()) for k, case in enumerate(SUMMED)],
-    ids=KINDS,
-)
+@pytest.mark.parametrize(("arguments", "method", "steps"), SUMMED, ids=KINDS)
 def test_action_summed_by_the_run_is_that_of_its_steps(arguments, method, steps):
     stepper = sc.compile_stepper(sc.LagrangianSystem.from_text("system", ["x", "y"], **arguments), method)
     without, run = (stepper.integrate([0.3, 0.1], velocity=[0.1, 0.2], action=x, **steps) for x in (False, True))
@@ -106,7 +100,6 @@ def test_action_summed_by_the_run_is_that_of_its_steps(arguments, method, steps)
     assert abs(run[2:].action() - without[2:].action()) < 1e-14 if not run.pieces else True
 
 
-@pytest.mark.rotated
 def test_action_is_summed_for_hamiltonians_rotations_and_arrays():
     top = lagrange("top", [], "(omega_1**2 + 2*omega_2**2 + 3*omega_3**2)/2 - R_33", rotations={"R": "omega"})
     oscillator = sc.HamiltonianSystem.from_text("oscillator", ["x"], "p_x**2/2 + p_x**4/8 + x**2/2 + x*p_x/5")
@@ -122,7 +115,6 @@ def test_action_is_summed_for_hamiltonians_rotations_and_arrays():
         assert abs(run.action() - without.action()) < 1e-14
 
 
-@pytest.mark.second
 def test_actions_of_constraints_forces_damping_and_ensembles(stepper):
     rod = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 - 1"])
     angle = sc.LagrangianSystem.from_text("angle", ["a"], "a_dot**2/2 - sin(a)")
@@ -153,7 +145,6 @@ def test_sums_are_compensated():
     assert compensated_sums(terms)[-1] == 1.0 + 1e-13
 
 
-@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("method", "h"), [("svi:1", 0.05), ("stoermer-verlet", 0.05), ("composition:4", 0.05)])
 def test_shadow_energy_is_constant_and_shows_a_drift(method, h):
     stepper = sc.compile_stepper(HENON_HEILES, method)

@@ -14,7 +14,7 @@ def compiled(lagrangian, coordinates, method="svi:8", **parameters):
 CHAIN = "(a_dot**2 + b_dot**2 + d_dot**2)/2 - 10*((a - t**3)**2 + (b - a)**2 + (d - b)**2)"
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("method", ["svi:2", "svi:4", "svi:8"])
 def test_chain_at_rest_follows_a_force_that_grows_as_a_power_of_time(method):
     """Each displacement is a power of t beyond the degree, with a large error relative to itself at any step size."""
@@ -24,7 +24,7 @@ def test_chain_at_rest_follows_a_force_that_grows_as_a_power_of_time(method):
     assert np.abs(run.q[-1] - fine.q[-1]).max() < 1e-5 * np.abs(fine.q[-1]).max()
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_light_planet_is_as_accurate_as_a_heavy_one():
     """Both move about a fixed centre; the mass of the second is 1e-9."""
     stepper = compiled(
@@ -37,7 +37,7 @@ def test_light_planet_is_as_accurate_as_a_heavy_one():
     assert np.abs(run.q[:, 2] - 0.01 * np.cos(angles)).max() < 1e-6 * 0.01
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("solver", ["auto", "newton"])
 def test_turning_points_are_reached_by_short_steps(solver: str) -> None:
     """Velocities are forgotten with time: steps of a low order near a turning point do not shrink with the velocity."""

@@ -7,7 +7,7 @@ from notation import lagrange
 import scvi_codegen as sc
 from scvi_codegen.runs.stepping.step_plan import Adaptive
 
-pytestmark = [pytest.mark.usefixtures("as_users_compile"), pytest.mark.second]
+pytestmark = [pytest.mark.usefixtures("as_users_compile"), pytest.mark.rotated]
 
 PUSHED = lagrange("pushed pendulum", "q", "q_dot**2/2 + k*cos(q)", k=1.0, forces={"q": "u"}, inputs="u")
 

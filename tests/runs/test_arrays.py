@@ -25,7 +25,7 @@ FIELD = sc.LagrangianSystem.from_text(
 )
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("count", [2, 3, 64, 1000])
 def test_one_library_is_used_for_every_size(count: int) -> None:
     """A ring of coupled oscillators against its normal modes; momentum to round-off."""
@@ -56,7 +56,7 @@ def test_unsupported_observations_are_rejected(observe: Any, message: str) -> No
         sc.compile_stepper(RING, "svi:2").integrate(random(5), h=0.1, steps=2, observe=observe)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_failures_of_array_runs() -> None:
     """A too large step fails and the preceding states are saved; a coordinate without mass is reported."""
     with pytest.raises(sc.StepFailedError, match="Use a smaller h") as caught:
@@ -81,7 +81,7 @@ def test_index_out_of_range_of_a_table_is_rejected() -> None:
         sc.unroll_sums(system, {"N": 5, "B": 1}, tables={"bonds": [[0, 1]]})
 
 
-@pytest.mark.tiers(0, 2)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize(("method", "most"), [("svi:1", 1.3), ("svi:2", 1.6), ("svi:4", 2.2), ("svi:8", 3.4)])
 @pytest.mark.parametrize("form", ["lagrangian", "hamiltonian"])

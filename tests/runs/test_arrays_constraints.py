@@ -120,7 +120,7 @@ def test_momentum_maps_compatible_with_constraints_are_conserved():
     assert np.abs(np.ptp(run.momentum_maps(), axis=0)).max() < 1e-13
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_time_dependent_constraints_are_satisfied():
     """A pendulum whose pivot shakes is that written out in its angle."""
     shaken = sc.LagrangianSystem.from_text(
@@ -157,7 +157,7 @@ steps = 20
 """
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_model_files_and_generated_programs_have_constraints(tmp_path):
     (tmp_path / "chain.toml").write_text(MODEL)
     model = sc.load_model(tmp_path / "chain.toml")

@@ -41,7 +41,7 @@ def steppers(request):
     return any_size, known, states.reshape(2, 4, *shape), parameters
 
 
-@pytest.mark.tiers(0, 2)
+@pytest.mark.rotated
 def test_functions_of_states_equal_those_of_known_sizes(steppers) -> None:
     """Of states that are not adjacent in memory, all in one call."""
     any_size, known, (q, p), parameters = steppers

@@ -124,7 +124,7 @@ class TestDamage:
         with pytest.raises(sc.StateError, match=name):
             chain.from_checkpoint(put_together(header, bytes(fields)), t_end=2.0)
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     @pytest.mark.parametrize("which", ["chain", "pendulums"])
     def test_damage_behind_a_right_checksum_is_detected(self, which: str, request: Any) -> None:
         stepper = request.getfixturevalue(which)
@@ -167,7 +167,7 @@ class TestDamage:
             chain.from_checkpoint(start(chain).checkpoint(), t_end=2.0)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_invalid_step_size_levels_are_rejected_also_for_scalar_runs() -> None:
     system = sc.LagrangianSystem.from_text(name="pendulum", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)")
     stepper = sc.compile_stepper(system, "svi:3", flags=QUICK_FLAGS)

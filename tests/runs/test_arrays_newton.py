@@ -21,7 +21,7 @@ def molecules():
     )
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_stiff_bonds_at_rest_do_not_limit_the_step_size():
     count, stiff = 40, 1e6
     chain = np.array([(i, i + 1) for i in range(count - 1)])
@@ -41,7 +41,7 @@ def test_stiff_bonds_at_rest_do_not_limit_the_step_size():
     assert np.abs(np.ptp(run.momentum_maps(), axis=0)).max() < 1e-9
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_step_without_convergence_fails():
     system = lagrange(
         "long waves", "q[N]", "sum(i in N, q_dot[i]**2/2) - 1e12*sum(i in N periodic, (q[i+1] - q[i])**2/2 - cos(q[i]))"

@@ -30,7 +30,7 @@ def known():
     return sc.compile_stepper(body_on_ring("N"), "svi:4", sizes={"N": 5})
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_the_only_array_needs_no_name():
     atoms = lagrange("atoms", ["r[2, 3]"], "sum(i in 2, k in 3, r_dot[i, k]**2/2 - r[i, k]**2/2)")
     stepper = sc.compile_stepper(atoms, "svi:4")
@@ -40,7 +40,7 @@ def test_the_only_array_needs_no_name():
     assert (stepper.arrays(run.q)["r"][0] == start).all()
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize(
     ("extra", "method", "message"),
     [

@@ -69,7 +69,7 @@ def test_slices_have_the_states_of_the_run(steppers):
 
 
 class TestEvents:
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_invalid_events_are_rejected(self, steppers):
         stepper, _ = steppers
         for function, message in (
@@ -83,7 +83,7 @@ class TestEvents:
 
 
 class TestInputs:
-    @pytest.mark.second
+    @pytest.mark.rotated
     @pytest.mark.parametrize("method", ["svi:2", "svi:6"])
     def test_equal_samples_do_not_reset_the_predictor(self, driven, method):
         """Equal samples need no additional iteration; different ones need fewer than without a predictor."""
@@ -108,7 +108,7 @@ class TestInputs:
         assert np.abs(others.q["q"] - none.q["q"]).max() < 1e-13
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_error_estimate_survives_a_zero_of_one_coefficient() -> None:
     """One quartic oscillator, whose highest coefficient vanishes now and then: no step changes the energy by more."""
     system = lagrange("quartic", "x[N]", "sum(i in N, x_dot[i]**2/2 - x[i]**4/4)")

@@ -143,7 +143,7 @@ def test_terms_are_distributed_over_threads(name: str) -> None:
     assert {sharing_of(rolled) for rolled in program.loops.forces} == {CASES[name].shared}
 
 
-@pytest.mark.tiers(2, 5)
+@pytest.mark.tiers(2, 3)
 @pytest.mark.sampled(5)
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("name", CASES)
@@ -176,7 +176,7 @@ def test_results_do_not_depend_on_the_number_of_threads(name: str, method: str, 
     assert found[1:] == found[:1] * (len(THREADS) - 1)
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("method", [sc.StoermerVerlet(), sc.StoermerVerlet("drift-kick-drift"), sc.Composition(4)])
 @pytest.mark.parametrize("sums", ["compensated", "plain"])
 def test_steps_together_are_those_one_by_one(sums: str, method: Any) -> None:
@@ -228,7 +228,7 @@ def test_hamiltonians_and_velocity_dependent_forces_with_threads() -> None:
         assert found[1:] == found[:1] * (len(THREADS) - 1)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_interrupt_ends_a_run_between_steps() -> None:
     run = stepper_of("pairs", "svi:4").start(start_of("pairs"), h=0.001, threads=3)
 

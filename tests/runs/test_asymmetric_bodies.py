@@ -101,7 +101,7 @@ def stepper():
     return sc.compile_stepper(BODY, "composition:8", flags=QUICK_FLAGS)
 
 
-@pytest.mark.tiers(0, 5)
+@pytest.mark.rotated
 @pytest.mark.parametrize("name", CASES)
 def test_steps_equal_taylor_series_in_50_digits(stepper, name):
     moments, omega, h = CASES[name]

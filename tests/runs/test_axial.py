@@ -9,7 +9,7 @@ import scvi_codegen as sc
 from scvi_codegen.systems.legendre.of_rotations import hamiltonian_of_rotations
 from scvi_codegen.systems.splittings.axial import axial_turns
 
-pytestmark = pytest.mark.second
+pytestmark = pytest.mark.rotated
 
 KINETIC = "(A*(omega_1**2 + omega_2**2) + C*omega_3**2)/2"
 THREE = "(A*omega_1**2 + B*omega_2**2 + C*omega_3**2)/2"
@@ -59,7 +59,6 @@ def test_actions_are_those_with_three_moments(others):
     assert abs(actions[1] - actions[0]) < 1e-11
 
 
-@pytest.mark.rotated
 @pytest.mark.parametrize("solver", ["auto", pytest.param("newton", marks=pytest.mark.full)])
 def test_a_symmetric_top_moves_as_one_with_three_moments(solver):
     ours, other = (sc.compile_stepper(each, "svi:6", solver=solver) for each in (body(f"{KINETIC} - w*R_33"), three()))

@@ -63,7 +63,7 @@ CASES = [
 ]
 
 
-@pytest.mark.tiers(0, 8)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("name", "plan"), CASES)
 @pytest.mark.parametrize("capacity", [batches.MOST_NUMBERS, 1])
 def test_trajectories_equal_single_runs(name: str, plan: str, capacity: int, monkeypatch: pytest.MonkeyPatch) -> None:

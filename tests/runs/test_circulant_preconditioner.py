@@ -9,7 +9,7 @@ import scvi_codegen as sc
 from scvi_codegen.codegen.lowering.program import lower_arrays
 from scvi_codegen.runs.stepping import array_envelope as envelope
 
-pytestmark = pytest.mark.second
+pytestmark = pytest.mark.rotated
 
 RANDOM = np.random.default_rng(1)
 ROUNDING = 2.0**-52
@@ -60,7 +60,6 @@ def products_of(stepper, q, h, *, steps=1, **given):
     return report.products
 
 
-@pytest.mark.tiers(0, 6)
 @pytest.mark.sampled(9)
 @pytest.mark.parametrize("size", [8, 12, 13, 34, 60, 77, 169, 500, 1001])
 @pytest.mark.parametrize("method", ["svi:2", "svi:4", "gauss:3"])
@@ -92,7 +91,6 @@ def test_each_array_has_its_circulant_preconditioner():
     assert products_of(stepper, start, 1.0) <= 3
 
 
-@pytest.mark.rotated
 @pytest.mark.sampled(3)
 @pytest.mark.covering
 @pytest.mark.parametrize("name", LATTICES)

@@ -221,7 +221,7 @@ def check(found: Counter, least: float) -> None:
     assert total["confirmed"] >= least * sum(total.values()), found
 
 
-@pytest.mark.tiers(0, 4)
+@pytest.mark.rotated
 @pytest.mark.parametrize(("family", "kind"), [(family, kind) for family in FAMILIES for kind in FAMILIES[family][0]])
 def test_no_error_is_confirmed_but_wrong(family, kind):
     """Three cases of each kind, more with narrow forces, some of which all stages miss; most are confirmed."""
@@ -231,7 +231,7 @@ def test_no_error_is_confirmed_but_wrong(family, kind):
     check(counts(range(first, first + count * stride, stride), family, ["svi:4"]), least)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_free_flight_is_examined_for_narrow_forces():
     """Without ``error=``: of thirty runs, steps that are not examined in pieces miss the force in eleven."""
     missed = 0
@@ -251,7 +251,7 @@ def test_no_false_confirmation_in_three_thousand_cases(family, count, least):
 FLOOR_HEIGHT = 2.55
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_an_unconfirmed_motion_with_kinks_has_the_remedies_for_these():
     height, span = FLOOR_HEIGHT, 3.0 * math.sqrt(2.0 * FLOOR_HEIGHT / 9.8)
     floor = lagrange("floor", "y", "y_dot**2/2 - 9.8*y - 1e5*positive_part(-y)**2")
@@ -261,7 +261,7 @@ def test_an_unconfirmed_motion_with_kinks_has_the_remedies_for_these():
     assert "time transformation" not in str(caught[0].message)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("offset", [0.0, 1e6])
 def test_errors_are_relative_to_the_range_of_each_coordinate(offset):
     """A small oscillation beside a large one has its own size; far from the origin positions are rounded."""
@@ -282,7 +282,7 @@ def test_a_coordinate_that_does_not_move_is_confirmed():
     assert run.confirmation.confirmed
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.filterwarnings("error")
 def test_rest_is_confirmed_and_its_energy_is_that_of_rounding():
     body = sc.LagrangianSystem.from_text(
@@ -323,7 +323,7 @@ def test_a_run_for_comparison_has_other_steps():
     assert len(irregular_stops(np.array([0.0, 1.0]), 0)) == LEAST_STOPS + 1
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_steps_of_a_confirmed_run_with_kinks_reproduce_it(tmp_path):
     """In Python, of models and on the command line: the tolerance and the largest step; rint is not located."""
     force = "rint((t - a)/100 + 1/2)"
@@ -348,7 +348,7 @@ def test_steps_of_a_confirmed_run_with_kinks_reproduce_it(tmp_path):
         assert np.array_equal(file["q"], run.q)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_kinks_of_arrays_are_found():
     """Two balls on a stiff floor: the second one meets it at the end of a step at all tolerances."""
     system = lagrange("floor", "y[N]", "sum(i in N, y_dot[i]**2/2 - 9.8*y[i] - 1e5*positive_part(-y[i])**2)")
@@ -369,7 +369,7 @@ def confirmed(system, q, p, method="svi:6", **arguments):
 class TestSizes:
     """Motions beside larger ones, far from the origin and in encounters."""
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_a_tiny_motion_next_to_a_large_one_has_its_own_size(self):
         run = confirmed(
             ("x z", "(x_dot**2 + z_dot**2)/2 - x**2/2 - z**2"), [1.0, 1e-14], [0.0, 0.0], t_end=5.0, error=1e-8
@@ -389,7 +389,7 @@ class TestSizes:
             assert np.abs(run.q[:, 0] - exact).max() <= run.global_error * apart
         assert loose.confirmation.confirmed > tight.confirmation.confirmed
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     @pytest.mark.parametrize("shift", [0.0, 100.0])
     def test_a_close_encounter_far_from_the_origin(self, shift):
         e, system = 0.9999, ("x y", f"(x_dot**2 + y_dot**2)/2 + 1/sqrt((x - {shift:g})**2 + y**2)")
@@ -399,7 +399,7 @@ class TestSizes:
         assert run.confirmation.confirmed
         assert (np.abs(run.q - exact).max(axis=0) / np.ptp(exact, axis=0)).max() <= run.global_error
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_nothing_is_confirmed_beyond_a_growth_that_exceeds_the_tolerance(self):
         """exp(-t) on a saddle, whose rounding errors grow by exp(t)."""
         run = confirmed(("q", "q_dot**2/2 + q**2/2"), [1.0], [-1.0], "svi:4", t_end=40.0, error=1e-6)
@@ -416,7 +416,7 @@ class TestSizes:
         assert confirmed(system, *start, t_end=5.0, error=1e-6, absolute_tolerance=1.0).confirmation.confirmed
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_a_comparison_that_is_given_up_confirms_nothing(monkeypatch):
     """Runs for comparison that take too many steps."""
     monkeypatch.setattr(global_error, "MANY", -(10**6))
@@ -426,7 +426,7 @@ def test_a_comparison_that_is_given_up_confirms_nothing(monkeypatch):
     assert math.isinf(run.global_error)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("mass", [1.0, 2.0**-30])
 def test_momenta_of_light_bodies_count(mass):
     """A body that crosses ripples: errors of its velocity are 100 times those of its position relative to its range."""

@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 
 import scvi_codegen as sc
 
-pytestmark = pytest.mark.second
+pytestmark = pytest.mark.rotated
 PLANE = "(x_dot**2 + y_dot**2)/2"
 
 

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 import scvi_codegen as sc
 from scvi_codegen.systems.contact import contacts_of
 
-pytestmark = pytest.mark.second
+pytestmark = pytest.mark.rotated
 G = 9.81
 POINT = f"(x_dot**2 + y_dot**2)/2 - {G}*y"
 
@@ -41,7 +41,6 @@ BALANCES = {
 }
 
 
-@pytest.mark.rotated
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("name", [*BALANCES])
 def test_the_balance_of_energy_has_the_order_of_the_method(name: str, degree: int) -> None:
@@ -90,6 +89,7 @@ def test_a_ball_rolls_off_the_edge_of_a_table(steps: dict[str, float]) -> None:
     assert run.q[-1] == pytest.approx([1.4, 0.1 - G / 2 * 0.2**2, 4.0], abs=1e-11)
 
 
+@pytest.mark.second
 @STEPS
 @pytest.mark.parametrize(("rise", "meets"), [(2.0, True), (8.0, False)])
 def test_a_ball_misses_a_wall_of_finite_height(rise: float, meets: bool, steps: dict[str, float]) -> None:
@@ -133,6 +133,7 @@ def test_friction_on_a_surface_is_that_of_the_true_normal_force(steps: dict[str,
     assert run.contact_forces()[-1, 0] == pytest.approx([normal, 0.2 * normal], rel=1e-9)
 
 
+@pytest.mark.second
 def test_a_gap_is_a_distance_or_follows_from_a_surface() -> None:
     for arguments in list[Any]([{"gap": "x", "of": ["x"]}, {"surface": "x"}, {}]):
         with pytest.raises(sc.SystemDefinitionError, match="either its gap="):

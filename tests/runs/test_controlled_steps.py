@@ -123,7 +123,7 @@ def test_equal_velocities_at_both_points_give_no_estimate_by_a_curve(name, solve
     assert math.isnan(estimate) if name == "of arrays" else 1e-6 < estimate < 1e-2
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize("solver", ["auto", "newton"])
 def test_three_lobatto_points_estimate_errors_by_the_momentum_derivative(solver):
     """The highest coefficient of the velocities is 0 in every step."""
@@ -135,7 +135,7 @@ def test_three_lobatto_points_estimate_errors_by_the_momentum_derivative(solver)
     assert 1e-8 < run.step_error < 2e-5
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_newton_solves_stiff_systems_with_steps_of_the_slow_time_scale():
     system = lagrange("penalty pendulum", "x y", "(x_dot**2 + y_dot**2)/2 - y - k*(x**2 + y**2 - 1)**2/8", k=1e10)
     start, rest = [math.sin(1.0), -math.cos(1.0)], [0.0, 0.0]
@@ -148,7 +148,7 @@ def test_newton_solves_stiff_systems_with_steps_of_the_slow_time_scale():
     assert np.ptp(run.energy()) < 1e-6
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize(
     "method", ["svi:5", *(pytest.param(name, marks=pytest.mark.full) for name in ("svi:8", "gauss:4"))]
 )
@@ -167,7 +167,7 @@ def test_initial_step_size_is_found_for_zero_velocity(method):
     assert np.abs(found.q[-1] - known.q[-1]).max() < 1e-13
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("tolerance", [1e-8, 1e-12])
 def test_degree_two_error_estimate_uses_the_change_of_force(tolerance):
     """At rest the force is initially constant: q = 2 asin(k cd(t, k)) (Whittaker, Analytical Dynamics, 44)."""
@@ -180,7 +180,7 @@ def test_degree_two_error_estimate_uses_the_change_of_force(tolerance):
     assert errors.max() < (len(run) - 1) * tolerance
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_a_singular_time_inside_a_run_is_resolved_or_its_error_reported():
     """The force -log((t - 1)^2): q(2) = q(0) + 4 from rest. The step across t = 1 has the error of the whole run."""
     singular = lagrange("singular", "q", "q_dot**2/2 - q*log((t - 1)**2)")
@@ -192,7 +192,7 @@ def test_a_singular_time_inside_a_run_is_resolved_or_its_error_reported():
         assert error < 10.0 * run.step_error <= 1e3 * wanted, tolerance
 
 
-@pytest.mark.tiers(0, 3)
+@pytest.mark.rotated
 @pytest.mark.parametrize("method", ["svi:4", "svi:8"])
 @pytest.mark.parametrize("force", ["1/(t - a)", "x/(t - a)", "1/(t - a)**2"])
 def test_a_pole_in_time_ends_a_run(method, force):
@@ -209,7 +209,7 @@ def test_a_pole_in_time_ends_a_run(method, force):
     assert passed <= 1
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_first_step_is_found_without_larger_ones_at_which_the_iteration_diverges():
     """Released at 1.5 rad; steps beyond 1.5 send the angle to 1e16, where cosines take a hundred times as long."""
     atwood = lagrange("atwood", "r s", "2*r_dot**2 + r**2*s_dot**2/2 - r*(3 - cos(s))")
@@ -294,7 +294,7 @@ def oscillators():
     return {"q": sc.compile_stepper(system, "svi:4"), "q[0]": sc.compile_stepper(summed, "svi:4")}
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_many_iterations_limit_the_step_size():
     """At 1e-3 the error of a charge in a field that depends on z allows sizes at which the iteration diverges."""
     system = lagrange("charge", "x y z", "(x_dot**2 + y_dot**2 + z_dot**2)/2 + (5 + 5*z**2/2)*(x*y_dot - y*x_dot)")
@@ -311,7 +311,7 @@ def test_many_iterations_limit_the_step_size():
     assert errors[0] < 0.1
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("solver", ["auto", "newton"])
 def test_free_fall_of_linked_bodies_from_rest_at_the_origin_takes_few_steps(solver):
     """The angle rests but for rounding errors of z, which the masses couple to it."""

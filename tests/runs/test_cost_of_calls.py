@@ -43,7 +43,7 @@ def numbers(found):
     return [x.tobytes() for x in (found.t, found.q, found.p, found.iterations, found.step_sizes, found.parameters)]
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("plan", [{"h": 0.05, "steps": 400}, {"t_end": 9.0}])
 def test_memory_of_earlier_calls_does_not_matter(stepper, plan):
     first = stepper.integrate(Q, P, **plan)
@@ -85,7 +85,7 @@ def chains():
     return [sc.compile_stepper(sc.LagrangianSystem.from_text(name="chain", **common, **each), by) for each, by in kinds]
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_calls_of_arrays_take_few_function_calls(chains):
     q, p = {"x": np.arange(3.0), "y": np.zeros(3)}, np.zeros(6)
     run = chains[0].integrate(q, p, h=0.05, steps=50)

@@ -92,7 +92,7 @@ def test_solve_ivp_ends_at_a_terminal_event(kepler):
     assert np.array_equal(chosen.sol(half.t[-1]), half.y[:, -1])
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_solve_ivp_reports_a_failed_step():
     runaway = sc.LagrangianSystem.from_text(name="runaway", coordinates=["q"], lagrangian="q_dot**2/2 + q**3/3")
     failed = sc.solve_ivp(sc.compile_stepper(runaway, sc.SVI(3), flags=FLAGS), (0, 10), [1.0, 1.0], h=0.1)

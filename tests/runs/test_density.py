@@ -35,7 +35,7 @@ def by_hand(stepper, q, p, tau, steps, rate, control):
     return np.array(states)
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ DENSITIES = {
 }
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("name", DENSITIES)
 def test_step_density_may_depend_on_time_or_momenta(name):
     """Time occurs in the system, too; forces enter the rates of momenta."""
@@ -88,7 +88,7 @@ def test_step_density_may_depend_on_time_or_momenta(name):
     assert np.abs(np.column_stack([run.t, run.q, run.p])[1:-1] - expected).max() < 1e-12
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("system", [KEPLER, sc.hamiltonian_of(KEPLER)], ids=["lagrangian", "hamiltonian"])
 def test_reversed_run_returns_on_its_own_steps(system):
     stepper = sc.compile_stepper(system, sc.SVI(4), time_transformation="frequency", flags=QUICK_FLAGS)
@@ -106,7 +106,7 @@ def off_the_time_transformation(run):
     return np.abs(np.abs(lengths) / (0.1 * (run.at(t + lengths / 2)[0] ** 2).sum(axis=1)) - 1.0).max(initial=0.0)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_steps_that_end_at_a_time_advance_the_density_partially():
     """At breakpoints of inputs and where a run goes to and fro; by whole ones it would go on ahead of the motion."""
     pushed = lagrange("pushed", "x y", "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)", forces={"x": "u"}, inputs="u")
@@ -136,7 +136,7 @@ def test_time_transformations_of_runs_with_inputs():
         stepper.integrate([0.0], [0.0], **given, steps=10)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_dense_output_events_and_continuation_with_step_density():
     stepper = kepler(sc.SVI(8), events="q1*q1_dot + q2*q2_dot")
     run = stepper.integrate(*START, h=0.2, t_end=3 * PERIOD)

@@ -189,7 +189,7 @@ def test_run_that_ends_at_a_step_ends_at_its_time():
     assert_allclose(still.tangent(), np.stack([np.eye(4)] * 2))
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_derivatives_of_a_rod_in_transformed_time():
     """With a constraint, compare with the transpose and with differences of steps."""
     rod = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - g*y", g=1.0, constraints=["x**2 + y**2 - 1"])
@@ -205,7 +205,7 @@ def test_derivatives_of_a_rod_in_transformed_time():
     assert forward[1, -1, -2] == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=1e-7)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_hamiltonian_linear_in_momenta_has_an_energy_surface():
     vortex = hamilton("turn", "q", "w*(q**2 + p**2)/2", momenta="p", w=1.5)
     made = sc.compile_stepper(sc.reparametrise(vortex, "1/(1 + q**2)"), sc.Gauss(2), flags=QUICK_FLAGS)

@@ -22,7 +22,7 @@ from scvi_codegen.codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.methods import Method
 from scvi_codegen.runs.ensembles.device import DeviceEnsemble
 
-pytestmark = pytest.mark.second
+pytestmark = pytest.mark.rotated
 
 CASES = {
     "kepler": "svi:8",
@@ -87,7 +87,7 @@ def test_a_thread_equals_a_trajectory_alone_bit_by_bit(gpu: EmulatedGpu) -> None
     assert np.array_equal(still.to_host().q[0], q)
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("system", CASES)
 def test_systems_and_methods_with_lanes_have_the_same_bits(gpu: EmulatedGpu, system: str) -> None:
     check_bits(compiled(system, CASES[system]), *states(system), **PLAN | {"t": 0.3})
@@ -109,7 +109,6 @@ def test_inputs_change_parameters_and_step_sizes_between_launches(gpu: EmulatedG
     assert np.isfinite(host.energy()).all()
 
 
-@pytest.mark.rotated
 @pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
 def test_trajectories_that_stop_are_continued_by_the_processor(gpu: EmulatedGpu) -> None:
     e = np.array([0.1, 0.97, 0.98, 0.99, 0.5])
@@ -145,7 +144,6 @@ def check_observed(stepper: sc.Stepper, start: tuple[np.ndarray, np.ndarray], ob
 
 @pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
 @pytest.mark.parametrize("observe", ["energy", "events", pytest.param("extremes", marks=pytest.mark.full)])
-@pytest.mark.second
 def test_values_at_all_steps_are_observed_without_saving_them(gpu: EmulatedGpu, observe: str) -> None:
     system = OBSERVED[observe]
     stepper = compiled(system, sc.SVI(4)).with_events(
@@ -154,7 +152,6 @@ def test_values_at_all_steps_are_observed_without_saving_them(gpu: EmulatedGpu, 
     check_observed(stepper, states(system), observe)
 
 
-@pytest.mark.second
 def test_interrupted_runs_have_the_states_so_far(gpu: EmulatedGpu) -> None:
     stepper, (q, p) = compiled("kepler", sc.SVI(4)), states("kepler")
     work = ensemble_runs(stepper, q, p, h=0.05, steps=200, device="cuda")

@@ -106,6 +106,7 @@ class TestCluster:
         assert np.array_equal(result.q, kepler.integrate_ensemble(q, p, h=0.05, steps=20).q)
         assert any(tmp_path.iterdir())
 
+    @pytest.mark.rotated
     def test_interrupt_cancels_remaining_parts(self, distributed: Any, cluster: Any, kepler: sc.Stepper):
         def interrupt(done: int) -> None:
             raise KeyboardInterrupt

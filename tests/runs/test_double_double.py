@@ -127,17 +127,15 @@ def largest_errors(folder: Path, count: int) -> dict[str, float]:
     return worst
 
 
-@pytest.mark.tiers(0, 0)
-@pytest.mark.parametrize(
-    "count", [pytest.param(1000, marks=pytest.mark.second), pytest.param(MANY, marks=pytest.mark.full)]
-)
+@pytest.mark.rotated
+@pytest.mark.parametrize("count", [1000, pytest.param(MANY, marks=pytest.mark.full)])
 def test_functions(count: int, tmp_path: Path) -> None:
     """Every function is accurate to 1e-30 for random arguments of all magnitudes, numbers and lanes."""
     worst = largest_errors(tmp_path, count)
     assert max(worst.values()) <= 1e-30, worst
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_rounding_errors_have_no_bias(tmp_path: Path) -> None:
     """Mean errors of products and roots vanish, as those of one sign would let the energies of orbits drift."""
     library, rng, count = compiled_functions(tmp_path), np.random.default_rng(3), 10_000
@@ -180,7 +178,7 @@ CASES = [
 ]
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("name", "method"), CASES)
 def test_step_of_samples(name: str, method: sc.methods.Method) -> None:
     """One step of each sample system that is accepted agrees with the oracle in 60 digits to 2e-30."""
@@ -200,7 +198,7 @@ def test_step_of_samples(name: str, method: sc.methods.Method) -> None:
             assert max(abs(run.mp(part)[1] - values)) <= 2e-30 * max(map(abs, values)), part
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_near_zeros(tmp_path: Path) -> None:
     """Near zeros sin, cos and tan of x have the relative error 1e-31 + 1e-47 |x / f(x)|."""
     flint = pytest.importorskip("flint")
@@ -221,7 +219,7 @@ def test_near_zeros(tmp_path: Path) -> None:
                     assert abs(value - exact) <= 1e-31 * abs(exact) + 1e-47 * a
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_automatic_precision() -> None:
     """With precision="auto" a chaotic run has the error asked for in double-double, a short one in double."""
     bodies = [(f"x{n}", f"y{n}") for n in range(3)]
@@ -242,7 +240,7 @@ def test_automatic_precision() -> None:
     assert np.abs(np.asarray(double.q[-1]) - np.asarray(long.q[-1])).max() > 1e-5
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_divided_kernels() -> None:
     """Derivatives of the forces of many coordinates, in parts, compile, and a step is accurate to 30 digits."""
     entry = sc.problem("outer-solar-system")
@@ -286,7 +284,7 @@ def exact_orbit(t: object, e: object = Fraction(1, 2)) -> list:
     return [mp.cos(angle) - e, mp.sqrt(1 - e**2) * mp.sin(angle)]
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_tolerances_are_met_or_refused() -> None:
     """Tolerances below what error estimates resolve are refused; the error of each step is below all others."""
     kepler, start = system("kepler"), {"q": ["0.5", 0], "velocity": [0, "1.7"], "t_end": 2.0}
@@ -307,7 +305,7 @@ def test_tolerances_are_met_or_refused() -> None:
             assert abs(step.mp("q")[-1] - run.mp("q")[k + 1]).max() < 10 * tolerance
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_cost_of_the_default_tolerance() -> None:
     """Adaptive steps to round-off are at most twice as many as those of 1e-28, also from and through zero."""
     text = "a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)"
@@ -326,7 +324,7 @@ def test_cost_of_the_default_tolerance() -> None:
         assert abs(run.q.mp() - few.mp("q")[-1]).max() < 1e-26
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_every_quantity_has_both_words(tmp_path: Path) -> None:
     """Coordinates, momenta and velocities by name, of runs, in progress, of ensembles, recordings and events."""
     stepper = sc.compile_stepper(system("kepler"), "svi:4", precision="double-double", events=sc.Event("y - 3/5"))
@@ -361,7 +359,7 @@ def test_every_quantity_has_both_words(tmp_path: Path) -> None:
         assert abs(q.mp() - again.mp("q")[-1]).max() < 1e-30
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_arrays_have_both_words() -> None:
     """Arrays of coordinates by name, and their items."""
     text = "q_dot[0]**2/2 + q_dot[1]**2/2 + z_dot**2/2 - (q[0] - q[1])**2/2 - z**2*q[0]**2"
@@ -376,7 +374,7 @@ def test_arrays_have_both_words() -> None:
             assert abs(by_name["q"].mp()[0][1] - third) + abs(by_name["z"].mp()[0] - z) < 1e-32
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_velocities_at_times_of_two_words() -> None:
     """Momenta, velocities, energies, steps and projections of systems that depend on t use both words of t."""
     text = "(2 + sin(t))*(x_dot**2 + y_dot**2)/2 - x**2*cos(t)/2 + t*x_dot"
@@ -422,7 +420,7 @@ def test_entries() -> None:
         assert x[1].mp() == mp.mpf(1) + mp.mpf(3e-20)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_ensembles(tmp_path: Path) -> None:
     """States of two words go on, are saved, and end with a failure; adaptive trajectories are one call of C."""
     stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
@@ -452,7 +450,7 @@ def test_ensembles(tmp_path: Path) -> None:
         stepper.integrate_ensemble(q, velocity=[[0, 1], ["a", 1]], h=0.07, steps=9)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_explicit_ensembles() -> None:
     """Trajectories in SIMD lanes equal the formulas in 50 digits, whatever their neighbours are."""
     driven = sc.LagrangianSystem.from_text(
@@ -486,7 +484,7 @@ def test_explicit_ensembles() -> None:
         assert (infinite.mp("q")[:, :3] == fewer.mp("q")).all()
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_lanes_do_not_depend_on_their_neighbours() -> None:
     """Trajectories whose iterations converge at different rates have equal bits in other blocks and threads."""
     stepper = sc.compile_stepper(system("kepler"), "svi:3", precision="double-double")
@@ -501,7 +499,7 @@ def test_lanes_do_not_depend_on_their_neighbours() -> None:
         assert (others.mp(name) == runs.mp(name)[:, order]).all()
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("kind", ["fixed", "tau", "inputs", "events"])
 def test_dense_output_at_the_times_of_states_is_these_states(kind: str) -> None:
     """Times have low words, which dense output takes as well: in arrays, in lists and alone."""
@@ -522,7 +520,7 @@ def test_dense_output_at_the_times_of_states_is_these_states(kind: str) -> None:
     assert (run.at(float(run.t[3]))[0] - run.q[3]).any()
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_outputs_have_both_words_or_are_refused():
     body = lagrange("body", "x", "(omega_1**2 + 2*omega_2**2 + 3*omega_3**2 + x_dot**2)/2", rotations={"R": "omega"})
     stepper = sc.compile_stepper(body, "svi:3", precision="double-double")

@@ -57,7 +57,7 @@ def end_of_ball(times: list, end: Any, kick: Any) -> tuple[list, list]:
     return found, list(moved(end))
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("steps", [{"h": 0.125, "t_end": 4.1}, {"t_end": 4.1, "tolerance": 1e-28}])
 def test_ball(steps: dict[str, float]) -> None:
     """Times of impacts on a curved, moving floor with restitution, and the states after them, have both words."""
@@ -109,7 +109,7 @@ def test_runs_in_parts() -> None:
     assert len(back.events[0]) == len(whole.events[0])
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_return() -> None:
     """A pendulum between elastic walls, integrated forward and back, returns, with its energy and 31 digits."""
     pendulum = sc.LagrangianSystem.from_text(name="pendulum", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)")
@@ -128,7 +128,7 @@ def test_return() -> None:
         assert largest(each - intervals[0] for each in intervals) < 1e-29
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_edge() -> None:
     """Inelastic impacts on two walls alternate, to 31 digits, and leave the velocity along their edge, (1, 1, 1).
 
@@ -175,7 +175,7 @@ def test_recordings(steps: dict[str, float], tmp_path: Path) -> None:
             assert (as_mpmath(getattr(found, name)) == as_mpmath(getattr(each, name))).all(), name
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_energies_of_impacts() -> None:
     """Impacts conserve energies that are not quadratic in p, also with constraints, to 31 digits."""
     fast = sc.HamiltonianSystem.from_text(
@@ -195,7 +195,7 @@ def test_energies_of_impacts() -> None:
             assert abs(change[1]) > 0.01
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_constraints() -> None:
     """A rod that hits a wall is a pendulum that reverses its angular velocity, times a restitution."""
     rod = sc.LagrangianSystem.from_text(
@@ -218,7 +218,7 @@ def test_constraints() -> None:
         assert max(np.abs(each).max() for each in run.constraint_values()) < 1e-30
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_corner() -> None:
     """In a corner both walls act: the velocity is reversed."""
     free = sc.LagrangianSystem.from_text(name="free", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2")
@@ -232,7 +232,7 @@ def test_corner() -> None:
         assert abs(run.mp("q")[-1, 1] - (1 - (5 - t) / 8)) < 1e-31
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_derivatives() -> None:
     """Derivatives through impacts are those of the run in double, at the states of two words."""
     starts = {"q": [-1.0, 1.1], "p": [0.3, 0.0], "h": 0.125, "steps": 14, "events": FLOOR}
@@ -241,7 +241,7 @@ def test_derivatives() -> None:
     assert np.abs(run.sensitivity().state - double.sensitivity().state).max() < 1e-10
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_reversible_controller() -> None:
     """Impacts in runs of equal steps of tau: those of adaptive runs."""
     g = {"time_transformation": "1/(1 + y**2/4)"}
@@ -252,7 +252,7 @@ def test_reversible_controller() -> None:
         assert largest(run.mp("q")[-1] - adaptive.mp("q")[-1]) < 1e-28
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_errors() -> None:
     """Accumulating impacts end the run with a warning, a start behind a wall and transformed time are errors."""
     dead = sc.LagrangianSystem.from_text(name="dead", coordinates=["y"], lagrangian="y_dot**2/2 - y")

@@ -12,7 +12,7 @@ import scvi_codegen as sc
 from scvi_codegen.runs.states.pairs import product_of, quotient_of, sum_of
 from scvi_codegen.runs.states.words import as_mpmath, with_low
 
-pytestmark = pytest.mark.second
+pytestmark = pytest.mark.rotated
 
 KEPLER = sc.LagrangianSystem.from_text(
     name="kepler",
@@ -46,6 +46,7 @@ def gauss_tables() -> tuple[list, list]:
     return [[quarter, quarter - root], [quarter + root, quarter]], [mp.mpf(1) / 2] * 2
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("hamiltonian", [False, True])
 def test_step(hamiltonian: bool) -> None:
     """A step of K = r (H - E) and its duration, the integral of r, are those of Gauss's method in 60 digits."""
@@ -86,7 +87,6 @@ def walk_of_energy(g: str, method: str, steps: int) -> np.ndarray:
     return K - K[:, 1:51].mean(axis=1, keepdims=True)
 
 
-@pytest.mark.rotated
 @pytest.mark.parametrize(
     ("g", "steps", "most"),
     [

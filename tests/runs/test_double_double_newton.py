@@ -15,7 +15,7 @@ from scvi_codegen.methods.exact.step import derived_step
 from scvi_codegen.runs.states.attitudes import momenta_of_body
 from scvi_codegen.runs.states.words import fraction_of, two_words, word
 
-pytestmark = pytest.mark.second
+pytestmark = pytest.mark.rotated
 
 LINKS = "(x_dot**2 + y_dot**2)/2 + 0.75*(u_dot**2 + w_dot**2)/2 - y - 0.75*w"
 MUTUAL = "a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)"
@@ -87,7 +87,7 @@ def check_step(stepper: sc.Stepper, form, method: str, q, p, t: float = 0.0) -> 
                 )
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(
     ("name", "method"),
     [
@@ -106,7 +106,7 @@ def test_steps(name: str, method: str) -> None:
     check_step(stepper, system(name), method, *consistent(stepper, name), t=0.5)
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("top", [False, True])
 def test_rotations(top: bool) -> None:
     """The same for a free body and, in the moving frame, a heavy top, whose quaternions keep their length."""
@@ -123,7 +123,6 @@ def test_rotations(top: bool) -> None:
         assert largest(maps[-1] - maps[0]) < 1e-30
 
 
-@pytest.mark.second
 def test_first_order() -> None:
     """Steps of a guiding centre are accurate to 3e-31, and it stays where H has its value."""
     text = "(1 + x**2 + y**2)*(x*y_dot - y*x_dot)/2 - cos(x) - sin(y)"
@@ -165,7 +164,6 @@ def test_numbers_of_first_order_states() -> None:
         assert abs(run.mp("x")[0] - expected[0]) + abs(run.mp("x_dot")[0] - expected[1]) < 1e-32
 
 
-@pytest.mark.second
 def test_constraints_hold() -> None:
     """Constraints of a four-bar and their rates hold to 1e-30, and so does the energy but for the order."""
     stepper = compiled("four-bar", "svi:8")
@@ -227,7 +225,6 @@ def test_initial_states() -> None:
     assert (many.q.low[-1] == again.q.low[-1]).all()
 
 
-@pytest.mark.second
 @pytest.mark.parametrize("degree", [2, 5, 9])
 def test_constraints_by_multipliers(degree: int) -> None:
     """Steps by RATTLE that are continued in two words agree with those by the factors of all unknowns."""
@@ -252,8 +249,7 @@ def test_constraints_by_multipliers(degree: int) -> None:
             assert max(abs(each).max() for each in runs[0].constraint_values()) < 5e-31
 
 
-@pytest.mark.tiers(0, 0)
-@pytest.mark.parametrize("degree", [3, *(pytest.param(s, marks=pytest.mark.second) for s in (9, 18))])
+@pytest.mark.parametrize("degree", [3, 9, 18])
 def test_velocities_by_iteration(degree: int) -> None:
     """Steps of variable masses by fixed-point iteration agree with those by the factors of all unknowns."""
     transformed = sc.reparametrise(system("kepler"), "frequency")

@@ -211,20 +211,20 @@ FAILING = {
 """With one trajectory that fails: between others, as the last, whose lane is filled with a copy, and in a segment."""
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize("name", FAILING)
 def test_a_failing_trajectory_equals_its_single_run_and_does_not_affect_others(name: str) -> None:
     FAILING[name].check()
 
 
-@pytest.mark.tiers(5, 6)
+@pytest.mark.tiers(5, 5)
 @pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
 @pytest.mark.parametrize("name", CASES)
 def test_each_trajectory_equals_the_single_run(name: str) -> None:
     CASES[name].check()
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("count", [1, 2, 7, 33])
 def test_heavy_tops_in_lanes_have_the_bits_of_single_runs(count: int) -> None:
     """With flags that fuse no products."""
@@ -241,7 +241,7 @@ def test_heavy_tops_in_lanes_have_the_bits_of_single_runs(count: int) -> None:
         assert runs.p[:, j].tobytes() == alone.p.tobytes()
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_parameters_are_named_rows_or_one_row_per_trajectory() -> None:
     stepper = stepper_for("planar-pendulum", sc.SVI(5))
     q, p = states("planar-pendulum", 3)
@@ -272,7 +272,7 @@ def test_ensembles_with_few_or_no_steps() -> None:
     assert still.energy().shape == (1, COUNT)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_rows_in_transformed_time_keep_their_tau() -> None:
     """Each trajectory reaches t_end within a step of its own; those that leave x > 0 fail, one in its first step."""
     system = sc.LagrangianSystem.from_text(name="root", coordinates=["x"], lagrangian="x_dot**2/2 - x**(5/2)")
@@ -317,7 +317,7 @@ def kepler() -> sc.Stepper:
 
 
 class TestFailures:
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_block_without_active_trajectories_stops(self):
         stepper = stepper_for("relativistic-particle", sc.SVI(5))
         q, p = states("relativistic-particle", 8)
@@ -351,7 +351,7 @@ class TestFailures:
         assert len(set(ends)) == 1
 
 
-@pytest.mark.tiers(0, 4)
+@pytest.mark.rotated
 @pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
 @pytest.mark.parametrize(
     ("name", "method", "plan"),
@@ -595,7 +595,7 @@ class TestCommandLine:
             assert file["steps"].max() > 0
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
 def test_lane_with_failed_iteration_continues_as_scalar_across_breakpoints():
     """Stiff from the second piece on, where Newton's iteration alone leads on."""

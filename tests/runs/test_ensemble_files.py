@@ -27,7 +27,7 @@ def ensemble() -> sc.EnsembleTrajectory:
     return stepper.integrate_ensemble(q, p, h=0.05, steps=60, save_every=3, parameters={"mu": [1.0, 1.1, 1.2]})
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("name", ["a.h5", "a.nc", "a.zarr"])
 def test_files_are_read_by_xarray(xarray, ensemble, tmp_path, name):
     path = tmp_path / name

@@ -113,7 +113,7 @@ CHAOTIC = {
 }
 
 
-@pytest.mark.tiers(0, 12)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.covering(2)
 @pytest.mark.parametrize("tolerance", TOLERANCES)
 @pytest.mark.parametrize("name", [*REGULAR, *CHAOTIC])
@@ -134,7 +134,7 @@ DRIVEN = {
 }
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.covering
 @pytest.mark.parametrize("tolerance", TOLERANCES)
 @pytest.mark.parametrize("name", DRIVEN)
@@ -145,7 +145,7 @@ def test_chaos_under_forces_is_reported_by_a_tangent_vector(name, tolerance):
     assert reports(stepper, q, p, t_end, tolerance=tolerance) == chaotic
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("tolerance", [0.0, 1e-9])
 @pytest.mark.parametrize("name", ["Henon-Heiles, E = 1/6.2", "double pendulum"])
 def test_growth_is_that_of_nearby_runs(name, tolerance):
@@ -175,7 +175,7 @@ def test_growth_is_measured_only_where_the_check_needs_it():
     assert reports(stepper, q, p, t_end)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("scale", [2.0**-600, 2.0**600])
 def test_states_of_extreme_size_are_checked_by_repetition(scale):
     """Squares of such numbers are not representable."""
@@ -237,7 +237,7 @@ ORBITS = {  # initial velocities and periods: Hairer, Norsett, Wanner, Solving O
 }
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("velocity", ORBITS)
 def test_growth_that_leaves_ten_digits_is_not_reported(velocity):
     """Arenstorf's orbits return to their start with 12 digits; perturbations grow by a factor of 5e4."""
@@ -247,7 +247,7 @@ def test_growth_that_leaves_ten_digits_is_not_reported(velocity):
     assert np.abs(run.q[-1] - [0.994, 0.0]).max() < 1e-12
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("method", ["svi:4", "svi:8"])
 def test_a_fall_from_the_rounded_equilibrium_is_reported(method):
     """The angle pi is rounded: the fall of a pendulum at rest is amplified rounding from its start."""
@@ -256,7 +256,7 @@ def test_a_fall_from_the_rounded_equilibrium_is_reported(method):
         stepper.integrate([math.pi], [0.0], t_end=45.0)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("origin", [0.0, 1000.0])
 def test_a_regular_motion_in_a_magnetic_field_is_not_reported_far_from_the_origin(origin):
     """Its momenta are those of the vector potential there."""
@@ -279,7 +279,7 @@ def test_small_motions_on_a_rod_are_not_reported(angle, unit, tolerance):
     assert not reports(sc.compile_stepper(rod, "svi:2"), *start, 20.0, tolerance=tolerance)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize(("q", "t_end"), [([2.5, -2.0], 30.0), ([2.5, -2.0], 40.0), ([2.4, -2.0], 40.0)])
 def test_reported_growth_has_the_number_of_digits_left(q, t_end):
     """Compare the number with the difference from a method of another order: three double pendulums, 5 to 9 digits."""

@@ -24,7 +24,7 @@ from scvi_codegen.interfaces.derivation.page.document import derivation_html
 from scvi_codegen.interfaces.models.model_files.model_file import dump_model, parse_model
 from scvi_codegen.runs.stepping.compiled_method import Variants
 
-pytestmark = pytest.mark.second
+pytestmark = pytest.mark.rotated
 
 FLAGS = ("-O1",)
 BALL = lagrange("ball", "y", "y_dot**2/2 - g*y", g=1.0)
@@ -59,7 +59,7 @@ def folded(start: float, v: float, t: float) -> float:
     return abs((start + v * t + 1.0) % 2.0 - 1.0)
 
 
-@pytest.mark.tiers(0, 2)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("kind", BOUNCES)
 def test_bounces_of_a_ball_form_a_geometric_series(ball, kind):
@@ -74,6 +74,7 @@ def test_bounces_of_a_ball_form_a_geometric_series(ball, kind):
     assert run.t[-1] == 12.72
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("e", [0.5, 0.8, 0.95])
 def test_accumulation_ends_the_run_and_is_named(ball, e):
     """The ball does not fall through the floor where infinitely many bounces take a finite time."""
@@ -113,7 +114,6 @@ def test_start_behind_a_wall(ball):
     assert abs(run.events[0].t[0] - (1.5 + math.sqrt(1.25))) < 1e-14
 
 
-@pytest.mark.rotated
 def test_accumulation_of_a_relativistic_ball():
     """Its momentum is linear in time and multiplied by -e at each bounce: small impulses are as precise as large ones.
 
@@ -130,7 +130,6 @@ def test_accumulation_of_a_relativistic_ball():
     assert np.abs(np.diff(run.t) - run.step_sizes[:-1]).max() < 1e-12
 
 
-@pytest.mark.tiers(0, 3)
 @pytest.mark.covering
 @pytest.mark.parametrize("t0", [0.0, 7e4])
 @pytest.mark.parametrize("h", [50.0, 5.0, 0.5])
@@ -165,7 +164,6 @@ def test_moving_wall_accelerates_a_point():
             assert abs(t[k] - float(now)) < 3e-13
 
 
-@pytest.mark.rotated
 def test_energy_of_a_double_pendulum_at_a_wall():
     """The mass matrix depends on the state; impulses conserve energy to round-off, trajectories have order 16."""
     system = lagrange("double pendulum", "a b", "a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)")
@@ -307,7 +305,6 @@ FAULTS = {
 }
 
 
-@pytest.mark.rotated
 @pytest.mark.parametrize("fault", FAULTS)
 def test_certificates_measure_impacts(fault):
     """A planted error of 1e-7 of the impulse, or of 1e-9 of the state, is noticed."""
@@ -327,7 +324,6 @@ def test_certificates_measure_impacts(fault):
     assert fault in violated if fault != "none" else not violated
 
 
-@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("flags", [("-O0",), ("-O3",)], ids=" ".join)
 @pytest.mark.parametrize("restitution", [1.0, 0.9])
@@ -445,7 +441,6 @@ CHAIN = sc.LagrangianSystem.from_text(
 )
 
 
-@pytest.mark.rotated
 @pytest.mark.parametrize(
     ("plan", "bound"), [({"h": 0.25, "steps": 160}, 1e-11), ({"t_end": 40.0, "tolerance": 1e-10}, 1e-7)]
 )
@@ -506,7 +501,6 @@ def chart(x, t):
     return np.array(columns).T
 
 
-@pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize(("b", "e"), [(0.0, 1.0), (0.0, 0.8), (0.2, 1.0), (0.2, 0.7)])
 def test_impacts_of_constrained_systems_equal_those_of_free_coordinates(b, e):
@@ -542,7 +536,6 @@ def test_impacts_of_constrained_systems_equal_those_of_free_coordinates(b, e):
         assert np.abs(adjoint - cotangents[-1] @ found).max() < 1e-13 * np.abs(found).max()
 
 
-@pytest.mark.rotated
 def test_impacts_of_relativistic_pendulums_contain_the_work_of_a_moving_constraint():
     """The impulse of a moving rod does work: H(p + lambda g_q + G^T mu) - H(p) = -lambda g_t - mu c_t."""
     options = {"coordinates": ["x", "y"], "parameters": {"b": 0.3}, "constraints": ["(x - b*sin(t))**2 + y**2 - 1"]}
@@ -559,7 +552,6 @@ def test_impacts_of_relativistic_pendulums_contain_the_work_of_a_moving_constrai
     assert np.abs(one.q[-1] - [0.3 * np.sin(16.0) + np.sin(two.q[-1, 0]), -np.cos(two.q[-1, 0])]).max() < 1e-10
 
 
-@pytest.mark.rotated
 def test_derivatives_through_impacts_of_a_moving_rod_with_a_quartic_kinetic_energy():
     """Differences of sixth order also require impacts that depend smoothly on the initial state, to round-off."""
     rod = sc.LagrangianSystem.from_text(
@@ -590,7 +582,6 @@ def test_derivatives_through_impacts_of_a_moving_rod_with_a_quartic_kinetic_ener
     assert np.abs(ends - np.polynomial.Polynomial.fit(u, ends, 5)(u)).max() < 1e-14
 
 
-@pytest.mark.rotated
 def test_impacts_of_constrained_arrays():
     """A pendulum of five links that hits a wall, in index notation and with known sizes."""
     links = sc.LagrangianSystem.from_text(
@@ -616,7 +607,6 @@ def test_impacts_of_constrained_arrays():
     assert np.abs(tangents[0] - tangents[1]).max() < 1e-10 * np.abs(tangents[1]).max()
 
 
-@pytest.mark.rotated
 def test_impacts_with_a_time_transformation():
     """Reversible steps through close encounters, against adaptive ones."""
     kepler = lagrange("kepler", "x y", "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2) + 0*e", e=0.97)
@@ -647,7 +637,6 @@ BODY = sc.LagrangianSystem.from_text(
 )
 
 
-@pytest.mark.rotated
 def test_corners_of_a_rigid_body_hit_the_floor():
     """Energy and what the floor does not change are conserved; momenta stay tangent to the unit quaternions."""
     stepper = sc.compile_stepper(BODY, "svi:6")
@@ -696,7 +685,6 @@ def test_derivatives_through_impacts_of_a_rigid_body(k):
     assert np.abs(found - np.concatenate([q, p])).max() < 1e-10
 
 
-@pytest.mark.rotated
 def test_impacts_of_a_body_that_turns_in_a_plane():
     """A rod that falls on its ends: with a rotation about one axis and with an angle."""
     rod = sc.LagrangianSystem.from_text("plane", coordinates=["z", "a"], lagrangian="z_dot**2/2 + 2*a_dot**2/10 - z")
@@ -752,7 +740,6 @@ def differences(run, z, values):
     return np.array(columns).T
 
 
-@pytest.mark.rotated
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("event", "method", "e", "tolerance"),
@@ -819,7 +806,6 @@ def test_derivatives_through_impacts_do_not_depend_on_the_turns_of_an_angle(turn
     assert run.sensitivity().state[-1][:, 0] == pytest.approx(np.concatenate(differences), rel=1e-4, abs=1e-4)
 
 
-@pytest.mark.rotated
 def test_derivatives_are_refused_where_they_do_not_exist(point, ball):
     grazing = point.integrate(
         [-3.0, 1.0 - 1e-14], velocity=[1.0, 0.0], h=0.37, t_end=6.0, events=sc.impact("x**2 + y**2 - 1")
@@ -914,7 +900,6 @@ def test_model_files_contain_events(tmp_path):
         parse_model(MODEL.replace("where", "were"))
 
 
-@pytest.mark.rotated
 @pytest.mark.parametrize("steps", ["step = 0.1\n", pytest.param("", marks=pytest.mark.full)])
 def test_generated_programs_print_events(tmp_path, steps):
     """The C program and the Python package of a folder have the events of a run of the model."""

@@ -19,7 +19,7 @@ from scvi_codegen.runs.stepping import compiled_method
 from scvi_codegen.systems.event import as_events
 from scvi_codegen.systems.system import MechanicalSystem
 
-pytestmark = pytest.mark.second
+pytestmark = pytest.mark.rotated
 
 METHODS = (sc.SVI(3), sc.SpectralCollocation(6), sc.Composition(8))
 MORE_METHODS = (
@@ -83,7 +83,6 @@ def polynomials() -> sc.Stepper:
     return sc.compile_stepper(system, sc.StoermerVerlet(), flags=FLAGS, events=[*functions, near])
 
 
-@pytest.mark.rotated
 @settings(max_examples=300, deadline=None)
 @given(
     st.lists(st.integers(1, 199), min_size=4, max_size=4, unique=True),
@@ -111,6 +110,7 @@ def test_few_roots_of_polynomials_of_degree_eight_are_missed(polynomials):
     assert found > 0.98 * 500 * 8
 
 
+@pytest.mark.second
 @settings(max_examples=200, deadline=None)
 @given(st.floats(0.15, 0.85), st.integers(1, 7), st.sampled_from([1.0, -1.0]))
 def test_pairs_of_close_roots_are_found(polynomials, middle, exponent, sign):
@@ -120,7 +120,6 @@ def test_pairs_of_close_roots_are_found(polynomials, middle, exponent, sign):
     assert np.abs(found.t - [middle - distance, middle + distance]).max() < 1e-15 / distance
 
 
-@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "function", ["cos(6*t) - 0.97", "exp(t) - 1.8 - 0.05*sin(20*t)", "sin(3*pi*t + 0.1)*(t + 1)", "sin(15*pi*t + 0.1)"]
@@ -163,7 +162,6 @@ def test_root_at_the_start_is_ignored_and_one_at_the_end_is_found():
     assert [found.t.tolist() for found in run.events] == [[], [2.0], []]
 
 
-@pytest.mark.rotated
 def test_more_crossings_than_the_buffer_of_one_call(pendulum):
     run = pendulum.integrate([0.1], [0.0], h=0.5, steps=3000, events=["sin(8*t)", "cos(8*t)"])
     for found, first in zip(run.events, (0.0, 0.5), strict=True):
@@ -239,7 +237,6 @@ def test_crossings_are_found_afterwards_up_to_the_terminal_event(kepler):
         assert np.abs(found.t - expected.t).max() < 1e-13
 
 
-@pytest.mark.rotated
 def test_momenta_of_hamiltonians_have_user_defined_names():
     system = hamilton("pendulum", "q", "J**2/2 - cos(q)", momenta="J")
     run = compiled_plainly(system, sc.SVI(4)).integrate([1.0], [0.0], h=0.1, steps=100, events=["J", "q_dot", "q"])
@@ -250,7 +247,6 @@ def test_momenta_of_hamiltonians_have_user_defined_names():
     assert np.abs(run.events[2].t - expected[1].t).max() < 1e-12
 
 
-@pytest.mark.rotated
 def test_point_vortices_have_no_velocity_kernel():
     vortices = sc.problem("point-vortices")
     stepper = compiled_plainly(vortices.system, sc.SVI(3))
@@ -273,7 +269,7 @@ def test_events_from_sympy_functions_of_time():
     assert np.abs(run.events[2].q - 0.1).max() < 1e-14
 
 
-@pytest.mark.tiers(6)
+@pytest.mark.tiers(6, 6)
 @pytest.mark.parametrize(
     ("event", "error", "words"),
     [
@@ -299,7 +295,6 @@ def test_stepper_with_events_is_pickled(pendulum):
     assert watched.with_events(()).source == pendulum.source
 
 
-@pytest.mark.rotated
 @pytest.mark.covering
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 @pytest.mark.parametrize(
@@ -328,7 +323,6 @@ def test_source_with_events_extends_the_plain_one_without_warnings(compiler, nam
     assert (result.returncode, result.stderr) == (0, "")
 
 
-@pytest.mark.rotated
 def test_a_stepper_may_be_compiled_with_events():
     stepper = sc.compile_stepper(FREE, sc.SVI(2), flags=FLAGS, events=sc.Event("q - 1", terminal=True))
     assert "free_particle" in stepper.source.prefix
@@ -369,7 +363,6 @@ def thrown(request):
     return compiled_plainly(BALL, sc.SVI(2)), compiled_plainly(DISC, sc.SVI(2)), ("y", "x", "y")
 
 
-@pytest.mark.rotated
 @pytest.mark.covering
 @pytest.mark.filterwarnings("ignore::scvi_codegen.AccuracyWarning")
 @pytest.mark.parametrize(("floor", "error"), [(0.0, 1e-12), (1000.0, 2e-5)])
@@ -398,7 +391,6 @@ def test_bouncing_ball_runs_until_its_bounces_accumulate(thrown, floor, error, h
     assert abs(abs(float(str(raised.value).split("t = ")[1].split(":")[0])) - end) < error
 
 
-@pytest.mark.tiers(0, 1)
 @pytest.mark.covering
 @pytest.mark.parametrize("t0", [0.0, 7e4])
 @pytest.mark.parametrize(("h", "start", "velocity"), CORNERS)

@@ -8,7 +8,7 @@ import scvi_codegen as sc
 from scvi_codegen.analysis.verification.certificate import Outcome
 from scvi_codegen.runs.events import detection
 
-pytestmark = pytest.mark.second
+pytestmark = pytest.mark.rotated
 
 FLAGS = ("-O1",)
 GAS = lagrange("gas", ["r[N, 2]"], "sum(i in N, (r_dot[i, 0]**2 + r_dot[i, 1]**2)/2 + 0*d)", d=0.25)
@@ -31,6 +31,7 @@ def folded(r, v, t):
     return np.abs((r + v * t + 1.0) % 2.0 - 1.0)
 
 
+@pytest.mark.second
 def test_a_box_of_particles(gas):
     """Each particle is reflected by itself; elements are numbered along the loops."""
     random = np.random.default_rng(2)
@@ -56,6 +57,7 @@ def test_a_restored_run_continues_with_its_events(gas):
     assert sum(len(each) for each in two.events) == sum(len(each) for each in one.events) > 0
 
 
+@pytest.mark.second
 def test_discs_exchange_momentum_in_pairs(gas):
     """Hard discs: energy and momentum are those of the start, and every crossing is that of the pair it names."""
     random = np.random.default_rng(4)
@@ -94,7 +96,6 @@ def test_more_impacts_in_a_step_than_memory_for_them(gas, monkeypatch):
     assert np.abs(run.q["r"][-1] - folded(r, v, 1.0)).max() < 1e-14
 
 
-@pytest.mark.rotated
 def test_an_event_of_every_element_equals_events_of_entries():
     """Conditions, maps of velocities and restitution in loops, their derivatives, and adaptive steps."""
     stepper, n = sc.compile_stepper(CHAIN, "svi:4", flags=FLAGS), 4
@@ -128,7 +129,6 @@ def test_an_event_of_every_element_equals_events_of_entries():
     assert np.abs(tangents[0] - tangents[1]).max() < 1e-11 * np.abs(tangents[1]).max()
 
 
-@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("of_known_sizes", [False, pytest.param(True, marks=pytest.mark.full)])
 def test_gradients_through_events_of_elements(of_known_sizes):
     """The adjoint equals the tangents to round-off, and extrapolated differences of the run."""
@@ -209,7 +209,6 @@ AROUND = [
 ]
 
 
-@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("of_known_sizes", [False, pytest.param(True, marks=pytest.mark.full)])
 @pytest.mark.parametrize("h", [0.05, None])
 def test_ensembles_with_inputs_and_events_equal_single_runs(of_known_sizes, h):

@@ -21,7 +21,7 @@ def times(function: str, then: dict[str, str] | None = None, **steps: Any) -> An
     return free().integrate([0.0], [0.0], events=[sc.Event(function, then=then)], check_growth=False, **steps)
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("then", [KICK, None])
 @pytest.mark.parametrize("steps", [{"t_end": 500.5}, {"h": 10.0, "steps": 50}, {"h": 0.7, "steps": 715}])
 def test_every_kick_is_found(then: dict[str, str] | None, steps: dict[str, Any]) -> None:

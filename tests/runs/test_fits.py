@@ -8,7 +8,7 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 
-pytestmark = pytest.mark.second
+pytestmark = pytest.mark.rotated
 
 TOP = sc.LagrangianSystem.from_text(
     "top",
@@ -37,6 +37,7 @@ def fitted(stepper, true, measured, observed, **more):
     return sc.fit(stepper, true.t[::2], measured, h=0.1, observed=observed, **guess, **more)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("segments", [1, 4])
 def test_inertia_and_attitude_are_fitted_to_measured_matrices(stepper, true, segments):
     exact = true.rotation().reshape(-1, 9)[::2]
@@ -54,6 +55,7 @@ def test_inertia_and_attitude_are_fitted_to_measured_matrices(stepper, true, seg
     assert np.abs(again.rotation() - true.rotation()).max() < NOISE
 
 
+@pytest.mark.second
 def test_body_momenta_are_measurements(stepper, true):
     measured = np.hstack([true.body_momentum(), true.rotation()[:, 2]])[::2]
     names = ["p_R_1", "p_R_2", "p_R_3", "R_31", "R_32", "R_33"]

@@ -11,7 +11,7 @@ def largest_energy_error(stepper: sc.Stepper, q: object, v: object) -> float:
     return float(np.abs(run.energy() / run.energy()[0] - 1).max())
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(
     ("lagrangian", "solver", "allowed"),
     [
@@ -37,7 +37,7 @@ def test_array_of_balls_on_a_stiff_floor_conserves_its_energy() -> None:
     assert max(errors) < 1e-4, errors
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_smooth_motion_takes_the_same_steps() -> None:
     """The examination of free flights rejects no step of a comet, which moves nearly freely far from its sun."""
     comet = sc.LagrangianSystem.from_text("comet", ["x", "y"], "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)")

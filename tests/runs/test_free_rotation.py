@@ -95,7 +95,7 @@ def test_hamiltonians_with_rotations_have_the_same_steps(moving):
     np.testing.assert_allclose(np.ravel([q, p]), np.ravel([run.q[1], run.p[1]]), rtol=0, atol=1e-15)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_arrays_of_bodies_move_as_by_an_implicit_method():
     body = "2*omega_1[i]**2 + J[i]*omega_2[i]**2 + 2*omega_3[i]**2 + x_dot[i]**2/2 - x[i]*R_33[i]"
     system = sc.LagrangianSystem.from_text(

@@ -14,7 +14,7 @@ def pendulum_on_cart():
     return sc.compile_stepper(sc.problem("cart-pole").system, "svi:2", flags=QUICK_FLAGS)
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(
     ("coordinates", "lagrangian", "q", "v", "dropped"),
     [

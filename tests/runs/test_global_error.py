@@ -254,7 +254,7 @@ class TestChaos:
         assert apart[:-1].max() <= 1e-6 * np.linalg.norm(q)
         assert apart[-1] <= run.global_error * np.linalg.norm(run.q[-1])
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     @pytest.mark.parametrize("more", [{}, {"save_every": 7}, {"t_eval": np.linspace(0.0, 70.0, 50)}])
     def test_default_run_warns_of_chaos(self, burrau_stepper, more):
         with pytest.warns(sc.AccuracyWarning, match="errors: small perturbations of the initial state grew"):
@@ -262,7 +262,7 @@ class TestChaos:
         with pytest.warns(sc.AccuracyWarning, match="a run with the initial state perturbed by 8.9e-16"):
             burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, **more, check_growth=True)
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_late_encounters_are_detected_in_most_runs(self, burrau_stepper):
         """Errors of nearby initial states grow in bursts, some of them late; all are found by repeating all steps."""
         random, found = np.random.default_rng(1), []
@@ -277,7 +277,7 @@ class TestChaos:
             found.append(len(heard) > count)
         assert np.mean(found) > 0.8
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     @pytest.mark.filterwarnings("error")
     def test_short_or_unchecked_runs_do_not_warn(self, burrau_stepper):
         burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, check_growth=False)
@@ -288,14 +288,14 @@ class TestChaos:
         kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=600.0, check_growth=True)
         kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=600.0, tolerance=1e-9)
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_check_does_not_change_the_states(self, burrau_stepper):
         with pytest.warns(sc.AccuracyWarning):
             one = burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0)
         other = burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, check_growth=False)
         assert np.array_equal(one.q, other.q)
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_long_runs_are_checked_up_to_a_limit_or_completely(self):
         """Duffing's oscillator with two wells, chaotic after t = 1000 alone; damping excludes tangent vectors."""
         late = "(1 + tanh(t - 1000))/2"
@@ -367,7 +367,7 @@ class TestEnsembles:
         assert runs.confirmed_digits[1] == 0
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 class TestOtherRuns:
     def test_saved_states_and_events_are_confirmed(self, kepler_stepper):
         start = {"q": [1.6, 0.0], "p": [0.0, 0.5]}
@@ -382,7 +382,7 @@ class TestOtherRuns:
         assert len(saved) == -(-saved.steps // 10) + 1
         assert saved.global_error <= 1e-9
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     @pytest.mark.parametrize("indexed", [False, True], ids=["scalar", "array"])
     def test_confirmed_runs_with_inputs(self, indexed):
         """x'' = -x + u with u = 1 - t/2 until t = 2, then 0, from t = 0.5: exact."""
@@ -457,7 +457,7 @@ class TestCommandLine:
         assert found["digits"] == math.floor(-math.log10(found["estimate"])) >= 9
         assert (found["requested"], found["confirmed"], found["confirmed_until"]) == (1e-9, True, saved["t"][-1])
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_unconfirmed_result_exits_with_1(self):
         assert re.search(
             r"the bound 1e-09 on the global error is confirmed only until t = [\d.]+",
@@ -484,7 +484,7 @@ class TestCommandLine:
         return path
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("power", [-660, 660])
 def test_global_errors_of_linear_systems_are_scale_invariant(power):
     """Squares of such states overflow, or are 0."""

@@ -25,7 +25,7 @@ def size_of(system: sc.LagrangianSystem) -> str:
     return "4" if system.coordinates[0].name == "q_0" else "N"
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 def test_time_transformation_equals_that_of_the_entries(ring):
     options = {"velocity": 0 * Q, "h": 0.1, "t_end": 2.0}
     g = f"1/(1 + q[{size_of(ring)}-1]**2 + sum(i in {size_of(ring)}, q[i]**2))"
@@ -55,7 +55,7 @@ def test_time_transformation_by_momenta_of_a_hamiltonian():
     assert str(found) == "1/(p_0**2 + p_1**2 + p_2**2 + 1)"
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_events_in_index_notation_change_the_state():
     system = sc.LagrangianSystem.from_text(name="ring", coordinates=["q[4]"], lagrangian=RING.format(N=4))
     by_index = sc.Event("q[2] - sum(i in 4, q[i])**2", then={"p_q[2]": "-p_q[2]/2"}, where="q_dot[1] < 1")

@@ -77,7 +77,7 @@ def test_energy_is_kept_over_ten_thousand_crossings():
     assert np.abs(run.energy() - run.energy()[0]).max() < 2e-13
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("method", "order"), [("svi:1", 2), ("svi:2", 4), ("svi:4", 8)])
 def test_orders_and_tolerances_across_crossings(method, order):
     step = compiled("x_dot**2/2 - x**2/2 - V*unit_step(x)", "x", method, V=0.3)
@@ -88,7 +88,7 @@ def test_orders_and_tolerances_across_crossings(method, order):
     assert order == 2 or run(t_end=3.0, tolerance=1e-8) < 1e-7
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_derivatives_through_refraction_are_those_of_runs():
     text = f"{PLANE} + y*x_dot*b*unit_step(x - c*t**2) - V*unit_step(x - c*t**2 + y/3)*(1 + m*x_dot**2)"
     free, disc = compiled(text, b=0.2, c=0.2, V=0.3, m=0.1), compiled(f"{PLANE} - V*unit_step(1 - x**2 - y**2)", V=0.9)
@@ -103,7 +103,7 @@ def test_derivatives_through_refraction_are_those_of_runs():
         assert by == pytest.approx(np.transpose(exact), abs=1e-8)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_corners_starts_and_grazes():
     corner = compiled(f"{PLANE} - where(x > 0, 0.3, 0) - where(y > 0, 0.2, 0)")
     for q, p in (((-1.0, -1.0), (0.4**0.5, 0.6**0.5)), ((0.0, -1.0), (1.0, 0.6**0.5)), ((0.0, 0.0), (1.0, 1.0))):
@@ -150,7 +150,7 @@ def outcome(name, step):
     return {0: MODES, 1: WARNS}.get(sum("kinks" in str(warning.message) for warning in issued))
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("name", ROWS)
 def test_features_locate_kinks_or_warn_or_refuse(name):
     assert (outcome(name, "positive_part(x)**2"), outcome(name, "unit_step(x)")) == ROWS[name]

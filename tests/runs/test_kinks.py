@@ -37,20 +37,20 @@ def without_end(case: Case) -> dict:
     return {name: value for name, value in case.arguments.items() if name != "t_end"}
 
 
-@pytest.mark.tiers(5, 8)
+@pytest.mark.tiers(5, 5)
 @families
 def test_motions_across_kinks_are_within_tolerances(family):
     assert not wrong(family, [1], ["svi:4"], [kind for kind in KINDS if kind != "order"])
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @families
 def test_orders_across_kinks(family):
     """SVI(1), SVI(2) and SVI(4) have orders 2, 4 and 8."""
     assert not wrong(family, [1], METHODS, ["order"])
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @families
 def test_methods_of_other_orders_are_within_tolerances(family):
     kinds = "round-off", "tolerance", "error="
@@ -70,7 +70,7 @@ def test_two_thousand_cases_across_kinks(family, method):
     assert not wrong(family, range(first, first + 84), [method])
 
 
-@pytest.mark.tiers(3, 8)
+@pytest.mark.tiers(3, 3)
 @families
 def test_restored_runs_have_the_same_bits_at_kinks(family):
     """After each of the first steps, some of which end at kinks."""
@@ -89,7 +89,7 @@ def test_restored_runs_have_the_same_bits_at_kinks(family):
         assert {*ends} == {(run.t, *run.q, *run.p)}
 
 
-@pytest.mark.tiers(3, 8)
+@pytest.mark.tiers(3, 3)
 @families
 @pytest.mark.parametrize("plan", [{}, {"tolerance": 1e-6}, {"h": 0.01}], ids=["round-off", "tolerance", "fixed"])
 def test_trajectories_of_ensembles_have_the_bits_of_runs(family, plan):
@@ -105,7 +105,7 @@ def test_trajectories_of_ensembles_have_the_bits_of_runs(family, plan):
         assert np.array_equal(together.ends[2][j], run.p[-1])
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("degree", [2, 4, 8])
 def test_derivatives_across_kinks_are_those_of_coarse_fixed_steps(degree):
     """A stiff floor, drag and a force that jumps, at steps whose own error is up to 1e-2."""
@@ -132,7 +132,7 @@ def test_derivatives_across_kinks_are_those_of_coarse_fixed_steps(degree):
     assert np.abs(run.pullback(seeds).q[0] / exact[:, 0] - 1).max() < 1e-9
 
 
-@pytest.mark.tiers(1, 8)
+@pytest.mark.tiers(1, 1)
 @families
 def test_derivatives_across_kinks_are_those_of_the_motion(family):
     """With respect to the initial state, to differences of the reference; to parameters, to differences of runs."""

@@ -76,7 +76,7 @@ def test_ordinary_bodies_need_no_newton_steps():
     assert np.abs(run.rotation("R")[-1] - attitude(0, 0.1)).max() < 1e-11
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_newtons_method_in_the_same_library_gives_the_same_bits():
     source, interface = sc.generate_source(body(), sc.SVI(4), controlled=True)
     own = sc.Stepper(source, interface, flags=PORTABLE_FLAGS)
@@ -87,7 +87,7 @@ def test_newtons_method_in_the_same_library_gives_the_same_bits():
     assert np.array_equal(runs[0].q, runs[1].q)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_ensembles_have_the_bits_of_single_runs():
     moments = np.array([[LIGHT, 1.0, 1.0], [1.0, 1.0, 1.0], [1.0, LIGHT, 1.0]])
     of = stepper("svi:4")

@@ -74,7 +74,7 @@ def test_nonlinear_chain_equals_newtons_method():
     assert runs[0].iterations.mean() < 8
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_energy_of_long_runs_does_not_drift(as_users_compile):
     """With the low words of the first forces, which are far off at such steps, it drifted by 1e-14 a step."""
     pinned = ring(further="".join(f"-k*q{i}**2/9" for i in range(COUNT)), name="pinned_ring")

@@ -141,7 +141,7 @@ class Begun:
         return float(momentum - first), float(places - begun - first * (self.time() - t))
 
 
-@pytest.mark.tiers(0, 4)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(6)
 @pytest.mark.parametrize("name", CASES)
 def test_sums_of_high_and_low_words_are_exact(name: str) -> None:
@@ -160,7 +160,7 @@ def test_sums_of_high_and_low_words_are_exact(name: str) -> None:
     assert worst[1] < (1e-16 if "composition" in name else 1e-17)  # whose coefficients have 53 bits
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("name", ["svi", "gauss of a Hamiltonian", "svi, coupled"])
 def test_ensemble_states_are_within_a_rounding_of_exact_sums(name: str) -> None:
     """Low words keep what sums leave: high words alone are off by no more than half a rounding each, however long."""
@@ -177,7 +177,7 @@ def test_ensemble_states_are_within_a_rounding_of_exact_sums(name: str) -> None:
             assert abs(exact(*(q * MASSES)) - begun_at - first * 64 * k * Fraction(H)) <= most_q * 1.01
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("lengths", ["tolerance", "inputs"])
 def test_times_are_sums_of_all_steps(lengths: str) -> None:
     """Adaptive steps, the last of which ends at t_end, and segments between breakpoints."""
@@ -203,7 +203,7 @@ def tables(code: str) -> dict[str, list[float]]:
     return {name: [float(x) for x in re.findall(r"-?\d[\w.+-]*", text)] for name, text in found}
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("text", ["svi", "gauss", "ensemble", "array"])
 def test_coefficients_and_their_low_words_are_exact(text: str) -> None:
     """For Gauss-Legendre points, compare c, A^2, b A and b of the tableau in 50 digits."""
@@ -230,7 +230,7 @@ BY_DESIGN = ("Newton", "rattle", "lobatto")
 """Forces at the start of their steps are those of the high word: an error like a rounding of the increment."""
 
 
-@pytest.mark.tiers(0, 3)
+@pytest.mark.rotated
 @pytest.mark.parametrize("name", [name for name in CASES if not any(each in name for each in BY_DESIGN)])
 def test_low_words_enter_everywhere_the_state_does(name: str) -> None:
     """A thousandth of the state as its low word, or in its high word: a step has the same forces and velocities."""

@@ -102,7 +102,7 @@ MATRIX = (
 )
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("attitude", [MATRIX, {"euler": "ZXZ", "angles": ANGLES}])
 def test_models_in_python_take_attitudes(attitude):
     system = parse_model(TOP).system

@@ -44,7 +44,7 @@ def apart(r: Any, lengths: Any) -> Any:
     return np.sqrt((between**2).sum(axis=-1))[np.triu_indices(len(r), 1)]
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("lengths", [LENGTHS, LONGER], ids=["default", "longer"])
 def test_temperature_and_pressure_are_those_of_sums_over_all_pairs(lengths: Any) -> None:
     run = motion(lengths)
@@ -103,7 +103,7 @@ def test_observers_are_the_functions_of_trajectories() -> None:
     assert observed[:, 2:].mean(axis=0) == pytest.approx(sc.radial_distribution(run, BOX, largest=2.0, bins=5)[1])
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_unknown_boxes_and_other_systems_are_refused() -> None:
     run = motion()
     with pytest.raises(sc.ArgumentError, match="'L' is not a parameter"):

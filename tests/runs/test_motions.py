@@ -400,7 +400,7 @@ def test_states_by_name_are_projected_and_constraints_are_reported_as_written():
         stepper.integrate(start, {"x": 0, "y": 0, "R": [1, 1, 1]}, h=0.1, steps=1)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_a_bound_of_the_global_error_is_confirmed_for_attitudes():
     motion = MOTIONS["heavy top"]
     stepper = sc.compile_stepper(motion.system, "svi:6", flags=QUICK_FLAGS)
@@ -409,7 +409,7 @@ def test_a_bound_of_the_global_error_is_confirmed_for_attitudes():
     assert run.confirmed_digits >= 9
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_the_fast_top_of_bruels_and_cardona_has_the_published_attitude():
     """O. Bruels, A. Cardona, J. Comput. Nonlinear Dyn. 5 (2010) 031002; quaternion at 0.2 s of Exudyn's heavyTop.py."""
     stepper = sc.compile_stepper(top((15.234375, 0.46875, 15.234375), "15*9.81*R_32"), "svi:8", flags=QUICK_FLAGS)

@@ -6,7 +6,7 @@ from scipy.integrate import solve_ivp
 
 import scvi_codegen as sc
 
-pytestmark = pytest.mark.second
+pytestmark = pytest.mark.rotated
 
 LIGHT, SPAN = 1e-4, 5.0
 
@@ -39,7 +39,7 @@ def angle_alone():
     return solve_ivp(derivative, (0.0, SPAN), (1.0, 0.0), method="DOP853", rtol=1e-13, atol=1e-13).y[0, -1]
 
 
-@pytest.mark.tiers(0, 2)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", ["svi:8", "scvi:4"])
 @pytest.mark.parametrize("tolerance", [None, 1e-9])
@@ -50,6 +50,7 @@ def test_light_cart_is_accelerated_strongly(cart, method, tolerance):
     np.testing.assert_allclose(run.q[:, 0], (np.sin(1.0) - np.sin(run.q[:, 1])) / (1 + LIGHT), rtol=0, atol=allowed)
 
 
+@pytest.mark.second
 def test_step_count_is_bounded_by_the_tolerance(stepper):
     """Rounding that were taken for unresolved motion would end in steps of 1e-17."""
     exact, loose = (stepper.integrate([0, 1], velocity=[0, 0], t_end=SPAN, tolerance=x) for x in (None, 1e-9))
@@ -71,7 +72,6 @@ def test_first_step_of_a_sleeping_top_is_not_tiny():
     assert np.ptp(run.energy()) < 1e-13 * run.energy()[0]
 
 
-@pytest.mark.rotated
 @pytest.mark.usefixtures("as_users_compile")
 def test_velocities_are_found_where_newton_converges_slowly(cart):
     """At one state in a thousand Newton's corrections shrank the misfit by a rounding each, and were given up.

@@ -187,7 +187,7 @@ def test_parameters_that_change_make_another_list() -> None:
     assert runs[0] == pytest.approx(runs[1], abs=1e-12)
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("box", [None, "5", ["5", "L"], ["9", "4*L"]])
 def test_boxes_of_other_shapes_and_none(box: Any) -> None:
@@ -264,7 +264,7 @@ INVALID: tuple[tuple[dict[str, float], str], ...] = (
 )
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("kind", ["run-time sizes", "known sizes"])
 def test_lengths_are_checked_before_every_run(kind: str) -> None:
     points = np.array([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0], [0.0, 1.1, 0.0]])
@@ -286,7 +286,7 @@ def test_lengths_are_checked_before_every_run(kind: str) -> None:
                 call(parameters=parameters)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("size", ["3", "N"])
 def test_lengths_are_checked_before_c_is_generated(size: str, tmp_path: Path) -> None:
     """The program of a package does not check them."""

@@ -44,7 +44,7 @@ def stepper():
     return sc.compile_stepper(sc.problem("kepler").system, "svi:2")
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("situation", SITUATIONS)
 def test_observers_receive_the_states_that_a_run_saves(stepper, situation):
     arguments = STATE | SITUATIONS[situation]

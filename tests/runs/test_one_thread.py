@@ -97,7 +97,7 @@ def test_advancing_array_run_belongs_to_one_thread(arrays: sc.Stepper) -> None:
         enter()
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_run_recorded_into_a_folder_belongs_to_one_thread(stepper: sc.Stepper, tmp_path: Any) -> None:
     run = stepper.start([1.0], [0.0], h=0.1)
     with Holder(run, lambda wait: sc.record_run(run, tmp_path / "run", steps=10, progress=lambda _: wait())):
@@ -111,7 +111,7 @@ def test_owner_thread_may_reenter_a_run(stepper: sc.Stepper) -> None:
     assert saved[-1] == run.checkpoint()
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("kind", ["scalar", "arrays"])
 def test_steps_of_racing_threads_are_all_counted(kind: str, stepper: sc.Stepper, arrays: sc.Stepper) -> None:
     """A thread either makes its steps or is refused."""

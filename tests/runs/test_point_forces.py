@@ -61,7 +61,7 @@ def test_sympy_expressions_give_the_same_forces():
     assert all(sympy.expand(one - other) == 0 for one, other in zip(text.forces, same.forces, strict=True))
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_two_forces_and_others_on_the_same_body_are_added():
     force = {"body": "R", "point": POINT, "force": IN_SPACE}
     both = end_of(point_forces=[force, force], torques={"R": ["0", "c", "0"]}, forces={"x": "-c*x_dot"})
@@ -99,7 +99,7 @@ def test_points_of_systems_without_rotations():
     assert sympy.simplify(sympy.sympify(str(system.forces[0])) - by_hand) == 0
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_model_files_contain_forces_at_points():
     text = """
     [system]

@@ -87,7 +87,7 @@ def adaptive_ratio(name, method, solver, q, p, t, tolerance):
     return max(displaced(q, end, np.ravel(run.q["x"][1])) - 1e-11, 0.0) / run.step_error
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("solver", ["fixed-point", "newton"])
 def test_adaptive_array_run_starts_with_a_correct_step(solver):
     """The curve of a step of three periods is smooth: its end was off by 50 times the state, at an estimate of 0.02."""
@@ -156,7 +156,6 @@ def test_run_with_controller_starts_with_a_correct_step():
         assert abs(run.q[1, 0] - first) < 0.3
 
 
-@pytest.mark.second
 def test_comparison_with_half_steps_does_not_change_a_run():
     """Every 512th step is compared: what goes from step to step stays, by Newton's iteration, too."""
     system = sc.problem("henon-heiles").system
@@ -171,7 +170,6 @@ def test_comparison_with_half_steps_does_not_change_a_run():
         assert whole.step_error < 1e-6
 
 
-@pytest.mark.tiers(0, 1)
 @pytest.mark.covering
 @pytest.mark.parametrize("steps", [{"h": 0.1, "steps": 12}, {"t_end": 0.5, "tolerance": 1e-6}], ids=["h", "t_end"])
 @pytest.mark.parametrize("solver", ["fixed-point", "newton"])

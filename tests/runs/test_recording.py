@@ -248,7 +248,7 @@ class TestFiles:
             assert (file["h"], file["parameters"], file["parameter_names"]) == (H, [1.0], ["mu"])
             assert str(file["title"]) == whole.stepper.title
 
-    @pytest.mark.second
+    @pytest.mark.tiers(0, 1)
     def test_zarr_is_read_by_xarray(self, saved):
         pytest.importorskip("zarr")
         xarray = pytest.importorskip("xarray")
@@ -260,7 +260,7 @@ class TestFiles:
         assert (dataset.q.dims, list(dataset.coordinate)) == (("t", "coordinate"), ["q1", "q2"])
         assert dataset.attrs["method"] == whole.stepper.interface.method
 
-    @pytest.mark.tiers(2)
+    @pytest.mark.tiers(2, 2)
     @pytest.mark.parametrize("suffix", ["h5", "hdf5", "nc"])
     def test_hdf5_is_read_by_xarray(self, saved, suffix):
         pytest.importorskip("h5netcdf")

@@ -141,7 +141,6 @@ def test_certificates_contain_gauge_invariance_and_reduced_symplecticity(system,
     assert ("T*SO(3) and T*S^2" if system is MIXED else "(S^2)") in checks["reduced symplecticity"].statement
 
 
-@pytest.mark.second
 @pytest.mark.parametrize("system", [MIXED, SPINS], ids=lambda system: system.name)
 def test_derivatives_of_the_gauge_are_those_of_differences(system):
     reduction = Reduction(Sources(system, sc.as_method("svi:1")).integrator()[1])

@@ -115,7 +115,7 @@ def test_an_event_sets_an_angular_momentum():
     np.testing.assert_allclose(run.body_momentum()[-1], before * [1, -1, 1], rtol=0, atol=1e-7)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_events_are_found_in_the_names_of_rotations():
     run = compiled(TOP, "svi:6").integrate({"R": ATTITUDE}, velocity={"omega": OMEGA}, h=0.1, steps=60, events=EVENTS)
     tilt, rate, momentum, point = run.events
@@ -174,7 +174,7 @@ def test_a_system_in_sympy_is_that_in_text():
 DIRECTED = ("spherical", ["q"], "(q_dot**2 + n_1_dot**2 + n_2_dot**2 + n_3_dot**2 - q**2)/2 - n_3*q")
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_spins_and_directions_of_all_lengths_are_read():
     """Directions have any length, spins keep theirs; a small radial part of typed digits is removed."""
     stepper = sc.compile_stepper(sc.LagrangianSystem.from_text(*DIRECTED, directions=["n"]), "svi:1")

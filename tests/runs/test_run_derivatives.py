@@ -116,7 +116,7 @@ def differences(function, x, width=1e-4):
     return np.array(columns).T
 
 
-@pytest.mark.tiers(0, 2)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("name", "changes"), CASES)
 def test_derivatives_of_runs_are_products_of_those_of_steps(name, changes):
     motion = MOTIONS[name]
@@ -139,7 +139,7 @@ def test_derivatives_of_runs_are_products_of_those_of_steps(name, changes):
     assert_close(run.tangent(direction)[-1], found[-1, :, :size] @ direction, 1e-11)
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("name", "changes"), CASES)
 def test_gradients_are_the_transpose_of_sensitivities(name, changes):
     run = MOTIONS[name].run(**changes)
@@ -230,7 +230,7 @@ def moved(run):
     return replace(run, q=run.q + (np.arange(61) == 30)[:, np.newaxis] * 1e-3)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize(("name", "call", "error", "message"), REJECTED)
 def test_arguments_of_derivatives_are_checked(name, call, error, message):
     with pytest.raises(error, match=message):

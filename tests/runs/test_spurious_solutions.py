@@ -14,7 +14,7 @@ PENDULUM = sc.LagrangianSystem.from_text(
 STEPS = (0.05, 0.1, 0.2, 0.3)
 
 
-@pytest.mark.tiers(0, 3)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("count", [400, pytest.param(20_000, marks=pytest.mark.full)])
 @pytest.mark.parametrize("solver", ["auto", "newton"])
 @pytest.mark.parametrize("method", ["svi:1", "gauss:1", "svi:2", "radau-iia:2"])
@@ -51,7 +51,7 @@ def test_published_jump_of_the_midpoint_rule_is_refused() -> None:
     assert stepper.integrate(q, p, h=0.05, steps=1).step_error > 0.0
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("solver", ["auto", "newton"])
 def test_unresolved_vibrations_are_no_spurious_solutions(solver: str) -> None:
     system = sc.LagrangianSystem.from_text(

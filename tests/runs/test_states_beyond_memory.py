@@ -36,7 +36,7 @@ def test_member_with_too_many_states_ends_and_the_others_are_returned(settings, 
     assert abs(x - np.cos(FAST * t)) < 1e-2
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("system", [OSCILLATOR, ARRAY], ids=["named", "array"])
 def test_run_with_too_many_states_ends_with_them_and_a_remedy(system, little_memory):
     stepper = sc.compile_stepper(system, "svi:4")

@@ -41,7 +41,7 @@ def check_all_phases(system, method, solver="auto"):
     assert np.all(achieved[resolved] < 5.0 * estimated[resolved])
 
 
-@pytest.mark.tiers(0, 2)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("method", [sc.SVI(4), pytest.param(sc.SVI(6), marks=pytest.mark.full)])
 @pytest.mark.parametrize("name", SYSTEMS)
@@ -49,7 +49,7 @@ def test_error_estimate_is_independent_of_the_phase(name, method):
     check_all_phases(SYSTEMS[name], method)
 
 
-@pytest.mark.tiers(1)
+@pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize("method", [sc.SVI(4), sc.SVI(6)])
 def test_error_estimate_of_an_oscillator_hardly_varies_with_the_phase(method):
     """The leading coefficient of the curve passes through zero twice a period; the error per step does not."""
@@ -59,7 +59,7 @@ def test_error_estimate_of_an_oscillator_hardly_varies_with_the_phase(method):
     assert min(estimates) > np.median(estimates) / 20
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_newton_and_fixed_point_error_estimates_agree_for_momentum_unknowns():
     vortices = sc.problem("point-vortices")
     steppers = [sc.compile_stepper(vortices.system, sc.SVI(4), solver=each) for each in ("auto", "newton")]
@@ -69,7 +69,7 @@ def test_newton_and_fixed_point_error_estimates_agree_for_momentum_unknowns():
         assert steppers[0].integrate(vortices.q, vortices.p, h=0.5, steps=50).step_error > 1e-3  # iterations fail
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("method", [sc.SVI(4), sc.SCVI(3), sc.Gauss(4)])
 def test_newton_error_estimate_is_independent_of_the_phase(method):
     check_all_phases(SYSTEMS["quartic"], method, "newton")

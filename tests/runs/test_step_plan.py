@@ -34,7 +34,7 @@ def longest(t: Any) -> float:
     return float(np.abs(np.diff(t)).max())
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("method", "solver"), [("svi:4", "auto"), ("gauss:2", "auto"), ("svi:4", "newton")])
 def test_no_step_is_longer_than_the_largest(method: str, solver: str) -> None:
     run = kepler(method, solver).integrate(Q, velocity=V, **LIMITED)
@@ -81,7 +81,7 @@ def test_absolute_tolerances_by_name_of_coordinate_array_and_rotation() -> None:
     assert values.tolist() == [0.2, *[0.1] * (stepper.dimension - 1)]
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize(("method", "solver"), [("svi:4", "auto"), ("svi:4", "newton")])
 def test_coordinate_that_hardly_moves_does_not_determine_the_steps(method: str, solver: str) -> None:
     text = "(x_dot**2 + y_dot**2 + z_dot**2)/2 + 1/sqrt(x**2 + y**2) - 50*z**2"

@@ -164,7 +164,7 @@ def test_absolute_tolerance_bounds_the_update(kepler):
 # Legendre transforms and energy.
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_velocity_is_found_where_momenta_cancel(quickly_compiled):
     """p = v + 5 sin(q) in which the terms cancel, as of charges in magnetic fields."""
     system = lagrange("driven pivot", "q", "q_dot**2/2 + 5.345*sin(q)*q_dot")
@@ -174,7 +174,7 @@ def test_velocity_is_found_where_momenta_cancel(quickly_compiled):
         assert stepper.velocity(q, p) == pytest.approx(p - 5.345 * np.sin(q), abs=2e-15)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_velocity_is_undefined_beyond_the_range_of_the_momenta(compiled, sample):
     """A momentum that no velocity below c gives in a system where there is one to find; and one given as nan."""
     stepper = compiled("relativistic-particle", sc.SVI(3))
@@ -189,7 +189,7 @@ def test_velocity_is_undefined_beyond_the_range_of_the_momenta(compiled, sample)
 # The discrete Lagrangian.
 
 
-@pytest.mark.tiers(0, 3)
+@pytest.mark.rotated
 @pytest.mark.covering
 @each_action
 @pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole"])
@@ -205,7 +205,7 @@ def test_step_is_the_plus_transform_after_the_inverse_of_the_minus_transform(sam
     assert plus[1] == pytest.approx(p1, abs=1e-13)
 
 
-@pytest.mark.tiers(0, 2)
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @each_action
 def test_momenta_are_derivatives_of_the_discrete_lagrangian(sample, compiled, method):
@@ -222,7 +222,7 @@ def test_momenta_are_derivatives_of_the_discrete_lagrangian(sample, compiled, me
         assert weights @ second == pytest.approx(p1[i], abs=1e-9)
 
 
-@pytest.mark.tiers(0, 2)
+@pytest.mark.rotated
 @each_action
 def test_two_point_form_gives_the_same_positions(sample, compiled, method):
     stepper, state = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
@@ -257,7 +257,7 @@ def test_methods_without_a_discrete_lagrangian_are_reported(compiled):
                 call([1.0, 0.0], [1.0, 0.1], 0.1)
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize("name", ["double-pendulum", "relativistic-particle", "planar-pendulum", "harmonic-oscillator"])

@@ -60,7 +60,7 @@ def test_spans_are_divided_into_equal_steps_below_the_maximum():
         steps_within(1e300, 1e-300)
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("t", "h", "t_end"), [(0.0, 0.1, 0.35), (1e16, 3.0, 1e16 + 8)])
 def test_runs_backward_end_as_those_forward(free, t, h, t_end):
     """The third step of 3 from 1e16 ends beyond 1e16 + 8, which is its end when rounded: it is shortened."""

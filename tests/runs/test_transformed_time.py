@@ -102,7 +102,7 @@ def test_energy_is_that_of_the_initial_state() -> None:
     assert made.step(*START, 0.1)[0] == pytest.approx(made.step(*START, 0.1, parameters={"E": -0.5})[0], rel=1e-14)
 
 
-@pytest.mark.tiers(1)
+@pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize("form", FORMS)
 def test_runs_end_at_a_physical_time(form: str) -> None:
     run = stepper(form).integrate(*START, h=0.1, t_end=9.0)
@@ -117,7 +117,7 @@ def test_runs_end_at_a_physical_time(form: str) -> None:
     assert len(stepper(form).integrate(*START, h=0.1, t_end=0.0)) == 2
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("form", FORMS)
 def test_events_are_located_in_physical_time(form: str) -> None:
@@ -133,7 +133,7 @@ def test_events_are_located_in_physical_time(form: str) -> None:
     assert 0.0 < ended.tau[-1] - ended.tau[-2] < 0.1
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_levi_civita_follows_an_ellipse_that_is_almost_a_line() -> None:
     """Through e = 1 - 1e-8: the oscillator is solved to round-off, and the time with it."""
     plane = sc.change_coordinates(
@@ -147,7 +147,7 @@ def test_levi_civita_follows_an_ellipse_that_is_almost_a_line() -> None:
     assert run.parameters[-1] == pytest.approx(-0.5, rel=1e-13)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_nonpositive_time_transformation_is_rejected() -> None:
     oscillator = sc.LagrangianSystem.from_text(name="oscillator", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2")
     made = sc.compile_stepper(sc.reparametrise(oscillator, "q"), sc.SVI(4))

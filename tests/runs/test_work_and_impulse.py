@@ -6,7 +6,7 @@ from notation import lagrange
 
 import scvi_codegen as sc
 
-pytestmark = pytest.mark.second
+pytestmark = pytest.mark.rotated
 
 DRAG = {"x": "-c*x_dot*sqrt(x_dot**2 + y_dot**2) + w*cos(3*t)", "y": "-c*y_dot*sqrt(x_dot**2 + y_dot**2)"}
 
@@ -17,7 +17,6 @@ def thrown():
     return lagrange("thrown", "x y", "(x_dot**2 + y_dot**2)/2 + k/sqrt(x**2 + y**2)", k=1.0, c=0.05, w=0.1, forces=DRAG)
 
 
-@pytest.mark.rotated
 @pytest.mark.parametrize("plan", [{"h": 0.05}, {}])
 def test_work_balance_with_impacts(thrown, plan):
     """Steps end in the states before impacts, which conserve the energy."""
@@ -30,12 +29,14 @@ def test_work_balance_with_impacts(thrown, plan):
         run.stepper.integrate([1.0, 0.0], [0.0, 1.1], h=0.05, t_end=6.0, save_every=7).work()
 
 
+@pytest.mark.second
 def test_unsupported_systems_have_no_work_balance(thrown):
     stepper = sc.compile_stepper(thrown, sc.RadauIIA(2))
     with pytest.raises(sc.MethodError, match="SVI, SCVI"):
         stepper.integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=2).impulses()
 
 
+@pytest.mark.second
 def test_missing_newton_iteration_is_an_error_message(thrown):
     stepper = sc.compile_stepper(thrown, sc.SVI(3), solver="fixed-point")
     run = stepper.integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=2)

@@ -13,7 +13,7 @@ KEPLER = sc.problem("kepler").system
 NEAR = [1.99999, 0.0], [0.0, (1e-5 / 1.99999) ** 0.5]
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("time_transformation", ["x", "x**2"])
 def test_run_stops_where_the_time_transformation_is_zero(time_transformation):
     stretched = sc.compile_stepper(sc.reparametrise(OSCILLATOR, time_transformation), sc.SVI(4))
@@ -24,7 +24,7 @@ def test_run_stops_where_the_time_transformation_is_zero(time_transformation):
     assert 100 < len(failure.value.trajectory) < 10**6
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("events", [None, ["x - 2"]], ids=["alone", "with events"])
 def test_reversible_controller_stops_where_the_time_transformation_is_zero(events):
     controlled = sc.compile_stepper(OSCILLATOR, sc.SVI(4), time_transformation="x**2", events=events)
@@ -33,7 +33,7 @@ def test_reversible_controller_stops_where_the_time_transformation_is_zero(event
     assert failure.value.status == "time transformation singular"
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_solve_ivp_reports_a_zero_time_transformation():
     motion = sc.solve_ivp(OSCILLATOR, (0.0, 4.0), [1.0, 0.0], time_transformation="x**2", method="svi:4")
     assert not motion.success
@@ -47,7 +47,7 @@ def test_close_encounters_do_not_stop_a_run(time_transformation):
     assert run.t[-1] == 7.0
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_energy_is_checked_after_a_single_short_step():
     stretched = sc.compile_stepper(sc.reparametrise(KEPLER, "q1**2 + q2**2"), sc.SVI(2))
     run = stretched.integrate([1.0, 0.0], [0.0, 1.0], h=0.1, steps=5)

@@ -18,7 +18,7 @@ from scvi_codegen.interfaces.derivation import derivation_html
 from scvi_codegen.systems.constraints.kind import Reaction
 from scvi_codegen.systems.formulas.symbols import symbol
 
-pytestmark = pytest.mark.second
+pytestmark = pytest.mark.rotated
 MU = 0.3
 CLOSED, STICKS, DIRECTION = map(symbol, ("closed", "sticks", "direction"))
 
@@ -66,6 +66,7 @@ def explicit_rod(_: float, x: NDArray[Any], sticks: bool) -> NDArray[Any]:
     return np.concatenate([v, (weight + C.T @ multipliers) / MASS])
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("degree", "largest"), [(1, 3e-5), (2, 3e-9), (3, 1e-13)])
 @pytest.mark.parametrize("sticks", [False, True])
 def test_sliding_and_sticking_keep_the_order(degree: int, largest: float, sticks: bool) -> None:
@@ -87,6 +88,7 @@ def test_sliding_and_sticking_keep_the_order(degree: int, largest: float, sticks
     assert (run.multipliers()[-1, 1] == 0.0) != sticks
 
 
+@pytest.mark.second
 def test_an_open_contact_changes_nothing() -> None:
     run = rod(3).integrate([0.0, 2.0, 0.3], velocity=[1.0, 0.0, 0.4], h=0.1, steps=5)
     assert np.allclose(run.q[-1], [0.5, 2.0 - 0.125, 0.5], atol=1e-15)
@@ -179,6 +181,7 @@ def test_a_ladder_leaves_the_wall(degree: int, error: float) -> None:
     assert abs(np.cos(run.q[row, 2]) - 2 / 3 * np.cos(0.2)) < error
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("degree", "error"), [(1, 4e-4), (2, 3e-8), (3, 4e-14)])
 def test_an_oscillator_on_a_belt_sticks_and_slips(degree: int, error: float) -> None:
     belt = sc.contact("y", slip="x_dot - vb", friction=0.25, static_friction=0.4)
@@ -230,6 +233,7 @@ def test_a_block_on_a_slope_creeps_nowhere() -> None:
         assert slides or not run.q.any()
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("steps", [{"h": 0.05}, {}])
 @pytest.mark.parametrize("floor", [0, 0.5])
 def test_a_bouncing_ball_comes_to_rest(floor: float, steps: dict[str, float]) -> None:
@@ -277,6 +281,7 @@ def test_a_plastic_ball_leaves_a_shaken_floor_with_the_jerk(steps: dict[str, flo
     assert [time for time, _ in run.contact_modes] == pytest.approx(expected, abs=1e-10)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("tangent", "consistent"), [(0.30, True), (0.31, False), (0.81, False), (0.83, True)])
 def test_painleve_is_named_where_rigid_bodies_have_no_motion(tangent: float, consistent: bool) -> None:
     floor = sc.contact("y - cos(a)", slip="x_dot - cos(a)*a_dot", friction=1.5)
@@ -347,7 +352,7 @@ def test_slip_on_a_shaken_table_begins_against_the_force(steps: dict[str, float]
     assert np.abs(np.concatenate([run.q[-1, :2], run.velocity[-1, :2]]) - true).max() < 2e-8
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("at_rest", [0.3, 0.301, 0.306])
 @pytest.mark.parametrize("steps", [{"h": 0.05}, {"h": 0.0125}, {}])
 def test_slip_in_space_begins_without_a_jump_of_friction(steps: dict[str, float], at_rest: float) -> None:
@@ -468,6 +473,7 @@ def test_contacts_are_part_of_a_system_and_of_its_model_file(tmp_path: Any) -> N
 FLOOR = MODEL.partition("[[contacts]]")[0].replace("- m*g*y", "- m*g*y - 1e4*positive_part(r - y)**2")
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("text", [MODEL, FLOOR + MODEL[MODEL.index("[parameters]") :].replace("mu = 0.3\n", "")])
 def test_generated_programs_and_packages_have_the_modes_of_runs(text: str, tmp_path: Any) -> None:
     (tmp_path / "ball.toml").write_text(text.replace("q = [0.0, 0.5, 0.0]", "q = [0.0, 0.7, 0.0]"))
@@ -594,6 +600,7 @@ def test_a_ball_in_space_bounces_where_friction_stops_its_slip() -> None:
     assert not run.velocity[-1, :2].any()
 
 
+@pytest.mark.second
 def test_kinks_of_friction_coefficients_are_located() -> None:
     block = of(f"{PLANE} - 10*y", "x y", [sc.contact("y", slip="x_dot", friction="where(x > 0.1, 0.05, 0.3)")], "svi:2")
     run = block.integrate([0, 0], velocity=[1, 0], h=0.07, t_end=0.7)

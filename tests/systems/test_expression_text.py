@@ -169,7 +169,7 @@ def test_long_sums_and_products_do_not_recurse() -> None:
         assert parse("-" * 50_000 + "x") == X
 
 
-@pytest.mark.tiers(4, 6)
+@pytest.mark.tiers(4, 4)
 @pytest.mark.sampled(6)
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_nested_expressions_are_read_or_rejected_without_crashing(name: str) -> None:

@@ -125,7 +125,7 @@ def test_one_forms_that_depend_on_time_change_the_energy() -> None:
         assert (abs(run.energy() / run.energy()[0] - 1).max() < 1e-12) == conserved
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_lotka_volterra_in_four_dimensions_agrees_with_the_published_reference() -> None:
     """GeometricProblems.jl, ``lotka_volterra_4d``: ``reference_solution`` at t = 100; in logarithms, sheared."""
     energy = "(exp({a}) + exp(b) + exp(c) + exp(d) - {a} - 2*b - c - d)"
@@ -140,7 +140,7 @@ def test_lotka_volterra_in_four_dimensions_agrees_with_the_published_reference()
     assert np.abs(np.exp([a + c, b, c, d]) - published).max() < 1e-11
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("size", ["3", "N"])
 def test_arrays_of_vortices(size: str) -> None:
     pairs = f"sum(i in {size}, j in {size}, G[i]*G[j]*log((x[i] - x[j])**2 + (y[i] - y[j])**2 + 0.1))/(8*pi)"
@@ -159,7 +159,7 @@ def test_arrays_of_vortices(size: str) -> None:
     assert np.abs(run.variables - expected.variables).max() < 1e-14
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_canonical_one_forms_use_the_fixed_point_iteration() -> None:
     oscillator = sc.LagrangianSystem.from_text("oscillator", ["x", "y"], "x*y_dot - x**2/2 - y**2/2")
     assert oscillator.is_canonical
@@ -169,7 +169,7 @@ def test_canonical_one_forms_use_the_fixed_point_iteration() -> None:
     assert run.variables[-1] == pytest.approx([math.cos(1.0), math.sin(1.0)], abs=1e-13)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_states_by_name_and_in_order() -> None:
     stepper = sc.compile_stepper(system("guiding centre"), "svi:2")
     start = dict(zip("xyzu", CASES["guiding centre"][3], strict=True))
@@ -192,7 +192,7 @@ def test_the_choice_with_the_shortest_one_form_is_used() -> None:
     assert fields == ((x,), (y,), (y**2,), x * y, x**2 + y**2)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("name", ["Lotka-Volterra", "massless particle"])
 def test_integrals_are_expanded_about_the_origins_of_the_lagrangian(name: str) -> None:
     """A motion at 1000 takes the steps of the same one at 0, also near an equilibrium, with errors of u |q|."""
@@ -218,7 +218,7 @@ def test_integrals_are_expanded_about_the_origins_of_the_lagrangian(name: str) -
         assert np.abs(ends[1e-6][1] - true).max() < 10 * np.abs(ends[1e-6][0] - true).max()
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_velocities_are_refused_and_available() -> None:
     stepper = sc.compile_stepper(system("coupled"), "svi:2")
     start = CASES["coupled"][3]
@@ -230,7 +230,7 @@ def test_velocities_are_refused_and_available() -> None:
     assert run.velocity[0] == pytest.approx([expected[names.index(name)] for name in stepper.coordinates], abs=1e-15)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_model_files(tmp_path) -> None:
     model = sc.Model(system=system("guiding centre"), method="svi:2", q=CASES["guiding centre"][3], h=0.1, span=1.0)
     sc.save_model(model, tmp_path / "model.toml")
@@ -241,7 +241,7 @@ def test_model_files(tmp_path) -> None:
     assert np.array_equal(package.integrate(model.q, model.p, h=0.1, steps=10).variables, model.integrate().variables)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_unsupported_uses_are_named() -> None:
     particle = system("massless particle")
     changes = {"system without impacts": sc.impact("x"), "'y_dot' is not a": sc.Event("x", then={"y_dot": "1"})}
@@ -258,7 +258,7 @@ def test_unsupported_uses_are_named() -> None:
         sc.compile_stepper(particle, "svi:2", time_transformation="1 + x**2").integrate([1.0, 0.2], h=0.1, t_end=1.0)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_transformed_time() -> None:
     particle = system("massless particle")
     slow = sc.compile_stepper(sc.reparametrise(particle, "1 + x**2"), "svi:6").integrate([1.0, 0.2], h=0.05, t_end=2.0)
@@ -276,7 +276,7 @@ def differences(function, size: int, width: float = 1e-3) -> np.ndarray:
     return np.array(columns).T
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("method", ["svi:2", "stoermer-verlet", "radau-iia:2"])
 def test_derivatives_of_steps_against_differences(method: str) -> None:
     """The one-form and H depend on parameters and time, so that every derivative of theta occurs."""
@@ -296,7 +296,7 @@ def test_derivatives_of_steps_against_differences(method: str) -> None:
     assert np.abs(stepper.vjp(z[:2], z[2:], h, t, cotangents=seeds) - seeds @ exact.state).max() < 1e-13
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_inputs(tmp_path) -> None:
     driven = lagrange("driven", "x y", "(x + x**3)*y_dot - x**2/2 - y**2/2 - f*x - f**2*y", inputs="f")
     times = np.linspace(0.0, 2.0, 3)

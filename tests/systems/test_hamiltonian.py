@@ -164,7 +164,7 @@ def test_transforms_and_energy_are_those_of_the_lagrangian(sample) -> None:
 # Singular Hamiltonians.
 
 
-@pytest.mark.tiers(0, 2)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("method", "error"),
@@ -214,7 +214,7 @@ def test_parameters_are_assumed_positive_if_their_values_are():
     assert [given.name for given in positive_parameters(system)] == ["a"]
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_energy_error_is_relative_to_the_action_if_the_energy_starts_at_0():
     pair = sc.HamiltonianSystem.from_text("two spins", spins=["a", "b"], hamiltonian="a_1*b_1 + a_2*b_2")
     run = sc.compile_stepper(pair, sc.SVI(2)).integrate({"a": [1, 0, 0], "b": [0, 0.6, 0.8]}, h=0.1, steps=50)

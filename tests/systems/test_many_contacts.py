@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 import scvi_codegen as sc
 
-pytestmark = pytest.mark.second
+pytestmark = pytest.mark.rotated
 G, HEIGHT, WIDTH = 9.81, 0.2, 0.5
 INERTIA = (HEIGHT**2 + WIDTH**2) / 3
 
@@ -45,6 +45,7 @@ def rests(stepper: Any, t_end: float, **parameters: float) -> Any:
     return stepper.integrate([0, HEIGHT, 0], velocity=[0, 0, 0], h=0.05, t_end=t_end, parameters=parameters)
 
 
+@pytest.mark.second
 @pytest.mark.filterwarnings("ignore:the contacts depend")
 def test_a_box_on_a_slope_creeps_nowhere_and_slides_by_its_closed_form() -> None:
     stepper = box(friction=0.5)
@@ -61,6 +62,7 @@ def test_a_box_on_a_slope_creeps_nowhere_and_slides_by_its_closed_form() -> None
     assert slides.velocity[-1] == pytest.approx([a, 0, 0], abs=1e-13)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("kinetic", "static"), [(0.5, 0.5), (0.4, 0.5)])
 def test_a_pushed_box_slips_where_both_corners_together_hold_it_no_longer(kinetic: float, static: float) -> None:
     run = rests(box(f"{0.5 * G / 0.97}*t", friction=kinetic, static_friction=static), 1.2)

@@ -33,7 +33,7 @@ def value(system: Any, state: dict[str, Any], velocity: dict[str, Any]) -> float
     return float(evaluate(system.lagrangian, {each: values[each.name] for each in system.lagrangian.free_symbols}))
 
 
-@pytest.mark.tiers(0, 4)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_inertias_of_shapes_are_integrals(shape):
     size = np.array([0.5, 0.7, 0.9][: SHAPES[shape][0]])
@@ -436,7 +436,7 @@ MOTIONS = {
 }
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("case", MOTIONS)
 def test_equations_of_motion_are_those_of_mujoco(case, tmp_path):
     pytest.importorskip("mujoco", reason="pip install mujoco")

@@ -117,7 +117,7 @@ def test_inputs_retain_their_names():
     assert run.q["q"][-1] == pytest.approx(other.q[-1], abs=1e-14)
 
 
-@pytest.mark.tiers(0, 3)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", ["b", "q", "N", "at0", "B0", "q_dot", "c0_1", "p_q"])
 def test_parameter_names_differ_from_names_of_arrays_and_tables(name):

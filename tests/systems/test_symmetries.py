@@ -357,7 +357,7 @@ EXACT = [
 ]
 
 
-@pytest.mark.tiers(0, 3)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(7)
 @pytest.mark.parametrize(("name", "method"), EXACT, ids=lambda value: getattr(value, "name", value))
 def test_claimed_conservation_is_measured(quickly_compiled, name, method):

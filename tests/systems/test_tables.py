@@ -115,7 +115,7 @@ def test_model_files():
         parse_model(TABLED)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("plan", [{"h": 0.01, "steps": 500}, {"t_end": 5.0}])
 @pytest.mark.parametrize("kinks", ["located", "as formulas"])
 def test_runs_end_where_a_table_ends(plan, kinks):

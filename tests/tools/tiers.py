@@ -4,8 +4,9 @@ Tests without a marker are quick; a marker of a test prevails over those of its 
 ``@pytest.mark.tiers(m)`` the first m cases are quick, the others of the second tier; with ``tiers(m, n)`` the first m
 are quick, those up to the n-th of the second tier, the others rotated. One in ``PARTS`` of the rotated cases is of the
 second tier where the environment variable ``SCVI_CODEGEN_TESTS_PART`` is a number, which ``.ci/run`` sets to the number
-of commits: so many runs reach all of them. With ``all`` all of them are; without it they are full. Tests that are named
-(``file::test``) run in any tier but the full one.
+of commits: so many runs reach all of them. With ``all`` all of them are; without it they are full. The hash of a case's
+name says of which part it is, or the number in ``@pytest.mark.rotated(number)``: cases with one number share what they
+compile, and run together. Tests that are named (``file::test``) run in any tier but the full one.
 
 ``@pytest.mark.covering`` on a test with several parametrised arguments keeps few of their combinations, so that each
 value of each argument is in one; ``@pytest.mark.covering(2)`` so that each is in two (where there are as many).
@@ -85,9 +86,10 @@ def mark_later_tiers(items: Iterable[pytest.Item]) -> None:
         marker = next((marker for marker in item.iter_markers() if marker.name in TIERS), None)
         if marker is None or marker.name not in ("rotated", "tiers"):
             continue
-        quick, both = (*marker.args, math.inf)[:2] if marker.args else (0, 0)
+        quick, both = (*marker.args, math.inf)[:2] if marker.name == "tiers" else (0, 0)
         seen[name := item.nodeid.partition("[")[0]] += 1
-        rotated = part == "all" or (part.isdigit() and (zlib.crc32(item.nodeid.encode()) - int(part)) % PARTS == 0)
+        number = marker.args[0] if marker.name == "rotated" and marker.args else zlib.crc32(item.nodeid.encode())
+        rotated = part == "all" or (part.isdigit() and (number - int(part)) % PARTS == 0)
         later = "second" if seen[name] <= both or rotated else "full"
         item.add_marker("quick" if seen[name] <= quick else later)
 
