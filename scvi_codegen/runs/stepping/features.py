@@ -144,6 +144,7 @@ FEATURES = {
             "make them terminal and restart",
         ),
         ("with kinks that runs locate", "device observe_ensemble hessian", 'compile it with kinks="as formulas"'),
+        ("where L or H jumps", "shadow_energy", "use energy()"),
         ("where L or H jumps", " ".join(BY_FORMULAS), "use runs, ensembles of runs and their first derivatives"),
         ("with events that set parameters", _DERIVATIVES, "make them terminal, and restart with the new parameters"),
         (
