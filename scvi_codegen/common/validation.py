@@ -78,12 +78,7 @@ def synonym_hint(word: str, keywords: Collection[str]) -> str:
 
 
 def keyword_hint(name: str, keywords: Collection[str]) -> str:
-    """Return ``"; did you mean 'h'?"``, or ``": "`` and an explanation, or the list of keywords.
-
-    Args:
-        name: a keyword that the function does not have.
-        keywords: those that it has.
-    """
+    """Return ``"; did you mean 'h'?"`` for an unknown name, or ``": "`` and an explanation, or the list of keywords."""
     if here := synonym_hint(name, keywords):
         return here
     for word in (name, *likely_names(name)):

@@ -185,11 +185,7 @@ class Axis(ABC):
         """Return the coefficients of :meth:`interpolation` at a coordinate with these distances from all points."""
 
     def modes(self, values: Array) -> Array:
-        """Return the squared amplitudes of all modes but the constant, (.., E, p), or (.., 1, N//2) of Fourier modes.
-
-        Args:
-            values: at the points along the last axis.
-        """
+        """Return the squared amplitudes of all modes but the constant, (.., E, p), or (.., 1, N//2) of Fourier."""
         return np.asarray(np.abs(np.fft.rfft(values)[..., None, 1:]) ** 2)
 
     def interpolation(self, place: float) -> dict[int, float]:
@@ -501,13 +497,7 @@ class FiniteDifferences(Axis):
 
     @classmethod
     def of(cls, system: Density, name: str, *, order: int, points: int) -> FiniteDifferences:
-        """Return the axis of a density; for u_xx in its density two points more are used.
-
-        Args:
-            system, name: the density, and the axis.
-            order: 2 m.
-            points: their number, ends included.
-        """
+        """Return the axis of a density, differences of order 2 m at points with both ends; two more for u_xx."""
         second = any(
             orders.get(name) == 2 and symbol(derivative) in system.density.free_symbols
             for derivative, (_, orders) in system.derivatives.items()
@@ -656,13 +646,7 @@ class Fourier(Axis):
 
     @classmethod
     def of(cls, system: Density, name: str, *, points: int, derivative: str | None = None) -> Fourier:
-        """Return the axis of a density.
-
-        Args:
-            system, name: the density, and the axis.
-            points: their number.
-            derivative: ``"fft"``, ``"dense"``, or ``None`` for fast Fourier transforms of many points.
-        """
+        """Return the axis of a density; ``derivative``: ``"fft"``, ``"dense"``, or ``None`` for the faster of both."""
         if system.boundary[name] != PERIODIC:
             raise SystemDefinitionError(
                 f"'fourier' needs a periodic axis, and '{name}' has ends: use \"spectral-elements\" or "

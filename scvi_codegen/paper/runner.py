@@ -54,11 +54,7 @@ def catalogue(module: str = CATALOGUE) -> Mapping[str, Experiment]:
 
 
 def with_needs(names: Sequence[str], experiments: Mapping[str, Experiment]) -> list[str]:
-    """Return the experiments called ``names`` and their dependencies, in topological order.
-
-    Raises:
-        StateError: for a name that is not among the experiments.
-    """
+    """Return the experiments and their dependencies in topological order; StateError for an unknown name."""
     ordered: dict[str, None] = {}
 
     def add(name: str) -> None:

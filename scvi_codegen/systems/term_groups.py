@@ -98,13 +98,7 @@ class SimilarTerms:
             yield SimilarTerms(*zip(*similar, strict=True))
 
     def group(self, slot: Callable[[str, int], Symbol], constant: Callable[[int], Symbol], sign: int = 1) -> TermGroup:
-        """Return the term group.
-
-        Args:
-            slot: symbol of a coordinate, by its array and its column in the table of indices.
-            constant: symbol of a constant, by its number.
-            sign: factor of the formula.
-        """
+        """Return the term group: symbols of coordinates by array and column, of constants by number, and a sign."""
         first = self.leaves[0]
         columns = list(zip(*(leaf.constants for leaf in self.leaves), strict=True))
         varying = [k for k, column in enumerate(columns) if len(set(column)) > 1]

@@ -85,11 +85,7 @@ class Trials:
         return self.q[0], {**self.state, "p": self.p[0], "parameters": parameters}
 
     def integrate(self, q: Array, *, h: float, steps: int, save_every: int) -> Any:
-        """Integrate as :meth:`Stepper.integrate`, an ensemble in one call; iterations are those of one trajectory.
-
-        Raises:
-            StepFailedError: if a trajectory fails.
-        """
+        """Integrate as :meth:`Stepper.integrate`, an ensemble in one call; iterations are those of one trajectory."""
         plan: dict[str, Any] = {"h": h, "steps": steps, "save_every": save_every}
         if not self.together:
             return self.stepper.integrate(q, **self.state, **plan)

@@ -75,11 +75,7 @@ MOST_COUPLED_MASSES = 32
 
 
 def rattle_of(system: MechanicalSystem, stages: StageSystem, predictor: NumberTable) -> Rattle | None:
-    """Return the iteration for the multipliers of such steps; ``None`` if it is not applicable.
-
-    Args:
-        predictor: (2 (s + 1), s + 1) tables to the unknowns of the next step, of velocities and of multipliers.
-    """
+    """Return the iteration for multipliers with (2 (s + 1), s + 1) tables as predictor; ``None`` if not applicable."""
     forms, tables = forms_of(system), velocity_tables(stages.shape)
     if system.reactions or any(velocity_conditions(system)) or tables is None or not forms.has_quadratic_energy:
         return None

@@ -74,14 +74,7 @@ def control_of(
     system: MechanicalSystem | None = None,
     g: str | Expr | None = None,
 ) -> Control | None:
-    """Return the step-size control of a program; ``None`` for adaptive steps whose curves give no error estimate.
-
-    Args:
-        program: the lowered program.
-        controller: the step-size controller.
-        system: the system, for steps in tau in physical time.
-        g: time-rescaling function of steps in tau.
-    """
+    """Return the step-size control of a program, with ``g`` of steps in tau; ``None`` without error estimates."""
     if controller.values is not None:
         assert system is not None  # by the caller
         assert g is not None

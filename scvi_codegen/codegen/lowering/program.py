@@ -138,11 +138,7 @@ def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
 
 
 def step_texts(system: MechanicalSystem, method: Method) -> Mapping[str, str]:
-    """Return the statements from which the C of a step is generated, by their titles; none of other steps.
-
-    Raises:
-        MethodError: for a system that the method does not support.
-    """
+    """Return the statements from which the C of a step is generated, by their titles; none of other steps."""
     if not system.constraints:
         splitting = splitting_of(system, method)
         return splitting_texts(splitting) if splitting else {}

@@ -387,11 +387,7 @@ TARGETS = {
 
 
 def library_for(platform: str, source: Source, *, flags: tuple[str, ...]) -> bytes:
-    """Return a shared library for a platform of :data:`TARGETS`: equal sources and flags give equal bytes.
-
-    Raises:
-        BuildError: without the extra ``compiler``, or if it rejects the source.
-    """
+    """Return a shared library for a platform of :data:`TARGETS`, equal for equal sources and flags; or BuildError."""
     if importlib.util.find_spec("ziglang") is None:
         raise BuildError(
             f"compiling for {platform} requires a cross compiler: pip install 'scvi-codegen[compiler]' (ziglang)"

@@ -713,13 +713,7 @@ def _scalar_kernels(
 
 
 def _lane_context(program: Program, beside: Sequence[Kernel], *, changes: bool) -> dict[str, object]:
-    """Return the template's context for the fixed-point iteration.
-
-    Args:
-        program: the program.
-        beside: kernels of its derivative.
-        changes: whether tangent and adjoint vectors are propagated, too.
-    """
+    """Return the template's context for the iteration, with kernels of its derivative; ``changes``: it has tangents."""
     fixed_point = program.fixed_point
     hot_kernels = (fixed_point or program.splitting or program).kernels
     operations = sum(sum(kernel.operation_counts().values()) for kernel in hot_kernels)
@@ -795,12 +789,7 @@ def with_xla_flow(derivatives: Source, version: str, *, second: bool = False) ->
 
 
 def with_flow_of_rows(derivatives: Source, *, second: bool = False) -> Source:
-    """Return a source with the flow of many rows, ``<prefix>_flow_rows``.
-
-    Args:
-        derivatives: a source with derivatives of steps.
-        second: whether to add second derivatives, ``<prefix>_hessian_rows``, which the source must have.
-    """
+    """Return a source with derivatives of steps and the flow of many rows; ``second``: with second derivatives."""
     prefix = derivatives.prefix
     shape = "long long steps, long long every, int count, long long rows"
     rest = f"double *found, {prefix}_report *report"

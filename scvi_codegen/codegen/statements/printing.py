@@ -128,19 +128,11 @@ class Layout:
         return f"{self.read(quantity, at).text} = {value};"
 
     def former(self, quantity: Quantity, at: At) -> Value:
-        """Return the value at the point before.
-
-        Raises:
-            MethodError: if the layout has no points.
-        """
+        """Return the value at the point before; MethodError if the layout has no points."""
         raise MethodError(f"former({quantity.text}[{at.text}]) is a value of points, which this step has not")
 
     def over_points(self, table: str, quantity: Quantity, at: At) -> Value:
-        """Return the sum over points with the row of a table.
-
-        Raises:
-            MethodError: if the layout has no points.
-        """
+        """Return the sum over points with the row of a table; MethodError if the layout has no points."""
         raise MethodError(f"{table} @ {quantity.text}[{at.text}] is a sum over points, which this step has not")
 
 

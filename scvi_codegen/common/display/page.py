@@ -145,13 +145,7 @@ def operations(expression: sympy.Basic) -> int:
 
 
 def formulas(all_formulas: Sequence[Formula], noun: str, *, together: int = MOST_TOGETHER) -> Iterator[Content]:
-    """Yield the first formulas, and the number of the others.
-
-    Args:
-        all_formulas: all of them.
-        noun: the word for one of them.
-        together: operations of those shown.
-    """
+    """Yield the first formulas, of ``together`` operations in all, and the number of the others, called ``noun``."""
     shown, large, total = 0, [], 0
     for formula in all_formulas[:MOST_FORMULAS]:
         size = operations(formula.right)

@@ -34,11 +34,7 @@ class ArrayStepEquations:
 
     @property
     def program(self) -> ArrayProgram:
-        """Lowered program.
-
-        Raises:
-            MethodError: for a method without fixed-point iteration, and a system that requires known sizes.
-        """
+        """Lowered program; MethodError without fixed-point iteration, and for a system that requires known sizes."""
         self.system.check_run_time_sizes()
         return lower_arrays(self.system, self.method, prefix="derived")
 

@@ -33,11 +33,7 @@ def default_controller(*, in_tau: bool) -> str:
 
 
 def controller_named(name: str | None, *, in_tau: bool) -> Controller:
-    """Return the controller of a name, ``None`` for the default one.
-
-    Raises:
-        MethodError: if the name is unknown, or the controller is not one of steps in tau, or only of these.
-    """
+    """Return the controller of a name, ``None`` for the default one; MethodError unless it is one of such steps."""
     name = default_controller(in_tau=in_tau) if name is None else name
     if name not in CONTROLLERS:
         names = ", ".join(CONTROLLERS)

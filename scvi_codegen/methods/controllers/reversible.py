@@ -18,12 +18,7 @@ __all__ = ["REVERSIBLE"]
 
 
 def density_and_growth(system: MechanicalSystem, g: str | Expr) -> tuple[Expr, ...]:
-    """Return 1/g and -d(log g)/dt along the motion of a system in physical time.
-
-    Raises:
-        SystemDefinitionError: for an invalid time-rescaling function, see
-            :func:`~scvi_codegen.systems.time_transformation.time_rescaling_function`.
-    """
+    """Return 1/g and -d(log g)/dt along the motion of a system in physical time; SystemDefinitionError for other g."""
     rate = time_rescaling_function(system, g, in_time=True)
     forms = forms_of(system)
     rates = dict(zip(system.coordinates, forms.legendre if system.auxiliaries else system.velocities, strict=True))

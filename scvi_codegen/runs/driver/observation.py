@@ -208,11 +208,7 @@ class Observed(Saver):
 
 
 def saver_of(output: Output) -> Saver:
-    """Return the observer that saves the states of an output, or calls its observer.
-
-    Raises:
-        StateError: for another observer.
-    """
+    """Return the observer that saves the states of an output, or calls its observer; StateError for others."""
     observe = output.observe
     if output.times is not None:
         return AtTimes(output.times)

@@ -98,9 +98,7 @@ class Run(Memory, AttitudeHistory):
     def _integrated(self, initial: InitialData, growth: int, steps: int | None, output: Output) -> Trajectory:
         """Start a run that is set up and record it: by one C call if it ends within ``FIRST_STEPS`` saved states.
 
-        Args:
-            growth: value of ``measures_growth`` in C.
-            initial, steps, output: as of :meth:`_recorded`.
+        ``growth``: value of ``measures_growth`` in C.
         """
         plan, h, save_every, short = self._plan, self._h, output.save_every, self._rows
         most = FIRST_STEPS if save_every == 1 else self._first_steps(save_every)

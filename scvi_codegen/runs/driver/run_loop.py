@@ -84,11 +84,7 @@ def record(
 def record_with_stops(
     memory: Memory, stops: Sequence[float], *, progress: Callable[[int], None] | None = None
 ) -> Trajectory:
-    """Advance with adaptive steps that end at each of the times ``stops``, and save all states.
-
-    Raises:
-        StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
-    """
+    """Advance as :func:`record` with adaptive steps that end at each of the times ``stops``, and save all states."""
     recorder, first, target = _StateRecorder(memory, 1, None, 0), memory.steps, memory._plan
     try:
         for t_end in stops:

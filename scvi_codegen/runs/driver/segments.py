@@ -233,13 +233,9 @@ def record_segments(
     recorded: Callable[[int | None], Trajectory],
     stopped: Callable[[], bool] = lambda: False,
 ) -> Trajectory:
-    """Record a run segment by segment; the states at their ends, and the last one before a failure, are also saved.
+    """Record a run by :func:`prepared_segments`; their ends, and the last state before a failure, are also saved.
 
-    Args:
-        run: the run.
-        segments: prepares the run for each segment and yields its number of steps, as :func:`prepared_segments`.
-        recorded: records a number of steps.
-        stopped: returns whether the run was stopped in the last segment; a terminal event ends it as well.
+    ``recorded`` records a number of steps; ``stopped`` tells whether the run was stopped; terminal events end it, too.
     """
     pieces, size = list[Trajectory](), 0
     for steps in segments:

@@ -85,11 +85,7 @@ class EnsembleSettings:
         return bool(stepper.searched) and self.observe != "events"
 
     def steps_or_ends(self, t: float, words: int) -> tuple[int | None, Array | None]:
-        """Return the number of common steps or the final time; with adaptive steps the final time or times.
-
-        Raises:
-            StateError: for missing or contradictory arguments.
-        """
+        """Return the number of common steps or the final times; StateError for missing or contradictory arguments."""
         h, t_end = self.h, self.t_end
         check_together(inputs=self.inputs, t_eval=self.t_eval)
         if words > 1:

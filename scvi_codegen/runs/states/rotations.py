@@ -48,12 +48,7 @@ class Member:
 
 
 def members_of(dimension: int, declarations: Sequence[str]) -> tuple[Member, ...]:
-    """Return the rotations, directions and spins of a system, whose coordinates follow the ordinary ones.
-
-    Args:
-        dimension: number of all coordinates.
-        declarations: as of :attr:`~scvi_codegen.codegen.rendering.source.Interface.rotations`.
-    """
+    """Return the rotations, directions and spins of a system, whose coordinates follow the ordinary ones."""
     parts = [text.split() for text in declarations]
     first = dimension - sum(COMPONENTS[kind] for kind, *_ in parts)
     members = []

@@ -251,11 +251,7 @@ def as_text(values: Any) -> list[str]:
 
 
 def two_words(value: Any, name: str) -> tuple[float, float]:
-    """Return the nearest double to a number, and the nearest double to the rest.
-
-    Raises:
-        StateError: for anything but a finite real number.
-    """
+    """Return the nearest double to a number, and that to the rest; StateError for anything but a finite real number."""
     if type(value) is float and np.isfinite(value):
         return value, 0.0
     if isinstance(value, ExactNumber | Word) and np.isfinite(value):
@@ -301,11 +297,7 @@ def check_doubles(**times: Any) -> None:
 
 
 def split(values: Any, name: str) -> tuple[Any, Any]:
-    """Return the high and the low words of numbers of any kind, also by name; ``None`` of ``None``.
-
-    Raises:
-        StateError: if a value is not a finite real number.
-    """
+    """Return high and low words of numbers, also by name, or ``None``; StateError unless finite and real."""
     if isinstance(values, Mapping):
         parts = {key: split(value, f"{name}: '{key}'") for key, value in values.items()}
         return {key: part[0] for key, part in parts.items()}, {key: part[1] for key, part in parts.items()}

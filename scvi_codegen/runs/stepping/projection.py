@@ -216,11 +216,7 @@ def _massless(stepper: Integrator, q: Array, t: float, parameters: Parameters) -
 
 
 def _at_unit_velocities(stepper: Integrator, q: Array, t: float, parameters: Parameters) -> tuple[Array, Array]:
-    """Return (1 + m, m) equal positions and the momenta there of no velocity and of a unit velocity of each coordinate.
-
-    Raises:
-        StateError: where velocities have no momenta.
-    """
+    """Return (1 + m, m) equal positions and the momenta there, of no and of unit velocities; StateError without any."""
     unit = np.concatenate([np.zeros((1, stepper.dimension)), np.eye(stepper.dimension)])
     positions = np.tile(q, (len(unit), 1))
     return positions, stepper.momentum(positions, unit, t, parameters)

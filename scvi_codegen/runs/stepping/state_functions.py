@@ -70,11 +70,7 @@ class StateFunctions(CompiledMethod):
     def _initial_momenta(
         self, q: States, p: States | None, velocity: States | None, t: float, parameters: Parameters
     ) -> States:
-        """Return the momenta of a state specified by p or by velocity.
-
-        Raises:
-            StateError: unless exactly one of both is passed.
-        """
+        """Return the momenta of a state by p or by velocity; StateError unless exactly one of both is passed."""
         if velocity is None and p is not None:
             return p
         if velocity is None or p is not None:

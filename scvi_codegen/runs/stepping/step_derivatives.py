@@ -109,11 +109,7 @@ class LinearisedMethod(StateFunctions):
         return 2 * self.dimension + self.interface.energy_index
 
     def _energy_gradient(self, q: Array, p: Array, parameters: Array) -> Array:
-        """Return the (variables,) gradient of the energy of a state by all variables; 0 if time is not transformed.
-
-        Raises:
-            StateError: if the gradient is undefined.
-        """
+        """Return the (variables,) gradient of the energy of a state, 0 unless time is transformed; or StateError."""
         gradient, name = np.zeros(self._input_size), self.interface.energy_parameter
         if name is None:
             return gradient

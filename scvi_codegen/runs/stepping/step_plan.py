@@ -168,11 +168,7 @@ class ErrorControl(NamedTuple):
         )
 
     def to(self, t_end: float) -> Adaptive:
-        """Return the step plan to a target time.
-
-        Raises:
-            StateError: if a number is invalid.
-        """
+        """Return the step plan to a target time; StateError if a number is invalid."""
         return Adaptive(checked_number(t_end, "t_end"), **self.checked())
 
     def checked(self) -> dict[str, Any]:
@@ -204,11 +200,7 @@ def plan_to_record(plan: Fixed | Adaptive | InTau) -> dict[str, Any]:
 
 
 def plan_from_record(*, h: Any = None, tau: Any = None, **control: Any) -> Fixed | Adaptive | InTau:
-    """Return the step plan of :func:`plan_to_record`.
-
-    Raises:
-        StateError, TypeError: for other names and numbers.
-    """
+    """Return the step plan of :func:`plan_to_record`; StateError or TypeError for other names and numbers."""
     if h is not None:
         if control or tau is not None:
             raise StateError("steps of one size have neither a target time nor a tolerance")
@@ -239,11 +231,7 @@ def _not_negative(value: Any, name: str) -> float:
 
 
 def absolute_tolerances(interface: Interface, dimension: int, absolute: AbsoluteTolerance) -> NDArray[np.float64]:
-    """Return the (m,) absolute tolerances of the coordinates.
-
-    Raises:
-        StateError: if there is no coordinate, array or rotation of a name.
-    """
+    """Return the (m,) absolute tolerances of the coordinates; StateError for names of no coordinates or rotation."""
     if not isinstance(absolute, tuple):
         return np.full(dimension, absolute)
     from scvi_codegen.runs.states.rotations import members_of  # here, because it imports runs
@@ -270,15 +258,7 @@ def absolute_tolerances(interface: Interface, dimension: int, absolute: Absolute
 
 
 def step_control(stepper: Any, plan: StepPlan) -> tuple[Any, ...]:
-    """Return the control of steps in C, NULL for fixed ones, and the numbers that it refers to.
-
-    Args:
-        stepper: :class:`~scvi_codegen.runs.stepping.integrator.Integrator` of the run.
-        plan: step plan.
-
-    Raises:
-        StateError: if there is no coordinate, array or rotation of a name, or a tolerance cannot be met.
-    """
+    """Return the control of steps in C, NULL for fixed ones, and its numbers; StateError if they cannot be met."""
     binding = stepper.binding
     match plan:
         case InTau(tau=tau):
@@ -336,16 +316,7 @@ def _check_resolved(tolerance: float | None, least: float) -> None:
 
 
 def checked_plan(kind: KindOfSteps, h: float | None, t_end: float | None, control: ErrorControl) -> StepPlan:
-    """Return the step plan of arguments of users.
-
-    Args:
-        kind: of the stepper.
-        h, t_end: step size; target time.
-        control: of adaptive steps.
-
-    Raises:
-        StateError: if a number is invalid, or they do not determine the steps.
-    """
+    """Return the step plan of arguments of users; StateError if they are invalid or do not determine the steps."""
     if kind.time_transformation is not None:
         if h is None or t_end is None or control.named:
             remedy = FEATURES["adaptive", "with a time transformation"]

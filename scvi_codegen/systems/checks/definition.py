@@ -184,11 +184,7 @@ def _check_continuity(
 
 
 def checked_gauge(system: MechanicalSystem) -> Expr:
-    """Return the energy of the rates of constraints that L needs for a regular mass matrix, 0 if its own is regular.
-
-    Raises:
-        SystemDefinitionError: for an invalid or singular Lagrangian, or invalid constraints.
-    """
+    """Return the energy of the rates of constraints that L needs for a regular mass matrix, 0 if its own is regular."""
     check_definition(system, "Lagrangian", system.velocities, "a velocity")
     if system.constraints:
         _check_constraints(system)

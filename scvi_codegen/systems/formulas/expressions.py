@@ -122,11 +122,7 @@ class Tape:
         self._results = [self._place(expression) for expression in expressions]
 
     def __call__(self, numbers: Sequence[Number]) -> list[Number]:
-        """Return the values at a point.
-
-        Raises:
-            ArithmeticError: if a value is not real or not within the range of a C double.
-        """
+        """Return the values at a point; ArithmeticError if one is not real or not within the range of a C double."""
         values = [*numbers, *self._start[len(numbers) :]]
         try:
             for register, operation, operands in self._steps:
@@ -173,15 +169,7 @@ def _operation(expression: sympy.Expr, operands: tuple[int, ...]) -> tuple[Calla
 
 
 def evaluate(expression: sympy.Expr, values: Mapping[sympy.Symbol, Number]) -> Number:
-    """Return the value of an expression at one point, in 60 digits.
-
-    Args:
-        expression: of the grammar.
-        values: a number for each of its symbols.
-
-    Raises:
-        ArithmeticError: if the value, or that of a subexpression, is not real or exceeds the range of a C double.
-    """
+    """Return the value of an expression at a point, in 60 digits; ArithmeticError if not real, or beyond C doubles."""
     try:
         return Tape(list(parts(expression)), list(values))(list(map(mp.mpf, values.values())))[0]
     except ArithmeticError as error:

@@ -109,14 +109,7 @@ class Elements:
         arrays: Mapping[str, NDArray[np.float64]],
         numbers: Mapping[Expr, float],
     ) -> Any:
-        """Return the values of a formula at every element.
-
-        Args:
-            formula: in the symbols of slots and numbers.
-            slots: symbol and access of each array entry.
-            arrays: arrays by name.
-            numbers: values by symbol.
-        """
+        """Return the values of a formula at every element, with arrays by name and numbers by symbol."""
         entries_by_slot: dict[Expr, Any] = {
             slot: convolved(arrays[access.array.name], access, arrays)[self.of(access)] for slot, access in slots
         }

@@ -64,11 +64,7 @@ class EnsembleStates:
         return self._table(_names_of(self.model)[0], self.model.q)
 
     def momenta(self, stepper: Stepper) -> Array:
-        """Return (k, m) momenta: those of the file, or Legendre transforms of its velocities; others from the model.
-
-        Raises:
-            StateError: if a velocity has no momentum.
-        """
+        """Return (k, m) momenta: those of the file, or Legendre transforms of its velocities; others from the model."""
         model = self.model
         _, velocities, momenta = _names_of(model)
         moving = not self.columns.keys().isdisjoint(velocities)
@@ -107,11 +103,7 @@ def _names_of(model: Model) -> tuple[list[str], list[str], list[str]]:
 
 
 def load_ensemble(path: str | os.PathLike[str], model: Model) -> EnsembleStates:
-    """Read a grid (``.toml``) or a table (``.csv``).
-
-    Raises:
-        ModelFileError: beginning with the path and naming the name or line at fault.
-    """
+    """Read a grid (``.toml``) or a table (``.csv``); ModelFileError names the path and the line at fault."""
     number = ExactNumber if model.in_double_double else float
     readers: dict[str, Callable[[str, Check], dict[str, Array]]]
     readers = {
