@@ -24,7 +24,7 @@ import numpy as np
 from scvi_codegen.common.errors import StateError, StepFailedError, UnresolvedError
 from scvi_codegen.methods import Method
 from scvi_codegen.runs.accuracy.size import distances_from_mean, relative, relative_to_motion
-from scvi_codegen.runs.ensembles.initial_states import momenta_of_each, start_of_ensemble
+from scvi_codegen.runs.ensembles.ensemble import momenta_of_each, start_of_ensemble
 from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
 from scvi_codegen.runs.states.validation import Array, States
 from scvi_codegen.runs.states.words import low_words, with_low

@@ -41,7 +41,7 @@ from scvi_codegen.codegen.lowering.solvers.tables import (
 from scvi_codegen.codegen.lowering.stage_groups import system_kernel
 from scvi_codegen.common.precision import Matrix, Vector, mp
 from scvi_codegen.methods.controllers import Controller
-from scvi_codegen.methods.controllers.predictive import PREDICTIVE
+from scvi_codegen.methods.controllers.controller import PREDICTIVE
 from scvi_codegen.methods.tables.basis import (
     cardinal_integrals,
     cardinal_values,

@@ -21,7 +21,6 @@ from scvi_codegen.codegen.ir.equations import Control, FixedPointIteration, Iter
 from scvi_codegen.codegen.ir.kernel import Kernel, Number, is_divided
 from scvi_codegen.codegen.ir.program import ArrayProgram, Program
 from scvi_codegen.codegen.rendering.environment import support_text, template_environment
-from scvi_codegen.codegen.rendering.header import HeaderRecord
 from scvi_codegen.codegen.rendering.kernels.double_double import arithmetic_headers, uses_functions
 from scvi_codegen.codegen.rendering.kernels.functions import unrolled_equations
 from scvi_codegen.codegen.rendering.kernels.loops import loop_context
@@ -39,7 +38,13 @@ from scvi_codegen.codegen.rendering.kernels.simd import (
 )
 from scvi_codegen.codegen.rendering.preprocessor import included
 from scvi_codegen.codegen.rendering.source import Contents, ExampleInput, Interface, LaneContents, Sizes, Source
-from scvi_codegen.codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, MAX_ITERATIONS, ROUNDING_UNITS
+from scvi_codegen.codegen.rendering.text import (
+    INPUT_PRECISION,
+    LARGEST_VIOLATION,
+    MAX_ITERATIONS,
+    ROUNDING_UNITS,
+    HeaderRecord,
+)
 from scvi_codegen.codegen.statements.printing import Layout
 from scvi_codegen.codegen.statements.steps import pair_rattle_functions, rattle_iteration, splitting_header
 

@@ -3,9 +3,7 @@
 from sympy import Expr
 
 from scvi_codegen.common.errors import MethodError, SystemDefinitionError, closest
-from scvi_codegen.methods.controllers.controller import Controller
-from scvi_codegen.methods.controllers.predictive import PREDICTIVE
-from scvi_codegen.methods.controllers.reversible import REVERSIBLE
+from scvi_codegen.methods.controllers.controller import PREDICTIVE, REVERSIBLE, Controller
 from scvi_codegen.systems.system import MechanicalSystem
 from scvi_codegen.systems.time_transformation import reparametrise, time_rescaling_function
 

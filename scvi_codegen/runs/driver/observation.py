@@ -18,9 +18,8 @@ from scvi_codegen.codegen.native.capacity import room_for_states, too_many_state
 from scvi_codegen.common.errors import EventError, StateError, StepFailedError, closest
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.driver.observer import Observer, StateChunk
-from scvi_codegen.runs.driver.run_loop import record, trajectory_of
+from scvi_codegen.runs.driver.run_loop import end_run, record, trajectory_of
 from scvi_codegen.runs.driver.singular_time import ProgressWatch
-from scvi_codegen.runs.driver.table_ranges import end_run
 from scvi_codegen.runs.events.refinement import search_of
 from scvi_codegen.runs.results.dense_output import states_and_steps_at, step_sizes_at, stepped_to
 from scvi_codegen.runs.results.output import Output

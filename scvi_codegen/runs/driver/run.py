@@ -12,8 +12,8 @@ from scvi_codegen.runs.accuracy.local_error import warn_of_inaccuracy
 from scvi_codegen.runs.accuracy.warning_switch import warn_of_failed_check
 from scvi_codegen.runs.driver.observation import Observation, Saver, saver_of
 from scvi_codegen.runs.driver.run_loop import ShortRuns, plain_trajectory, record
-from scvi_codegen.runs.results.descriptions import describe_run
 from scvi_codegen.runs.results.output import ALL_STATES, Output
+from scvi_codegen.runs.results.quantities import describe_run
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.layout import InitialData
 from scvi_codegen.runs.states.validation import Array, Parameters, States

@@ -24,10 +24,9 @@ from scvi_codegen.runs.driver.run_loop import record_with_stops
 from scvi_codegen.runs.results.dense_output import checked_times
 from scvi_codegen.runs.results.joining import joined
 from scvi_codegen.runs.results.output import Output
-from scvi_codegen.runs.states.pairs import exact_product
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import Array, check_left_to_inputs, no_input
-from scvi_codegen.runs.states.words import low_words, split, with_low
+from scvi_codegen.runs.states.words import exact_product, low_words, split, with_low
 from scvi_codegen.runs.stepping.features import refusal
 from scvi_codegen.runs.stepping.memory import Memory
 from scvi_codegen.runs.stepping.step_plan import Adaptive, Fixed, FixedSteps, StepPlan, ending_at

@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.runs.states.pairs import exact_product, exact_sum
 from scvi_codegen.runs.states.validation import Array
+from scvi_codegen.runs.states.words import exact_product, exact_sum
 
 WHOLE = 1e-9
 """Fraction of a step that rounding may leave of a span."""

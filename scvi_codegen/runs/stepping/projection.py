@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.codegen.native.options import REASONS, STATUS
 from scvi_codegen.codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
 from scvi_codegen.common.errors import AccuracyWarning, StateError, warn
-from scvi_codegen.runs.states.pairs import quotient_of
 from scvi_codegen.runs.states.validation import Array, Parameters, States, inputs_not_given, missing_input
+from scvi_codegen.runs.states.words import quotient_of
 from scvi_codegen.runs.stepping.features import require
 from scvi_codegen.runs.stepping.integrator import Integrator
 

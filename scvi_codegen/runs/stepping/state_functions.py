@@ -11,9 +11,8 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.codegen.native.options import REASONS
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.runs.states.pairs import product_of, quotient_of, sum_of
 from scvi_codegen.runs.states.validation import Array, Parameters, States, coordinate_shapes
-from scvi_codegen.runs.states.words import by_name, low_words, scalar, unnamed
+from scvi_codegen.runs.states.words import by_name, low_words, product_of, quotient_of, scalar, sum_of, unnamed
 from scvi_codegen.runs.stepping.array_interface import constraint_shapes
 from scvi_codegen.runs.stepping.compiled_method import CompiledMethod
 

@@ -14,9 +14,7 @@ from sympy import Expr, Symbol
 from sympy.core.function import AppliedUndef
 
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.systems.constraints.holonomic import HOLONOMIC
-from scvi_codegen.systems.constraints.kind import Constrained, ConstraintKind
-from scvi_codegen.systems.constraints.nonholonomic import NONHOLONOMIC
+from scvi_codegen.systems.constraints.kind import HOLONOMIC, NONHOLONOMIC, Constrained, ConstraintKind
 from scvi_codegen.systems.formulas.expressions import derivative_along, jacobian
 from scvi_codegen.systems.formulas.grammar import sides_of
 from scvi_codegen.systems.formulas.symbols import DOT, symbol
