@@ -39,11 +39,6 @@ def tangents_along(
 
     Returns:
         (n + 1, 2m) states, (n + 1, count, 2m) variations and (count, variables) final variations.
-
-    Raises:
-        EventError: if events end the run before the last step.
-        StateError: if derivatives through an event do not exist.
-        StepFailedError: if a step fails.
     """
     m, size, count = stepper.dimension, len(state), len(h)
     if not stepper.divides_steps:

@@ -101,9 +101,6 @@ def newton(
         relative: function of q and a correction that returns its size relative to the motion.
         q: start of the iteration.
         most: largest number of iterations.
-
-    Raises:
-        PathError: if the iteration does not converge.
     """
     damping = 1.0
     for iteration in range(most):

@@ -181,9 +181,6 @@ def lower(
         symmetries: whose momentum maps are included.
         lanes: allow a solver that uses SIMD lanes.
         fallback: include Newton's iteration as a fallback. Systems with integrals along the curve always include it.
-
-    Raises:
-        MethodError: if the solver is not available for the method and the system.
     """
     stages, explicit = discretise(system, method), solver in ("auto", "explicit")
     splitting = splitting_of(system, method) if explicit and not system.integrands else None

@@ -121,9 +121,6 @@ def load(source: Source, *, flags: tuple[str, ...] = TUNED_FLAGS) -> Library:
     """Return the library of a source, from memory, from the cache or compiled now.
 
     Flags in the environment variable ``SCVI_CODEGEN_CFLAGS`` are appended, and so override, those given.
-
-    Raises:
-        BuildError: without a compiler, or if it rejects the source.
     """
     compiler = find_compiler()
     key = fingerprint(source, flags=flags)

@@ -266,9 +266,6 @@ def render_double_double(
         program: with a fixed-point iteration of separable systems, or with Newton's method, also as the fallback of
             another iteration.
         derivatives: at the points of a fixed-point iteration, which correct it to two words.
-
-    Raises:
-        MethodError: for a function that has no double-double form.
     """
     fixed_point = program.fixed_point
     if in_pairs(program):

@@ -85,11 +85,7 @@ class Flow:
         return source
 
     def parameter_values(self, parameters: Any) -> Any:
-        """Return all parameters in order as a list, or, unless passed by name, unchanged.
-
-        Raises:
-            StateError: for unknown names, and missing inputs.
-        """
+        """Return all parameters in order as a list, or, unless passed by name, unchanged."""
         interface = self.stepper.interface
         check_inputs_given(interface, parameters)
         if parameters is not None and not isinstance(parameters, Mapping):

@@ -54,9 +54,6 @@ def with_time_transformation(
             among :data:`CONTROLLERS`, such as ``"reversible"``: unchanged, for ``compile_stepper(...,
             time_transformation=...)``. Source of these names: E. Hairer, Ch. Lubich, G. Wanner, *Geometric Numerical
             Integration*, VIII.2 and VIII.3.
-
-    Raises:
-        SystemDefinitionError: as :func:`check_controller` and as :func:`reparametrise`.
     """
     check_controller(controller, transformed=g is not None)
     if g is None:

@@ -71,9 +71,6 @@ def checked_inputs(
     """Return validated inputs: (t, values), (t, values, kind), a number or a piecewise polynomial of SciPy by name.
 
     With a number of trajectories, values may have one row for each trajectory, and constants one number.
-
-    Raises:
-        StateError: if a name is no input, an input is missing, or data define no function of time.
     """
     if interface.in_tau and argument is not None:
         raise refusal("inputs", "in transformed time")

@@ -104,9 +104,6 @@ def state_of(
         velocity: by name: of ordinary coordinates and directions, and the angular velocity under its own name (body
             frame) or with ``_space``.
         shapes: names and shapes of arrays of coordinates, ``("R", (3, 4))`` of three rotations.
-
-    Raises:
-        StateError: naming what is unknown, missing or invalid.
     """
     q, p, velocity = (_by_entry(shapes, members, part) for part in (q, p, velocity))
     ordinary = coordinates[: members[0].columns.start]

@@ -51,9 +51,6 @@ def projected(
     """Return the nearest state on the constraints, and (2,) its relative distance in q and in p.
 
     Distances are in the metric of the mass matrix at the projected state, hence independent of coordinate units.
-
-    Raises:
-        StateError: if the iteration fails, or if the constraints are linearly dependent there.
     """
     q0, p0 = stepper._states.pair(q, p)
     _of_constrained(stepper, q0, p0, t)

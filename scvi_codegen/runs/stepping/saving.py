@@ -64,10 +64,6 @@ def read_checkpoint(
         stepper: of the system and method of the run; of run-time sizes, of any size.
         threads: number of threads per step of run-time sizes.
         adaptive: whether the run continues with adaptive steps.
-
-    Raises:
-        StateError: if the bytes are damaged or belong to another integrator or another kind of steps, or, of run-time
-            sizes, for an invalid ``threads``.
     """
     body = unsealed(saved)
     try:

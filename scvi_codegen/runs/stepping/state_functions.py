@@ -77,11 +77,7 @@ class StateFunctions(CompiledMethod):
         return self.initial_momentum(q, velocity, t, parameters)
 
     def initial_momentum(self, q: States, velocity: States, t: float, parameters: Parameters) -> Array:
-        """Return the (m,) momentum of the initial state of a run.
-
-        Raises:
-            StateError: if the mass matrix is singular along the velocity, so the momentum does not determine it.
-        """
+        """Return the (m,) momentum of the initial state of a run."""
         q, v = self._states.pair(q, velocity, "velocity")
         p = self._transformed("momentum", self._states.time(t), q, v, self._parameters(parameters))
         dropped = (p == 0.0) & (v != 0.0)
@@ -122,11 +118,7 @@ class StateFunctions(CompiledMethod):
         return parts
 
     def _energies_of(self, t: Array, q: Array, p: Array, parameters: Array) -> Array:
-        """Return (n,) energies of unchecked contiguous arrays of shapes (n,), (n, m), (n, m) and (k,).
-
-        Raises:
-            StateError: if a state is outside the domain of L.
-        """
+        """Return (n,) energies of unchecked contiguous arrays of shapes (n,), (n, m), (n, m) and (k,)."""
         result, binding = np.empty(len(t) * self.interface.words), self.binding
         states = self._states
         arrays = states.times_block(t), *map(states.block, (q, p)), result

@@ -269,9 +269,6 @@ class LinearisedMethod(StateFunctions):
 
         Returns:
             (n, m) recomputed positions and momenta at the ends of the steps.
-
-        Raises:
-            StepFailedError: if Newton's iteration does not converge.
         """
         binding, m = self.tangent, self.dimension
         report = binding.new("report *")
@@ -306,10 +303,6 @@ class LinearisedMethod(StateFunctions):
             vectors: (n + 1, 2, count, 2m + k + 2) cotangents and their tangents: the image of row i + 1 under step i
                 is added to row i.
             parameters, options: as of :meth:`_propagate`.
-
-        Raises:
-            MethodError: if second derivatives are unavailable.
-            StepFailedError: if Newton's iteration does not converge.
         """
         binding = self._second_derivatives
         report = binding.new("report *")

@@ -358,9 +358,6 @@ def planned_steps(
         kind: of the stepper; runs in double-double end at t_end to 32 digits.
         h, steps, t_end, tolerance, absolute_tolerance, max_step, first_step, save_every, t: arguments of
             :meth:`Stepper.integrate`; t matters with h and t_end.
-
-    Raises:
-        StateError: if a number is invalid, or they do not determine the steps.
     """
     fixed = h is not None and kind.time_transformation is None
     control = ErrorControl(tolerance, absolute_tolerance, max_step, first_step)

@@ -369,9 +369,6 @@ def formula_of_entries(
         text, arrays, symbols, tables: as of :func:`~scvi_codegen.systems.formulas.arrays.parse_sums`.
         rules: sizes, index tables and names of entries, those of velocity arrays left out; by default those of arrays
             whose sizes are numbers.
-
-    Raises:
-        SystemDefinitionError: for anything outside the grammar, and for an index outside its array.
     """
     rules = rules or EntryRules(
         {}, {}, {array.name: entry_names(array, {}) for array in arrays if not array.name.endswith(DOT)}

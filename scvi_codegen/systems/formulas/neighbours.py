@@ -69,9 +69,6 @@ def parse_neighbours(
             or one per component, and absent without a periodic boundary.
         arrays: coordinates.
         symbols: parameters by name.
-
-    Raises:
-        SystemDefinitionError: if a key is missing or unknown, or ``of`` is not an array of positions.
     """
     by_name, results = {array.name: array for array in arrays}, []
     for name, entry in argument.items():

@@ -368,12 +368,7 @@ class RotationNames:
         dissipation: Any,
         others: Iterable[tuple[str, Iterable[Expr]]] = (),
     ) -> Forces:
-        """Return the forces by name of a coordinate (one), rotation or direction (three components), and ``others``.
-
-        Raises:
-            SystemDefinitionError: for forces and torques on other names, of other numbers of components, and a
-                dissipation without velocities.
-        """
+        """Return the forces by name of a coordinate (one), rotation or direction (three components), and ``others``."""
         if not isinstance(forces or {}, Mapping):
             raise SystemDefinitionError(f"forces must be a mapping from coordinates to formulas, not {forces!r}")
         rotating = {member.name: member for member in self.rotations}
