@@ -32,7 +32,7 @@ S. Reich, SIAM J. Numer. Anal. 33 (1996), on compositions; E. Barth, K. Kuczera,
 Chem. 16 (1995), on the iteration.
 """
 
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, TypeAlias
@@ -81,7 +81,7 @@ def rattle_of(system: MechanicalSystem, stages: StageSystem, predictor: NumberTa
         return None
     if forms.regular_legendre is not forms.legendre:  # massless coordinates: M has no inverse
         return None
-    groups = coupled_coordinates(forms.lower_mass, system.dimension)
+    groups = connected_components((range(system.dimension), list(forms.lower_mass)))  # that masses couple
     if max(map(len, groups)) > MOST_COUPLED_MASSES:
         return None
     points = len(tables.blocks)
@@ -203,11 +203,6 @@ def _tables(
         yield IterationTable(f"RATTLE_{name}", lower_vector(vector), name in two_words)
     for name, matrix in matrices.items():
         yield IterationTable(f"RATTLE_{name}", lower_matrix(matrix), name in two_words)
-
-
-def coupled_coordinates(entries: Iterable[tuple[int, int]], count: int) -> list[tuple[int, ...]]:
-    """Return the groups of coordinates that entries (i, j) of a matrix couple."""
-    return [tuple(sorted(group)) for group in connected_components((range(count), list(entries)))]
 
 
 def constrained_steps(system: ArraySystem, stages: StageSystem, method: Method) -> ConstrainedSteps | None:

@@ -17,7 +17,7 @@ from itertools import accumulate, chain
 from typing import Any, ClassVar, Literal, TypeAlias, cast, get_args
 
 from scvi_codegen.codegen.ir.derivatives import Derivatives, PointDerivatives
-from scvi_codegen.codegen.ir.equations import Control, FixedPointIteration, IterationTable, Rattle, StoredValues
+from scvi_codegen.codegen.ir.equations import Control, FixedPointIteration, IterationTable, StoredValues
 from scvi_codegen.codegen.ir.kernel import Kernel, Number, is_divided
 from scvi_codegen.codegen.ir.program import ArrayProgram, Program
 from scvi_codegen.codegen.rendering.environment import support_text, template_environment
@@ -417,7 +417,8 @@ def _render_mixed_newton(program: Program, correction: PointDerivatives | None, 
     )
     rattle, vectors = program.rattle, tuple[Kernel, ...]()
     plain = not (program.damping or quantities.integrals)
-    if rattle and constraints and rattle.points > 1 and plain and _of_forces_alone(rattle):
+    of_forces = rattle and rattle.part == "rattle" and not rattle.macros  # of constant masses and forces of positions
+    if rattle and constraints and rattle.points > 1 and plain and of_forces:
         kernels = *kernels, *rattle.kernels
         of_points = *rattle.kernels, replace(constraints.kernel, values=len(constraints.kernel.results))
         vectors = tuple(replace(kernel, name=f"{kernel.name}_of_points") for kernel in of_points)
@@ -441,11 +442,6 @@ def _render_mixed_newton(program: Program, correction: PointDerivatives | None, 
         },
     }
     return _render(program.prefix, context)
-
-
-def _of_forces_alone(rattle: Rattle) -> bool:
-    """Return whether masses are constant, and forces and momenta do not depend on velocities and positions."""
-    return rattle.part == "rattle" and not rattle.macros
 
 
 def render_embedded(program: Program, precision: Embedded, control: Control | None = None) -> Source:

@@ -235,7 +235,8 @@ class Ensemble:
         start = {"t0": t0, "q": positions, "p": momenta, "parameters": values}
         ensemble = cls(stepper=stepper, settings=settings, **start, inputs=inputs, fixed=fixed, save_every=save_every)
         if not stepper._has_energy(parameters):
-            ensemble._set_energies()
+            for member, at, momentum in zip(values, positions, momenta, strict=True):
+                member[stepper.interface.energy_index] = stepper.energy(at, momentum, 0.0, member)
         if fixed is None:
             ensemble._set_ends(cast(Array, ends))
         if inputs:
@@ -244,11 +245,6 @@ class Ensemble:
 
     def __len__(self) -> int:
         return len(self.q)
-
-    def _set_energies(self) -> None:
-        """Set the parameter of transformed time, the energy of each initial state."""
-        for values, q, p in zip(self.parameters, self.q, self.p, strict=True):
-            values[self.stepper.interface.energy_index] = self.stepper.energy(q, p, 0.0, values)
 
     def _set_ends(self, ends: Array) -> None:
         """Set the plan of adaptive steps, their final times and output times; all run forward or all backward."""
