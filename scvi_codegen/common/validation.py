@@ -138,11 +138,7 @@ class ArgumentType:
 
 
 class OfRunTimeSizes:
-    """Base of types that count as instances of another type, but lack features that require known sizes.
-
-    Attributes:
-        REQUIRES_SIZES: explanation and remedy.
-    """
+    """Base of types that count as others, but lack features; ``REQUIRES_SIZES`` explains it and names the remedy."""
 
     __slots__ = ()
     REQUIRES_SIZES: ClassVar[str]

@@ -279,11 +279,7 @@ def rational(value: Number) -> Expr:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpectralElements(Axis):
-    """Elements between ascending ends.
-
-    Attributes:
-        reference: the points on [-1, 1].
-    """
+    """Elements between ascending ends, with the points ``reference`` on [-1, 1]."""
 
     reference: Vector
 
@@ -487,11 +483,7 @@ def _edges(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FiniteDifferences(Axis):
-    """Equidistant points.
-
-    Attributes:
-        stencil: number of points for the interpolation of values between points.
-    """
+    """Equidistant points, ``stencil`` of them for the interpolation of values between points."""
 
     stencil: int
 

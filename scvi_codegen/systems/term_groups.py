@@ -59,12 +59,7 @@ class TermGroup:
 
 @dataclass(frozen=True, slots=True)
 class SplitSystem:
-    """System split into unrolled terms and term groups.
-
-    Attributes:
-        rest: the same system without the term groups.
-        term_groups: term groups of L, or of -H for a Hamiltonian.
-    """
+    """System split into unrolled terms, ``rest``, and term groups of L, or of -H for a Hamiltonian."""
 
     rest: MechanicalSystem
     term_groups: tuple[TermGroup, ...]
@@ -72,12 +67,7 @@ class SplitSystem:
 
 @dataclass(frozen=True, slots=True)
 class SimilarTerms:
-    """Terms of the same structure.
-
-    Attributes:
-        terms: the expressions.
-        leaves: coordinates and constants of each term, in the same order.
-    """
+    """Terms of the same structure, and the leaves of each: coordinates and constants, in the same order."""
 
     terms: tuple[Expr, ...]
     leaves: tuple[_Leaves, ...]

@@ -445,11 +445,7 @@ def _render_mixed_newton(program: Program, correction: PointDerivatives | None, 
 
 
 def render_embedded(program: Program, precision: Embedded, control: Control | None = None) -> Source:
-    """Return the source for a microcontroller: one file, bounded iterations, scalars of its registers.
-
-    Raises:
-        MethodError: for a number outside the range of single precision.
-    """
+    """Return one file for a microcontroller, bounded iterations in its scalars; MethodError out of their range."""
     target = TARGETS[precision]
     target.check((*program.layout.defaults, *chain(*map(constants, _scalar_kernels(program, control)))))
     bound = f"{program.prefix.upper()}_MAX_ITERATIONS"

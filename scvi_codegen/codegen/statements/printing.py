@@ -85,12 +85,7 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Layout:
-    """Numbers and SIMD lanes of the C of a step without points.
-
-    Attributes:
-        words: of the numbers that statements compute.
-        lanes: whether SIMD lanes are trajectories.
-    """
+    """C of a step without points: numbers of one or two ``words``, and ``lanes`` if SIMD lanes are trajectories."""
 
     words: int = 1
     lanes: bool = False

@@ -115,13 +115,7 @@ Content: TypeAlias = Block | TableBlock | Code | Drawing | SideBySide
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Section:
-    """A part of a page.
-
-    Attributes:
-        name: anchor of links.
-        title: its heading.
-        contents: in order.
-    """
+    """A part of a page: anchor of links, heading, and contents in order."""
 
     name: str
     title: str

@@ -20,11 +20,7 @@ DIGITS = 17
 
 @dataclass(frozen=True, slots=True)
 class ArrayStepEquations:
-    """Compiled kernels of a system of arrays, with the loops around them, and the equations of a step.
-
-    Attributes:
-        system, method: the system and the method.
-    """
+    """Compiled kernels of a system of arrays, with the loops around them, and the equations of a step."""
 
     system: ArraySystem
     method: Method

@@ -35,12 +35,7 @@ MAX_SHOWN_LENGTH = 60
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CsvTable:
-    """Columns of numbers.
-
-    Attributes:
-        columns: (n,) values by name, in the order of the file.
-        lines: (n,) line numbers of the rows, from 1; empty for a file without lines.
-    """
+    """Columns of numbers by name in the order of the file, and line numbers of the rows from 1, if there are lines."""
 
     columns: dict[str, NDArray[np.float64]]
     lines: tuple[int, ...]

@@ -44,12 +44,7 @@ STYLE = {
 
 
 def check_plot_path(path: str | os.PathLike[str], suffixes: tuple[str, ...] = PICTURES) -> None:
-    """Check before a long run that a picture can be written.
-
-    Raises:
-        StateError: for a suffix that is none of ``suffixes``.
-        PlotError: without matplotlib.
-    """
+    """Check before a long run that a picture can be written; StateError for its suffix, PlotError without library."""
     if Path(path).suffix.lower() not in suffixes:
         formats = f"{', '.join(suffixes[:-1])} or {suffixes[-1]}"
         raise StateError(f"a picture is saved as {formats}, not as {str(path)!r}")

@@ -24,11 +24,7 @@ T = -2
 
 @dataclass(frozen=True)
 class PhysicalTime:
-    """Run without time transformation: the maps below are identities.
-
-    Attributes:
-        states: states of the run at the ends of steps.
-    """
+    """Run without time transformation: the maps below are identities."""
 
     states: SavedStates
 

@@ -168,11 +168,7 @@ class StateRows:
 
 
 class ShortRuns(StateRows):
-    """Memory of runs of at most ``FIRST_STEPS`` saved states, each started and recorded by one C call.
-
-    Args:
-        memory: the run, whose parameters, options and plan the call uses.
-    """
+    """Memory of runs of at most ``FIRST_STEPS`` saved states by the plan of a run, each recorded by one C call."""
 
     def __init__(self, memory: Memory) -> None:
         super().__init__(memory, FIRST_STEPS + 3)

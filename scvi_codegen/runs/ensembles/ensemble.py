@@ -198,16 +198,7 @@ class Ensemble:
     def of(
         cls, stepper: Any, q: States, p: States | None, settings: EnsembleSettings, *, velocity: States | None = None
     ) -> Self:
-        """Return the ensemble of validated arguments.
-
-        Args:
-            stepper: the compiled integrator.
-            q, p, velocity: (k, m) initial state, of which p or the velocity is ``None``.
-            settings: other arguments.
-
-        Raises:
-            StateError: if a shape, name or number is invalid, or the stepper has a time transformation.
-        """
+        """Return the ensemble of (k, m) states with p or velocity; StateError if invalid, or in transformed time."""
         settings.check(stepper)
         layout, parameters = stepper._states, settings.parameters
         t0 = layout.time(settings.t)

@@ -309,11 +309,7 @@ def nearly_dependent(jacobian: Array) -> str:
 def rank_deficiency(names: Sequence[str], q: Array, at: Jacobian, *, nearest: bool = False) -> str | None:
     """Return what is wrong with constraints of deficient rank, and what to do; ``None`` if they are independent.
 
-    Args:
-        names: formulas of the constraints.
-        q: (m,) positions.
-        at: function that returns g and G at positions.
-        nearest: first minimise the constraint residual by Gauss-Newton iteration.
+    ``nearest``: first minimise the constraint residual by Gauss-Newton iteration.
     """
     for _ in range(ITERATIONS if nearest else 0):
         g, jacobian = at(q)

@@ -59,11 +59,7 @@ def read_checkpoint(
 ) -> tuple[Integrator, bytes, dict[str, Any], ErrorControl]:
     """Return the stepper, bound to the sizes of the run, the state, the parameters by name and the error control.
 
-    Args:
-        saved: bytes of :func:`checkpoint`.
-        stepper: of the system and method of the run; of run-time sizes, of any size.
-        threads: number of threads per step of run-time sizes.
-        adaptive: whether the run continues with adaptive steps.
+    ``adaptive``: whether the run continues with adaptive steps.
     """
     body = unsealed(saved)
     try:

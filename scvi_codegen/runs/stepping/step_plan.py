@@ -28,11 +28,7 @@ AbsoluteTolerance: TypeAlias = float | tuple[tuple[str, float], ...]
 
 @dataclass(frozen=True, slots=True)
 class FixedSteps:
-    """Steps of one size; base of :class:`Fixed` and :class:`Until`.
-
-    Attributes:
-        h: step size, of tau in transformed time.
-    """
+    """Steps of one size h, of tau in transformed time; base of :class:`Fixed` and :class:`Until`."""
 
     h: float
 
@@ -44,11 +40,7 @@ class Fixed(FixedSteps):
 
 @dataclass(frozen=True, slots=True)
 class Until(FixedSteps):
-    """Fixed steps to a target time, the last of which is shorter; it is not taken by the run itself.
-
-    Attributes:
-        t_end: target time.
-    """
+    """Fixed steps to the time ``t_end``, the last of which is shorter; it is not taken by the run itself."""
 
     t_end: float
 
@@ -81,12 +73,7 @@ class Adaptive:
 
 @dataclass(frozen=True, slots=True)
 class InTau:
-    """Steps of one size in the fictitious time of a controller, to a target time.
-
-    Attributes:
-        t_end: target time.
-        tau: step size.
-    """
+    """Steps of one size in the fictitious time ``tau`` of a controller, to the time ``t_end``."""
 
     t_end: float
     tau: float
@@ -103,12 +90,7 @@ def ending_at(plan: StepPlan, t_end: float) -> StepPlan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdaptivePlans(Sequence[Adaptive]):
-    """Adaptive steps of trajectories to times of their own, made when they are read.
-
-    Attributes:
-        ends: (k,) target times.
-        plan: that of a trajectory, whose target time is replaced.
-    """
+    """Adaptive steps of trajectories by one plan to (k,) ``ends`` of their own, made when they are read."""
 
     ends: NDArray[np.float64]
     plan: Adaptive
@@ -354,10 +336,7 @@ def planned_steps(
 ) -> tuple[StepPlan, int | None]:
     """Return the plan of :meth:`Stepper.integrate` and its number of steps, ``None`` to t_end.
 
-    Args:
-        kind: of the stepper; runs in double-double end at t_end to 32 digits.
-        h, steps, t_end, tolerance, absolute_tolerance, max_step, first_step, save_every, t: arguments of
-            :meth:`Stepper.integrate`; t matters with h and t_end.
+    Runs in double-double end at t_end to 32 digits; t matters with h and t_end.
     """
     fixed = h is not None and kind.time_transformation is None
     control = ErrorControl(tolerance, absolute_tolerance, max_step, first_step)

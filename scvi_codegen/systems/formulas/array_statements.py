@@ -365,10 +365,7 @@ def formula_of_entries(
 ) -> Expr:
     """Return a formula in index notation, which may be nonlinear in its sums, as a formula of the entries of arrays.
 
-    Args:
-        text, arrays, symbols, tables: as of :func:`~scvi_codegen.systems.formulas.arrays.parse_sums`.
-        rules: sizes, index tables and names of entries, those of velocity arrays left out; by default those of arrays
-            whose sizes are numbers.
+    ``rules``: sizes, tables and names of entries; by default those of arrays whose sizes are numbers.
     """
     rules = rules or EntryRules(
         {}, {}, {array.name: entry_names(array, {}) for array in arrays if not array.name.endswith(DOT)}

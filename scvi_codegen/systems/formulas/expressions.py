@@ -105,12 +105,7 @@ CONSTANT_VALUES = {sympy.S.Pi: mp.mpf(mp.pi), sympy.S.Exp1: mp.mpf(mp.e)}
 
 
 class Tape:
-    """Straight-line program of several expressions in the same symbols.
-
-    Args:
-        expressions: of the grammar of :mod:`~scvi_codegen.systems.formulas.grammar`.
-        symbols: all that occur in them.
-    """
+    """Straight-line program of several expressions of the grammar, in the same symbols."""
 
     def __init__(self, expressions: Sequence[sympy.Expr], symbols: Sequence[sympy.Symbol]) -> None:
         self.symbols = tuple(symbols)

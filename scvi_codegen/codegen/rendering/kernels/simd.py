@@ -220,11 +220,7 @@ def iteration_source(
 ) -> IterationSource:
     """Return the template data of a fixed-point iteration.
 
-    Args:
-        fixed_point: the iteration.
-        meaning: of a lane.
-        kernels: those applied to vectors, if they are not the iteration's own.
-        changes: whether it also propagates tangent and adjoint vectors.
+    ``kernels``: those applied to vectors, if not its own; ``changes``: tangent and adjoint vectors are propagated, too.
     """
     kernels = tuple(fixed_point.kernels if kernels is None else kernels)
     if meaning.are_points:

@@ -39,12 +39,7 @@ MOST = 10**8
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EnsembleStates:
-    """Initial values of k trajectories from a file.
-
-    Attributes:
-        columns: (k,) values by name; exact numbers where states have two words.
-        model: provides all other values.
-    """
+    """Initial values of k trajectories from a file, exact numbers in two words; the model has all others."""
 
     columns: Mapping[str, Array]
     model: Model
