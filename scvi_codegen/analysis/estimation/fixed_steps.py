@@ -29,12 +29,11 @@ def tangents_along(
     """Return the states at the ends of steps, and tangent vectors there.
 
     Args:
-        stepper: the compiled stepper, with its events.
+        stepper: with its events.
         state: (2m,) initial state.
         t, h: (n,) times and sizes of consecutive steps.
         tangents: (count, variables) initial variations of (q, p, parameters, t, h).
         parameters: values in order.
-        options: solver options.
         size_variations: (n, count) variations of the step sizes, which are those in ``tangents`` by default.
 
     Returns:

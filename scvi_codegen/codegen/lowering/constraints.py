@@ -206,11 +206,7 @@ def _tables(
 
 
 def constrained_steps(system: ArraySystem, stages: StageSystem, method: Method) -> ConstrainedSteps | None:
-    """Return the kernels and fractions of constrained steps; ``None`` without constraints.
-
-    Raises:
-        MethodError: for other methods.
-    """
+    """Return kernels and fractions of RATTLE steps, ``None`` without constraints; MethodError for other methods."""
     if not system.constraints:
         return None
     pairs = list(_kernels(system))

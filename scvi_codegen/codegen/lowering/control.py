@@ -135,7 +135,6 @@ def _tables_by_ratio(
     """Return tables by ratio of the next step size to the last, and by step.
 
     Args:
-        fixed_point: the iteration.
         ratios: ratios of the next step size to the last.
         sources: times of the stored values, in units of the last step size.
         degree: of the polynomial.

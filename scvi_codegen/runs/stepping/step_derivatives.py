@@ -264,7 +264,6 @@ class LinearisedMethod(StateFunctions):
             vectors: (n + 1, count, 2m + k + 2) variations of (q, p, parameters, t, h): the image of row i under step i
                 is added to row i + 1.
             parameters: (k,) values in order.
-            options: solver options.
             transpose: apply the transpose: the image of row i + 1 is added to row i.
 
         Returns:

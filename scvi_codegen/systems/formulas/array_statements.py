@@ -270,10 +270,7 @@ def _place_text(subscript: Place) -> str:
 
 
 def array_text(expression: Expr) -> str:
-    """Return the text of a sum of sums.
-
-    Raises:
-        SystemDefinitionError: for other limits than those above.
+    """Return the text of a sum of sums; SystemDefinitionError for other limits than those above.
 
     >>> from sympy import IndexedBase, symbols
     >>> q, (i, N) = IndexedBase("q"), symbols("i N", integer=True)

@@ -21,9 +21,7 @@ MAX_ELEMENTS = 5_000_000
 def array_value(expression: Expr, values: dict[Expr, Any]) -> Any:
     """Return the values of an expression, with the broadcast shape of the arrays in ``values``; NaN where undefined.
 
-    Args:
-        expression: an expression.
-        values: a number or an array for each symbol; values of subexpressions are added.
+    ``values`` has a number or an array for each symbol; values of subexpressions are added.
 
     >>> x = Symbol("x", real=True)
     >>> array_value(x**2 + 1, {x: np.arange(3.0)}).tolist()

@@ -155,9 +155,7 @@ def format_expression(expression: Expr) -> str:
     """Return an expression as text of the grammar, from which ``parse_expression`` rebuilds it node by node.
 
     The expression is taken as SymPy's constructors leave it; one built with ``evaluate=False`` comes back evaluated.
-
-    Raises:
-        SystemDefinitionError: for an expression outside the grammar.
+    SystemDefinitionError for an expression outside the grammar.
 
     >>> import sympy
     >>> x, y = sympy.symbols("x y", real=True)
