@@ -424,12 +424,7 @@ class Sources:
         return render_ensemble(program, tangents=count)
 
     def observing(self, observed: Observing) -> Source | None:
-        """Return the ensemble source that observes functions of the state; ``None`` without trajectories in lanes.
-
-        Raises:
-            EventError: for an invalid formula.
-            MethodError: if velocities at given momenta, on which a function depends, have no formula.
-        """
+        """Return the ensemble source that observes functions of the state; ``None`` without trajectories in lanes."""
         system, program = self.system, self.program()
         if program.rattle or render_ensemble(program) is None:
             return None

@@ -43,11 +43,7 @@ class NewtonFallback(Variant):
 
 @dataclass(frozen=True, slots=True)
 class Derivatives(Variant):
-    """Derivatives of steps with respect to all their arguments.
-
-    Attributes:
-        order: highest order, 1 or 2.
-    """
+    """Derivatives of steps with respect to all their arguments, up to the ``order`` 1 or 2."""
 
     of_known_sizes = True
     order: int = 1
@@ -55,22 +51,14 @@ class Derivatives(Variant):
 
 @dataclass(frozen=True, slots=True)
 class Acting(Variant):
-    """Runs that sum the action of their steps.
-
-    Attributes:
-        in_lanes: whether their trajectories are in SIMD lanes.
-    """
+    """Runs that sum the action of their steps; ``in_lanes``: of trajectories in SIMD lanes."""
 
     in_lanes: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class TangentVectors(Variant):
-    """Trajectories in SIMD lanes with tangent vectors.
-
-    Attributes:
-        count: number of vectors of each trajectory.
-    """
+    """Trajectories in SIMD lanes with ``count`` tangent vectors each."""
 
     of_known_sizes = True
     count: int
@@ -95,21 +83,13 @@ class Energies(Observing):
 
 @dataclass(frozen=True, slots=True)
 class Crossings(Observing):
-    """Numbers of zero crossings of event functions.
-
-    Attributes:
-        functions: formulas of the events.
-    """
+    """Numbers of zero crossings of event functions, whose formulas are ``functions``."""
 
     functions: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class WithEvents(Variant):
-    """The integrator with event detection, of a package that is loaded.
-
-    Attributes:
-        events: the events.
-    """
+    """The integrator with event detection, of a package that is loaded."""
 
     events: tuple[Event, ...]

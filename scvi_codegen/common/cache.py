@@ -109,11 +109,7 @@ def exposed(path: Path) -> str:
 
 
 def size_limit() -> int:
-    """Return the maximum total size of the entries in bytes, 0 for no limit.
-
-    Raises:
-        BuildError: if ``$SCVI_CODEGEN_CACHE_SIZE`` is not a size.
-    """
+    """Return the maximum total size of the entries in bytes, 0 for no limit; BuildError if the variable is no size."""
     setting = os.environ.get(SIZE_VARIABLE) or DEFAULT_SIZE
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?", setting.strip(), re.IGNORECASE)
     if match is None:

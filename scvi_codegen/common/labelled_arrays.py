@@ -121,11 +121,7 @@ class Labelled:
 
 
 def checked_units(units: Mapping[str, str] | None) -> dict[str, str]:
-    """Return units by name; those of velocities follow from those of positions and time.
-
-    Raises:
-        StateError: for an unknown name, or a value that is not text.
-    """
+    """Return units by name, those of velocities from positions and time; StateError for unknown names, other values."""
     result = dict(units or {})
     for name, unit in result.items():
         if name not in MEASURED or not isinstance(unit, str):

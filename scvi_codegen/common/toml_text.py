@@ -19,11 +19,7 @@ LONG_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\
 
 
 def read_toml(text: str, parse_float: Callable[[str], float] = float) -> dict[str, Any]:
-    """Return the document in a text, with numbers with a point or an exponent by ``parse_float``.
-
-    Raises:
-        ModelFileError: for text that is not TOML, or longer or deeper than any file of this program.
-    """
+    """Return the document in a text, its real numbers by ``parse_float``; ModelFileError if invalid or too large."""
     if len(text) > MAX_CHARACTERS:
         raise ModelFileError(f"the file has {len(text)} characters: the limit is {MAX_CHARACTERS}")
     if LONG_KEY.search(text):

@@ -78,12 +78,7 @@ def synonym_hint(word: str, keywords: Collection[str]) -> str:
 
 
 def keyword_hint(name: str, keywords: Collection[str]) -> str:
-    """Return ``"; did you mean 'h'?"``, or ``": "`` and an explanation, or the list of keywords.
-
-    Args:
-        name: a keyword that the function does not have.
-        keywords: those that it has.
-    """
+    """Return ``"; did you mean 'h'?"`` for an unknown name, or ``": "`` and an explanation, or the list of keywords."""
     if here := synonym_hint(name, keywords):
         return here
     for word in (name, *likely_names(name)):
@@ -143,11 +138,7 @@ class ArgumentType:
 
 
 class OfRunTimeSizes:
-    """Base of types that count as instances of another type, but lack features that require known sizes.
-
-    Attributes:
-        REQUIRES_SIZES: explanation and remedy.
-    """
+    """Base of types that count as others, but lack features; ``REQUIRES_SIZES`` explains it and names the remedy."""
 
     __slots__ = ()
     REQUIRES_SIZES: ClassVar[str]

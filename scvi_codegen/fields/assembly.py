@@ -360,14 +360,7 @@ class Assembly:
     def quadrature(
         self, cells_of: Mapping[str, Cells], others: Sequence[str], term: Expr, node: Mapping[str, Slot]
     ) -> Expr:
-        """Return the weighted sum of a term over the quadrature points of a cell.
-
-        Args:
-            cells_of: kind of cells by axis.
-            others: the other axes.
-            term: of the density.
-            node: index of the quadrature point along the axes that are summed already.
-        """
+        """Return the weighted sum of a term over the points of a cell; ``node``: those along axes summed already."""
         if left := [axis for axis in cells_of if axis not in node]:
             axis, cells = left[0], cells_of[left[0]]
             count = 1 if cells.edge else len(self.axes[axis].quadrature)

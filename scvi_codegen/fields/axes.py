@@ -185,11 +185,7 @@ class Axis(ABC):
         """Return the coefficients of :meth:`interpolation` at a coordinate with these distances from all points."""
 
     def modes(self, values: Array) -> Array:
-        """Return the squared amplitudes of all modes but the constant, (.., E, p), or (.., 1, N//2) of Fourier modes.
-
-        Args:
-            values: at the points along the last axis.
-        """
+        """Return the squared amplitudes of all modes but the constant, (.., E, p), or (.., 1, N//2) of Fourier."""
         return np.asarray(np.abs(np.fft.rfft(values)[..., None, 1:]) ** 2)
 
     def interpolation(self, place: float) -> dict[int, float]:
@@ -283,11 +279,7 @@ def rational(value: Number) -> Expr:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpectralElements(Axis):
-    """Elements between ascending ends.
-
-    Attributes:
-        reference: the points on [-1, 1].
-    """
+    """Elements between ascending ends, with the points ``reference`` on [-1, 1]."""
 
     reference: Vector
 
@@ -491,23 +483,13 @@ def _edges(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FiniteDifferences(Axis):
-    """Equidistant points.
-
-    Attributes:
-        stencil: number of points for the interpolation of values between points.
-    """
+    """Equidistant points, ``stencil`` of them for the interpolation of values between points."""
 
     stencil: int
 
     @classmethod
     def of(cls, system: Density, name: str, *, order: int, points: int) -> FiniteDifferences:
-        """Return the axis of a density; for u_xx in its density two points more are used.
-
-        Args:
-            system, name: the density, and the axis.
-            order: 2 m.
-            points: their number, ends included.
-        """
+        """Return the axis of a density, differences of order 2 m at points with both ends; two more for u_xx."""
         second = any(
             orders.get(name) == 2 and symbol(derivative) in system.density.free_symbols
             for derivative, (_, orders) in system.derivatives.items()
@@ -656,13 +638,7 @@ class Fourier(Axis):
 
     @classmethod
     def of(cls, system: Density, name: str, *, points: int, derivative: str | None = None) -> Fourier:
-        """Return the axis of a density.
-
-        Args:
-            system, name: the density, and the axis.
-            points: their number.
-            derivative: ``"fft"``, ``"dense"``, or ``None`` for fast Fourier transforms of many points.
-        """
+        """Return the axis of a density; ``derivative``: ``"fft"``, ``"dense"``, or ``None`` for the faster of both."""
         if system.boundary[name] != PERIODIC:
             raise SystemDefinitionError(
                 f"'fourier' needs a periodic axis, and '{name}' has ends: use \"spectral-elements\" or "

@@ -344,12 +344,7 @@ class FieldHistory:
 
     @cached_property
     def between(self) -> tuple[Array, FieldHistory]:
-        """Times (n, 9) near each state, a twentieth of the distance of states apart, and the history at these times.
-
-        Raises:
-            StateError: if the run has no dense output.
-            StepFailedError: if a partial step fails.
-        """
+        """Times (n, 9) near each state, a twentieth of the distance of states apart, and the history at these times."""
         if not self.run._has_dense_output or self.run.pieces:
             raise StateError("recordings and runs with inputs have none here")
         count = len(self.t)

@@ -118,11 +118,7 @@ def fitted(specification: Specification, system: MechanicalSystem | None) -> Spe
 
 
 def specification_of(name: str) -> dict[str, Any]:
-    """Return the specification of a method's name: ``{"method": "svi", "degree": 6}`` for ``"svi:6"``.
-
-    Raises:
-        MethodError: for an unknown name, an invalid number or one that the method does not accept.
-    """
+    """Return the specification of a name, ``{"method": "svi", "degree": 6}`` for ``"svi:6"``; else MethodError."""
     method, colon, number = name.partition(":")
     _check_name(method)
     size = size_of(method)
@@ -165,11 +161,7 @@ def _listed(arguments: Sequence[str]) -> str:
 
 
 def method_from_specification(specification: Specification) -> Method:
-    """Return the method of plain data such as ``{"method": "svi", "degree": 8, "quadrature": "gauss-legendre:8"}``.
-
-    Raises:
-        MethodError: for an unknown method, an argument that it does not accept, or a missing one.
-    """
+    """Return the method of plain data such as ``{"method": "svi", "degree": 8, ..}``; MethodError for other data."""
     arguments: dict[str, Any] = dict(specification)
     name: Any = arguments.pop("method", None)
     _check_name(name)

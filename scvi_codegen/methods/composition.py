@@ -130,10 +130,6 @@ class _Leapfrogs(Method):
 
         return explicit_system(system, self)
 
-    def paper_form(self, system: MechanicalSystem) -> StageSystem:
-        """Return the same equations: the paper uses Stoermer-Verlet without printing it."""
-        return self.stage_system(system)
-
 
 @dataclass(frozen=True, slots=True)
 class Composition(_Leapfrogs):

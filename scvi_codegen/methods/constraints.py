@@ -58,11 +58,7 @@ SAME = mp.mpf(10) ** -40
 
 
 def with_constraints(system: MechanicalSystem, stages: StageSystem, name: str) -> StageSystem:
-    """Return the stage equations with the constraints of the system.
-
-    Raises:
-        MethodError: unless the method, of this name, is an SVI of degree s with s + 1 points, both ends among them.
-    """
+    """Return the stage equations with the constraints of the system."""
     _check_points(system, stages, name)
     group, count = stages.stage_groups[0], len(system.constraints)
     points = len(group.abscissae)

@@ -60,11 +60,7 @@ def discretised_form(system: MechanicalSystem, method: Method) -> MechanicalSyst
 
 
 def discretise(system: MechanicalSystem, method: Method) -> StageSystem:
-    """Return the compiled equations, with momenta at the points for a Hamiltonian and multipliers for constraints.
-
-    Raises:
-        MethodError: for a system that the method does not support.
-    """
+    """Return the compiled equations, with momenta at the points for a Hamiltonian and multipliers for constraints."""
     stages = method.stage_system(axial_turns(system)[0])
     check_regular(method, system)
     check_continuity(system)

@@ -69,7 +69,3 @@ class ExplicitMethod(Method):
         from scvi_codegen.methods.explicit_stages import explicit_system
 
         return explicit_system(system, self)
-
-    def paper_form(self, system: MechanicalSystem) -> StageSystem:
-        """Return the same equations."""
-        return self.stage_system(system)

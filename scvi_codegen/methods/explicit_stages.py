@@ -61,9 +61,6 @@ def explicit_system(system: MechanicalSystem, method: Method) -> StageSystem:
 
     With rotations V_k is the change of q in drift k divided by its duration, and the momenta P_k before the drifts are
     unknown, too.
-
-    Raises:
-        MethodError: for a system that is not separable, and statements that are not an explicit step for it.
     """
     split = kinetic_splitting(system)
     if isinstance(split, str):

@@ -113,9 +113,6 @@ def action_groups(
         abscissae: (g,) points in [0, 1].
         weights: rows of (g,) weights, of L first, then of its derivatives.
         gathers: position, velocity and as many further derivatives of the curve as L has.
-
-    Raises:
-        MethodError: for derivatives of the L of a Hamiltonian, which depends on momenta, or of a system with forces.
     """
     if len(weights) > 1 and system.auxiliaries:
         raise MethodError(

@@ -2,9 +2,9 @@
 
 A method is a frozen dataclass derived from :class:`Method` in a file of its own and a line in ``METHODS``
 (:mod:`scvi_codegen.methods`). It must define a name, a title, its order, whether it is symmetric and symplectic, a
-specification, and two forms of its equations, which may coincide: as compiled, and as printed in the paper. Other
-properties (for solvers, verification reports, momentum maps) have defaults here that claim nothing and may be
-overridden. Code outside this package does not distinguish between kinds of methods.
+specification, and its equations as compiled; also as printed in the paper if these differ. Other properties (for
+solvers, verification reports, momentum maps) have defaults here that claim nothing and may be overridden. Code outside
+this package does not distinguish between kinds of methods.
 
 Arguments of methods (nodes, quadrature, space of trial curves) are given as objects or names.
 """
@@ -174,9 +174,9 @@ class Method(ABC):
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
         """Return the compiled equations, with velocities as unknowns."""
 
-    @abstractmethod
     def paper_form(self, system: MechanicalSystem) -> StageSystem:
-        """Return the equations in the paper's notation."""
+        """Return the equations in the paper's notation; by default, for methods that it does not print, the same."""
+        return self.stage_system(system)
 
 
 Kind = TypeVar("Kind")

@@ -165,16 +165,7 @@ class Recurrence:
 
     @classmethod
     def of(cls, step: ExplicitStep, statements: Sequence[Statement], *, masses: bool) -> Recurrence:
-        """Return the values at the end of a step.
-
-        Args:
-            step: whose tables are used.
-            statements: of it, for a system.
-            masses: whether there are constant masses.
-
-        Raises:
-            MethodError: for statements that are no such recurrence.
-        """
+        """Return the values at the end of a step by its statements; MethodError unless these are such a recurrence."""
         letters = {"q0": Q, "p0": P, "t": TIME} | ({"inverse_mass": MASS} if masses else {})
         values: dict[str, Sum] = {name: {letter: {0: mp.one}} for name, letter in letters.items()}
         values |= {"h": {UNIT: {1: mp.one}}, "q": {}, "p": {}, "S": {}}
@@ -239,11 +230,7 @@ class Recurrence:
         self.values[name] = value
 
     def read(self, name: str) -> Sum:
-        """Return the value of a quantity.
-
-        Raises:
-            MethodError: if it has none.
-        """
+        """Return the value of a quantity; MethodError if it has none."""
         if name not in self.values:
             remedy = f"assign it before; values at first are those of {', '.join(self.values)}"
             if name == MASS[0]:

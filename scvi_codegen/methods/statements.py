@@ -189,24 +189,12 @@ FORMS = (
 
 
 def read(text: str, features: Sequence[str] = ()) -> tuple[Statement, ...]:
-    """Return the statements of a text.
-
-    Args:
-        text: in the syntax of the module.
-        features: names that hold; a condition that is another name, without numbers, does not hold.
-
-    Raises:
-        MethodError: for a line of another form.
-    """
+    """Return the statements of a text; conditions on names other than ``features`` do not hold. Raises MethodError."""
     return tuple(_Reader(frozenset(features)).block(_parsed(text).body))
 
 
 def selected(text: str, features: Sequence[str]) -> str:
-    """Return a text without conditions on features, some of which hold.
-
-    Raises:
-        MethodError: for a line that is not in the syntax of Python.
-    """
+    """Return a text without conditions on features, of which some hold; MethodError for lines that are not Python."""
     return ast.unparse(_Selection(frozenset(features)).visit(_parsed(text)))
 
 

@@ -8,7 +8,6 @@ import multiprocessing
 import os
 import signal
 import sys
-import traceback
 import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -35,12 +34,10 @@ class Failure:
     Attributes:
         name: name of the experiment.
         message: what went wrong, one line.
-        details: traceback, or ``""``.
     """
 
     name: str
     message: str
-    details: str = ""
 
 
 Outcome: TypeAlias = Result | Failure
@@ -54,11 +51,7 @@ def catalogue(module: str = CATALOGUE) -> Mapping[str, Experiment]:
 
 
 def with_needs(names: Sequence[str], experiments: Mapping[str, Experiment]) -> list[str]:
-    """Return the experiments called ``names`` and their dependencies, in topological order.
-
-    Raises:
-        StateError: for a name that is not among the experiments.
-    """
+    """Return the experiments and their dependencies in topological order; StateError for an unknown name."""
     ordered: dict[str, None] = {}
 
     def add(name: str) -> None:
@@ -122,7 +115,7 @@ def _outcome(experiment: Experiment, needs: Mapping[str, Result]) -> Outcome:
 
 def _failure(name: str, error: BaseException) -> Failure:
     message = " ".join(f"{type(error).__name__}: {error}".split())
-    return Failure(name=name, message=message, details=traceback.format_exc())
+    return Failure(name=name, message=message)
 
 
 def _in_this_process(

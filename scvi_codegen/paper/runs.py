@@ -356,12 +356,7 @@ def _value(term: str, attribute: str, runs: Runs) -> float:
 def figure(name: str, title: str, setting: RunSetting, views: Sequence[View], checks: str) -> Experiment:
     """Return the experiment that runs the schemes of a setting, draws views of them and tests statements.
 
-    Args:
-        name: name of the experiment, ``"figure-1"``.
-        title: title of the experiment.
-        setting: problem and schemes.
-        views: functions that return the panels.
-        checks: statements of the paper, a line each, followed by indented lines as in :func:`compared`.
+    ``checks``: statements of the paper, a line each, followed by indented lines as in :func:`compared`.
     """
     tests = re.findall(r"^(\S.*)\n((?:[ ]+.*(?:\n|$))+)", checks, re.MULTILINE)
     measures = dict.fromkeys(re.findall(r"(\w+):", " ".join(test.split("|")[0] for _, test in tests)))

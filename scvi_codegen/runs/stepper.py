@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.native.arguments import checked_number
-from scvi_codegen.codegen.native.calls import with_calls
+from scvi_codegen.codegen.native.binding import with_calls
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.codegen.variants import Variant

@@ -28,7 +28,6 @@ from scvi_codegen.runs.events.contacts import contact_forces, contact_modes
 from scvi_codegen.runs.events.refinement import crossings_of
 from scvi_codegen.runs.forwarding import ChaosOfRun, Pictured
 from scvi_codegen.runs.results.dense_output import states_at, times_of_words, within
-from scvi_codegen.runs.results.descriptions import describe_states, describe_step_size
 from scvi_codegen.runs.results.energy import energy_account
 from scvi_codegen.runs.results.export import States, to_dataframe, write_states
 from scvi_codegen.runs.results.joining import (
@@ -39,7 +38,7 @@ from scvi_codegen.runs.results.joining import (
     joined_crossings,
     relative_changes,
 )
-from scvi_codegen.runs.results.quantities import quantities_in_modes, quantities_of
+from scvi_codegen.runs.results.quantities import describe_states, describe_step_size, quantities_in_modes, quantities_of
 from scvi_codegen.runs.results.recomputation import work_and_impulses_until, work_until
 from scvi_codegen.runs.results.saved_states import Array, ModeHistory, checked_row, in_modes
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory

@@ -47,7 +47,7 @@ class LagrangianSystem(MechanicalSystem):
             mass matrix, which then is not computed, else 0.
         links: of a robot from a file, the geometry of its moving links, for pictures.
         gauge: energy of the rates of constraints that determine the velocities of massless coordinates, else 0
-            (:mod:`scvi_codegen.systems.massless`).
+            (:mod:`scvi_codegen.systems.checks.definition`).
 
     Raises:
         SystemDefinitionError: naming the symbol at fault, if a name is invalid or used twice, L contains an unknown

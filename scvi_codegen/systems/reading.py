@@ -167,7 +167,11 @@ def system_from_sympy(
     turning["rotations"], of_frames = rotations_of_frames(turning.get("rotations"))
     names = RotationNames.declared(*(turning.get(key) for key in TURNING), momentum=momenta is not None)
     if function == "Lagrangian" and are_arrays(q for q in coordinates if isinstance(q, str)):
-        _check_no_others(velocities, forces, dissipation, damping, constraints, inputs, *turning.values())
+        if any((velocities, forces, dissipation, damping, constraints, inputs, *turning.values())):
+            raise SystemDefinitionError(
+                "from_sympy reads Lagrangian, parameters, tables and neighbours of a system with arrays: give the rest "
+                "as text to from_text"
+            )
         declared = {"coordinates": list(coordinates), "parameters": parameters, "tables": tables}
         return _of_arrays(cls, arrays_from_sympy(formula, name=name, neighbours=neighbours, **declared))
 
@@ -211,15 +215,6 @@ def system_from_sympy(
         values=dict(zip(map(str, translation.parameters), constants.values(), strict=True)),
         inputs=input_names,
     )[0]
-
-
-def _check_no_others(*others: Any) -> None:
-    """Raise an error if one of these arguments is given beside arrays."""
-    if any(others):
-        raise SystemDefinitionError(
-            "from_sympy reads Lagrangian, parameters, tables and neighbours of a system with arrays: give the rest "
-            "as text to from_text"
-        )
 
 
 def _forces_of(

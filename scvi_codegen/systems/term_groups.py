@@ -59,12 +59,7 @@ class TermGroup:
 
 @dataclass(frozen=True, slots=True)
 class SplitSystem:
-    """System split into unrolled terms and term groups.
-
-    Attributes:
-        rest: the same system without the term groups.
-        term_groups: term groups of L, or of -H for a Hamiltonian.
-    """
+    """System split into unrolled terms, ``rest``, and term groups of L, or of -H for a Hamiltonian."""
 
     rest: MechanicalSystem
     term_groups: tuple[TermGroup, ...]
@@ -72,12 +67,7 @@ class SplitSystem:
 
 @dataclass(frozen=True, slots=True)
 class SimilarTerms:
-    """Terms of the same structure.
-
-    Attributes:
-        terms: the expressions.
-        leaves: coordinates and constants of each term, in the same order.
-    """
+    """Terms of the same structure, and the leaves of each: coordinates and constants, in the same order."""
 
     terms: tuple[Expr, ...]
     leaves: tuple[_Leaves, ...]
@@ -98,13 +88,7 @@ class SimilarTerms:
             yield SimilarTerms(*zip(*similar, strict=True))
 
     def group(self, slot: Callable[[str, int], Symbol], constant: Callable[[int], Symbol], sign: int = 1) -> TermGroup:
-        """Return the term group.
-
-        Args:
-            slot: symbol of a coordinate, by its array and its column in the table of indices.
-            constant: symbol of a constant, by its number.
-            sign: factor of the formula.
-        """
+        """Return the term group: symbols of coordinates by array and column, of constants by number, and a sign."""
         first = self.leaves[0]
         columns = list(zip(*(leaf.constants for leaf in self.leaves), strict=True))
         varying = [k for k, column in enumerate(columns) if len(set(column)) > 1]

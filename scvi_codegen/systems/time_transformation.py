@@ -139,13 +139,7 @@ MAX_SIMPLIFIED_OPERATIONS = 200
 def time_rescaling_function(system: MechanicalSystem, g: str | Expr, *, in_time: bool = False) -> Expr:
     """Return the formula of a time-rescaling function, from its name, from text or from an expression.
 
-    Args:
-        system: the mechanical system.
-        g: a name among ``TIME_RESCALINGS``, or a formula.
-        in_time: whether it may also depend on time and on inputs.
-
-    Raises:
-        SystemDefinitionError: for a formula in other symbols, and a name that is not applicable to the system.
+    ``in_time``: it may also depend on time and on inputs. SystemDefinitionError for other symbols and names.
     """
     if in_time and forms_of(system).one_form:
         raise SystemDefinitionError(

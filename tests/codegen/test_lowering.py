@@ -22,7 +22,7 @@ from scvi_codegen.codegen.ir.arithmetic import DEEPEST_EXPRESSION, lower_kernel
 from scvi_codegen.codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation, loads
 from scvi_codegen.codegen.native.compilers import find_compiler
 from scvi_codegen.codegen.rendering.kernels.printer import print_expression, print_number
-from scvi_codegen.codegen.rendering.kernels.roots import with_factors_in_roots
+from scvi_codegen.codegen.rendering.kernels.simd import with_factors_in_roots
 from scvi_codegen.interfaces.models.systems import fput_chain
 from scvi_codegen.systems.formulas.expressions import gradient, jacobian
 

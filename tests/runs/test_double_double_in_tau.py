@@ -9,8 +9,7 @@ import pytest
 from mpmath import mp
 
 import scvi_codegen as sc
-from scvi_codegen.runs.states.pairs import product_of, quotient_of, sum_of
-from scvi_codegen.runs.states.words import as_mpmath, with_low
+from scvi_codegen.runs.states.words import as_mpmath, product_of, quotient_of, sum_of, with_low
 
 pytestmark = pytest.mark.rotated
 

@@ -18,7 +18,7 @@ from sympy.physics.mechanics import (
 
 from scvi_codegen import SVI, LagrangianSystem, SystemDefinitionError, compile_stepper
 from scvi_codegen.systems.constraints import kind_of
-from scvi_codegen.systems.constraints.holonomic import HOLONOMIC
+from scvi_codegen.systems.constraints.kind import HOLONOMIC
 from scvi_codegen.systems.multibody.kinetics import potential_of
 
 T = dynamicsymbols._t

@@ -24,7 +24,7 @@ import numpy as np
 from scvi_codegen.common.errors import StateError, StepFailedError, UnresolvedError
 from scvi_codegen.methods import Method
 from scvi_codegen.runs.accuracy.size import distances_from_mean, relative, relative_to_motion
-from scvi_codegen.runs.ensembles.initial_states import momenta_of_each, start_of_ensemble
+from scvi_codegen.runs.ensembles.ensemble import momenta_of_each, start_of_ensemble
 from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
 from scvi_codegen.runs.states.validation import Array, States
 from scvi_codegen.runs.states.words import low_words, with_low
@@ -85,11 +85,7 @@ class Trials:
         return self.q[0], {**self.state, "p": self.p[0], "parameters": parameters}
 
     def integrate(self, q: Array, *, h: float, steps: int, save_every: int) -> Any:
-        """Integrate as :meth:`Stepper.integrate`, an ensemble in one call; iterations are those of one trajectory.
-
-        Raises:
-            StepFailedError: if a trajectory fails.
-        """
+        """Integrate as :meth:`Stepper.integrate`, an ensemble in one call; iterations are those of one trajectory."""
         plan: dict[str, Any] = {"h": h, "steps": steps, "save_every": save_every}
         if not self.together:
             return self.stepper.integrate(q, **self.state, **plan)

@@ -267,11 +267,7 @@ def _unconfirmed(trajectory: Trajectory) -> str:
 def _error_control(
     stepper: Stepper, request: _StepRequest, atol: Any, max_step: float | None, first_step: float | None
 ) -> ErrorControl:
-    """Return the arguments of :meth:`Stepper.integrate` for those of SciPy; the tolerance is not among them.
-
-    Raises:
-        StateError: for ``atol`` without ``rtol``, and for numbers that are invalid or too many.
-    """
+    """Return the arguments of :meth:`Stepper.integrate` for those of SciPy but the tolerance; StateError if invalid."""
     max_step = None if max_step == math.inf else max_step  # SciPy's default
     if atol is None:
         return ErrorControl(None, None, max_step, first_step)

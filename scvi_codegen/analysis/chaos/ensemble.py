@@ -33,8 +33,7 @@ from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.accuracy.local_error import warn_of_large_steps
 from scvi_codegen.runs.driver.run_loop import record
-from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings
-from scvi_codegen.runs.ensembles.initial_states import momenta_of_each, start_of_ensemble
+from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings, momenta_of_each, start_of_ensemble
 from scvi_codegen.runs.ensembles.lanes import LaneRuns
 from scvi_codegen.runs.ensembles.result import OK
 from scvi_codegen.runs.ensembles.schedule import CommonSteps

@@ -29,21 +29,15 @@ def tangents_along(
     """Return the states at the ends of steps, and tangent vectors there.
 
     Args:
-        stepper: the compiled stepper, with its events.
+        stepper: with its events.
         state: (2m,) initial state.
         t, h: (n,) times and sizes of consecutive steps.
         tangents: (count, variables) initial variations of (q, p, parameters, t, h).
         parameters: values in order.
-        options: solver options.
         size_variations: (n, count) variations of the step sizes, which are those in ``tangents`` by default.
 
     Returns:
         (n + 1, 2m) states, (n + 1, count, 2m) variations and (count, variables) final variations.
-
-    Raises:
-        EventError: if events end the run before the last step.
-        StateError: if derivatives through an event do not exist.
-        StepFailedError: if a step fails.
     """
     m, size, count = stepper.dimension, len(state), len(h)
     if not stepper.divides_steps:

@@ -227,11 +227,7 @@ def _sizes(parts: Sequence[Measurements], prior: Array, nodes: Array) -> Array:
 
 
 def joined(chain: Chain, x: Array, limits: Limits) -> tuple[Array, NDArray[np.bool_], int]:
-    """Return the unknowns that satisfy continuity within bounds, the mask of those at bounds, and the iterations.
-
-    Raises:
-        FitError: if the line search fails or the iteration does not converge.
-    """
+    """Return the unknowns that satisfy continuity within bounds, the mask of those at bounds, and the iterations."""
     whole, (low, high) = replace(chain, jump=1.0, unit=1.0), limits
     rounding = ROUNDING_LEVEL * whole.measured
     for iteration in range(1, MOST + 1):

@@ -266,9 +266,6 @@ def different_paths(
         starts: number of curves at random: the line and sine waves of the size of the distance of the ends.
         revolutions: largest number of whole revolutions, both ways, of starts around the centre of a rotation.
         arguments: further ones of :meth:`~scvi_codegen.Stepper.path`.
-
-    Raises:
-        PathError: if no path is found.
     """
     paths, reason = list[Path](), None
     ends = [real_array(stepper._states.positions(end, "the ends"), "the ends") for end in (q0, q1)]
@@ -325,9 +322,6 @@ def _first_motion(attempts: Sequence[Attempt]) -> tuple[solver.Solution, Discret
     """Return the first path that is found and its discretisation error.
 
     The number counts the stationary points before it that are no motions.
-
-    Raises:
-        PathError: if no attempt succeeds.
     """
     reasons, dropped = [], 0
     for attempt in attempts:

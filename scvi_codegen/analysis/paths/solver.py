@@ -101,9 +101,6 @@ def newton(
         relative: function of q and a correction that returns its size relative to the motion.
         q: start of the iteration.
         most: largest number of iterations.
-
-    Raises:
-        PathError: if the iteration does not converge.
     """
     damping = 1.0
     for iteration in range(most):
@@ -189,8 +186,7 @@ def continued_from_motion(intervals: Intervals, q: Array, duration: float) -> So
 def descended(intervals: Intervals, q: Array) -> Solution:
     """Return a minimum of the action below q, by Newton's method with a shift that makes the Hessian positive definite.
 
-    Raises:
-        PathError: if there is none, as on paths longer than their first conjugate time.
+    PathError if there is none, as on paths longer than their first conjugate time.
     """
     at = intervals.linearised(q)
     scale = float(np.abs(at.blocks[3]).max())

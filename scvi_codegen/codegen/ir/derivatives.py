@@ -9,12 +9,7 @@ from scvi_codegen.codegen.ir.program import Program
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InputDerivatives:
-    """Nonzero derivatives of the results of a stage group with respect to parameters and time.
-
-    Attributes:
-        entries: (i, j) of each: the result, and the parameter, or the number of parameters for time.
-        kernel: their values at u; ``None`` if there are none.
-    """
+    """Nonzero derivatives of results i of a stage group by parameters j, the last one of time, as (i, j); if any."""
 
     entries: tuple[tuple[int, int], ...]
     kernel: Kernel | None

@@ -50,11 +50,7 @@ def lower_matrix(entries: Matrix) -> NumberTable:
 
 
 def exact_number(constant: sympy.Expr) -> Number:
-    """Return the value of an expression without symbols: a fraction, or 60 digits of it.
-
-    Raises:
-        SystemDefinitionError: if it is not a real number, or beyond the largest double.
-    """
+    """Return the value of an expression without symbols, a fraction or 60 digits; else SystemDefinitionError."""
     if isinstance(constant, sympy.Rational):
         value: Number = Fraction(int(constant.p), int(constant.q))
     else:

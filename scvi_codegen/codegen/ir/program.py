@@ -44,12 +44,7 @@ class MomentumMap:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Integrals:
-    """Functions f that are integrated along a run, by the method's own quadrature: h sum_n weights[n] f(u_n) a step.
-
-    Attributes:
-        kernel: the functions, at the arguments of the points.
-        weights: (g,) of the points.
-    """
+    """Functions f that are integrated along a run, by the method's own quadrature: h sum_n weights[n] f(u_n) a step."""
 
     kernel: Kernel
     weights: tuple[Number, ...]

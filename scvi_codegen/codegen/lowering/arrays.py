@@ -37,8 +37,6 @@ def check_solver_of_arrays(
     """Raise an error unless a method and a solver are available for an array system of run-time sizes.
 
     Args:
-        system: of arrays.
-        method: of its steps.
         solver: one of :data:`SOLVERS`.
         resolved: what the method becomes for the system with one coordinate; ``None`` if it is not available.
         loops: the terms in loops, with the eigenvectors of the method's matrix (``shifts``) if Newton's method can use

@@ -32,7 +32,7 @@ S. Reich, SIAM J. Numer. Anal. 33 (1996), on compositions; E. Barth, K. Kuczera,
 Chem. 16 (1995), on the iteration.
 """
 
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, TypeAlias
@@ -75,17 +75,13 @@ MOST_COUPLED_MASSES = 32
 
 
 def rattle_of(system: MechanicalSystem, stages: StageSystem, predictor: NumberTable) -> Rattle | None:
-    """Return the iteration for the multipliers of such steps; ``None`` if it is not applicable.
-
-    Args:
-        predictor: (2 (s + 1), s + 1) tables to the unknowns of the next step, of velocities and of multipliers.
-    """
+    """Return the iteration for multipliers with (2 (s + 1), s + 1) tables as predictor; ``None`` if not applicable."""
     forms, tables = forms_of(system), velocity_tables(stages.shape)
     if system.reactions or any(velocity_conditions(system)) or tables is None or not forms.has_quadratic_energy:
         return None
     if forms.regular_legendre is not forms.legendre:  # massless coordinates: M has no inverse
         return None
-    groups = coupled_coordinates(forms.lower_mass, system.dimension)
+    groups = connected_components((range(system.dimension), list(forms.lower_mass)))  # that masses couple
     if max(map(len, groups)) > MOST_COUPLED_MASSES:
         return None
     points = len(tables.blocks)
@@ -209,17 +205,8 @@ def _tables(
         yield IterationTable(f"RATTLE_{name}", lower_matrix(matrix), name in two_words)
 
 
-def coupled_coordinates(entries: Iterable[tuple[int, int]], count: int) -> list[tuple[int, ...]]:
-    """Return the groups of coordinates that entries (i, j) of a matrix couple."""
-    return [tuple(sorted(group)) for group in connected_components((range(count), list(entries)))]
-
-
 def constrained_steps(system: ArraySystem, stages: StageSystem, method: Method) -> ConstrainedSteps | None:
-    """Return the kernels and fractions of constrained steps; ``None`` without constraints.
-
-    Raises:
-        MethodError: for other methods.
-    """
+    """Return kernels and fractions of RATTLE steps, ``None`` without constraints; MethodError for other methods."""
     if not system.constraints:
         return None
     pairs = list(_kernels(system))

@@ -41,7 +41,7 @@ from scvi_codegen.codegen.lowering.solvers.tables import (
 from scvi_codegen.codegen.lowering.stage_groups import system_kernel
 from scvi_codegen.common.precision import Matrix, Vector, mp
 from scvi_codegen.methods.controllers import Controller
-from scvi_codegen.methods.controllers.predictive import PREDICTIVE
+from scvi_codegen.methods.controllers.controller import PREDICTIVE
 from scvi_codegen.methods.tables.basis import (
     cardinal_integrals,
     cardinal_values,
@@ -74,14 +74,7 @@ def control_of(
     system: MechanicalSystem | None = None,
     g: str | Expr | None = None,
 ) -> Control | None:
-    """Return the step-size control of a program; ``None`` for adaptive steps whose curves give no error estimate.
-
-    Args:
-        program: the lowered program.
-        controller: the step-size controller.
-        system: the system, for steps in tau in physical time.
-        g: time-rescaling function of steps in tau.
-    """
+    """Return the step-size control of a program, with ``g`` of steps in tau; ``None`` without error estimates."""
     if controller.values is not None:
         assert system is not None  # by the caller
         assert g is not None
@@ -142,7 +135,6 @@ def _tables_by_ratio(
     """Return tables by ratio of the next step size to the last, and by step.
 
     Args:
-        fixed_point: the iteration.
         ratios: ratios of the next step size to the last.
         sources: times of the stored values, in units of the last step size.
         degree: of the polynomial.

@@ -26,11 +26,7 @@ from scvi_codegen.systems.system import MechanicalSystem
 def derivatives_of(
     system: MechanicalSystem, stages: StageSystem, program: Program, *, second: bool = False
 ) -> Derivatives:
-    """Return the derivatives of ``program``, the program of the stage equations ``stages``, with respect to all inputs.
-
-    Args:
-        second: whether second derivatives are included.
-    """
+    """Return the derivatives of ``program``, of the equations ``stages``, by all inputs; ``second``: also second."""
     program = replace(program, summed=not forms_of(system).one_form)
     inputs = tuple(
         _input_derivatives(system, group.name, group.results, group.arguments) for group in stages.stage_groups

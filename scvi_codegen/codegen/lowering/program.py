@@ -138,11 +138,7 @@ def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
 
 
 def step_texts(system: MechanicalSystem, method: Method) -> Mapping[str, str]:
-    """Return the statements from which the C of a step is generated, by their titles; none of other steps.
-
-    Raises:
-        MethodError: for a system that the method does not support.
-    """
+    """Return the statements from which the C of a step is generated, by their titles; none of other steps."""
     if not system.constraints:
         splitting = splitting_of(system, method)
         return splitting_texts(splitting) if splitting else {}
@@ -185,9 +181,6 @@ def lower(
         symmetries: whose momentum maps are included.
         lanes: allow a solver that uses SIMD lanes.
         fallback: include Newton's iteration as a fallback. Systems with integrals along the curve always include it.
-
-    Raises:
-        MethodError: if the solver is not available for the method and the system.
     """
     stages, explicit = discretise(system, method), solver in ("auto", "explicit")
     splitting = splitting_of(system, method) if explicit and not system.integrands else None

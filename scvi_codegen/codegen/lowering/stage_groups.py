@@ -152,11 +152,7 @@ class UnknownLayout:
 
 
 def layout_of(stages: StageSystem, dimension: int) -> UnknownLayout:
-    """Return the sites of stage equations.
-
-    Raises:
-        MethodError: unless there are as many blocks as rows, and equally many, of every size.
-    """
+    """Return the sites of stage equations; MethodError unless blocks and rows of every size are equally many."""
     blocks, rows = [block.size for block in stages.blocks], [row.size for row in stages.rows]
     sizes = [None, *sorted({size for size in (*blocks, *rows) if size is not None})]
     numbers = [dimension if size is None else size for size in sizes]

@@ -19,11 +19,7 @@ REAL_KINDS = "iufO"
 
 
 def real_array(value: ArrayLike, name: str) -> NDArray[np.float64]:
-    """Return a contiguous copy in binary64 of real numbers of any shape, layout and byte order, possibly not finite.
-
-    Raises:
-        StateError: for anything but real numbers, and for masked entries.
-    """
+    """Return a contiguous copy in binary64 of real numbers, possibly not finite; StateError for others and masks."""
     for word in ("unit", "units"):  # of astropy, of pint; not the label of a row or a column
         unit = getattr(value, word) if hasattr(type(value), word) else None
         if unit is not None and str(unit) not in ("", "dimensionless"):

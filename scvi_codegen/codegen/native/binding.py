@@ -4,8 +4,11 @@ A library with only the fixed-point iteration uses Newton's method of a second l
 first requests it (:mod:`scvi_codegen.codegen.rendering.kernels.simd`); that call is then repeated from its start.
 """
 
+import re
 from collections.abc import Callable, Iterable, Mapping
-from functools import partial
+from dataclasses import replace
+from functools import cache, partial
+from struct import Struct
 from threading import local
 from typing import Any, Self
 
@@ -13,9 +16,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native.building import Library
-from scvi_codegen.codegen.native.calls import FIRST_RESULT, RESULTS
 from scvi_codegen.codegen.native.options import FAILURES, FALLBACK_REQUIRED, SolverOptions, checked_options
+from scvi_codegen.codegen.rendering.source import Source
+from scvi_codegen.common.cache import template_folder
 from scvi_codegen.common.errors import MethodError
+
+RESULTS, FIRST_RESULT = Struct("=4d4q"), "error"
+"""Format of the last fields of the struct (``calls_declarations.h``), and the first of them."""
+OPTIONAL_FUNCTIONS = frozenset(("advance_to", "set_fallback", "project"))
+"""Functions that not all integrators have, HAS_.. in ``calls.h`` like the optional fields of a run."""
+
+
+def with_calls(source: Source) -> Source:
+    """Return a source of runs with the functions of calls; others unchanged."""
+    if "advance" not in source.contents.functions:
+        return source
+    declarations, functions = (
+        re.sub(r"NAME\((\w+)\)", rf"{source.prefix}_\1", _text(name)) for name in ("calls_declarations", "calls")
+    )
+    present = [name for name in source.contents.functions if name in OPTIONAL_FUNCTIONS]
+    switches = "".join(f"#define HAS_{name.upper()}\n" for name in (*present, *source.contents.run_fields))
+    return replace(
+        source,
+        code=f"{source.code}\n{switches}{declarations}\n{functions}",
+        declarations=f"{source.declarations}\n{declarations}",
+    )
+
+
+@cache
+def _text(name: str) -> str:
+    return (template_folder() / f"{name}.h").read_text(encoding="utf-8")
+
 
 DOUBLE_SIZE = np.dtype(np.float64).itemsize
 WITHOUT_STEPS = frozenset(("start", "step_error", "energies", "call_momenta", "call_project"))

@@ -121,9 +121,6 @@ def load(source: Source, *, flags: tuple[str, ...] = TUNED_FLAGS) -> Library:
     """Return the library of a source, from memory, from the cache or compiled now.
 
     Flags in the environment variable ``SCVI_CODEGEN_CFLAGS`` are appended, and so override, those given.
-
-    Raises:
-        BuildError: without a compiler, or if it rejects the source.
     """
     compiler = find_compiler()
     key = fingerprint(source, flags=flags)
@@ -387,11 +384,7 @@ TARGETS = {
 
 
 def library_for(platform: str, source: Source, *, flags: tuple[str, ...]) -> bytes:
-    """Return a shared library for a platform of :data:`TARGETS`: equal sources and flags give equal bytes.
-
-    Raises:
-        BuildError: without the extra ``compiler``, or if it rejects the source.
-    """
+    """Return a shared library for a platform of :data:`TARGETS`, equal for equal sources and flags; or BuildError."""
     if importlib.util.find_spec("ziglang") is None:
         raise BuildError(
             f"compiling for {platform} requires a cross compiler: pip install 'scvi-codegen[compiler]' (ziglang)"

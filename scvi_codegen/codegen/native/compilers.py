@@ -115,11 +115,7 @@ WHEEL = "take one from a wheel: pip install 'scvi-codegen[compiler]' (ziglang)"
 
 
 def find_compiler() -> tuple[str, ...]:
-    """Return the command that compiles C: ``$CC``, else cc, gcc or clang, else the ``ziglang`` wheel.
-
-    Raises:
-        BuildError: if there is none.
-    """
+    """Return the command that compiles C: ``$CC``, else cc, gcc or clang, else the ``ziglang`` wheel; or BuildError."""
     setting = os.environ.get("CC")
     if setting:
         command = words_of("CC")
@@ -140,11 +136,7 @@ def find_compiler() -> tuple[str, ...]:
 
 
 def words_of(variable: str) -> tuple[str, ...]:
-    """Return the words of an environment variable, split as by a shell.
-
-    Raises:
-        BuildError: if a quote is not closed.
-    """
+    """Return the words of an environment variable, split as by a shell; BuildError if a quote is not closed."""
     text = os.environ.get(variable, "")
     try:
         return tuple(shlex.split(text))
@@ -201,11 +193,7 @@ FLAGS_VARIABLE = "SCVI_CODEGEN_CFLAGS"
 
 
 def fingerprint(source: Source, *, flags: tuple[str, ...]) -> str:
-    """Return 24 digits of a digest of everything that determines the compiled code: source, compiler, flags, processor.
-
-    Raises:
-        BuildError: without a compiler.
-    """
+    """Return 24 digits of a digest of what determines the compiled code: source, compiler, flags and processor."""
     compiler = find_compiler()
     # whether any flag selects the instructions of this processor (-march, -mcpu, -mtune)
     tuned = "=native" in " ".join((*compiler, *flags, os.environ.get(FLAGS_VARIABLE, "")))

@@ -45,12 +45,7 @@ def kernel_text(source: Source) -> str:
 
 
 def compiled_kernel(text: str, architecture: str, **options: Any) -> bytes:
-    """Return the binary (cubin) for an architecture such as ``"sm_90"``, from the cache or compiled now.
-
-    Raises:
-        MissingLibraryError: without the extra ``cuda``.
-        BuildError: if NVRTC rejects the text.
-    """
+    """Return the binary (cubin) for an architecture such as ``"sm_90"``, from the cache or compiled now."""
     settings = {**OPTIONS, **options}
 
     def compiled() -> str:

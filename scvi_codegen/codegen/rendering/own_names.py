@@ -89,13 +89,15 @@ class FileScope:
         self._makers = {
             match["name"]: ([parameter.strip() for parameter in match["parameters"].split(",")], names)
             for match in macros
-            if match["parameters"] and (names := re.findall(r"\bstatic\b[\w ]*?(\w+(?:##\w+)+)\(", match["body"]))
+            if match["parameters"] and (names := re.findall(r"\bstatic\b[\w ]*?(\w+(?:##\w+)*)\(", match["body"]))
         }
         for match in macros:  # those that end in another one
-            if (inner := self._makers.get((match["body"].split() or [""])[-1].partition("(")[0])) and match[
-                "parameters"
-            ]:
-                self._makers[match["name"]][1].extend(inner[1])
+            call = re.search(r"(\w+)\(([^()]*)\)$", match["body"])
+            if call and (inner := self._makers.get(call[1])) and match["parameters"]:
+                arguments = dict(zip(inner[0], map(str.strip, call[2].split(",")), strict=False))
+                made = ["##".join(arguments.get(part, part) for part in name.split("##")) for name in inner[1]]
+                parameters = [parameter.strip() for parameter in match["parameters"].split(",")]
+                self._makers.setdefault(match["name"], (parameters, []))[1].extend(made)
         self._local = {match["name"] for match in macros if not match["parameters"] and "static" in match["body"]}
 
     def names(self, code: str) -> Iterator[str]:

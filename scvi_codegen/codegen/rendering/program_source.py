@@ -17,11 +17,10 @@ from itertools import accumulate, chain
 from typing import Any, ClassVar, Literal, TypeAlias, cast, get_args
 
 from scvi_codegen.codegen.ir.derivatives import Derivatives, PointDerivatives
-from scvi_codegen.codegen.ir.equations import Control, FixedPointIteration, IterationTable, Rattle, StoredValues
+from scvi_codegen.codegen.ir.equations import Control, FixedPointIteration, IterationTable, StoredValues
 from scvi_codegen.codegen.ir.kernel import Kernel, Number, is_divided
 from scvi_codegen.codegen.ir.program import ArrayProgram, Program
 from scvi_codegen.codegen.rendering.environment import support_text, template_environment
-from scvi_codegen.codegen.rendering.header import HeaderRecord
 from scvi_codegen.codegen.rendering.kernels.double_double import arithmetic_headers, uses_functions
 from scvi_codegen.codegen.rendering.kernels.functions import unrolled_equations
 from scvi_codegen.codegen.rendering.kernels.loops import loop_context
@@ -39,7 +38,13 @@ from scvi_codegen.codegen.rendering.kernels.simd import (
 )
 from scvi_codegen.codegen.rendering.preprocessor import included
 from scvi_codegen.codegen.rendering.source import Contents, ExampleInput, Interface, LaneContents, Sizes, Source
-from scvi_codegen.codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, MAX_ITERATIONS, ROUNDING_UNITS
+from scvi_codegen.codegen.rendering.text import (
+    INPUT_PRECISION,
+    LARGEST_VIOLATION,
+    MAX_ITERATIONS,
+    ROUNDING_UNITS,
+    HeaderRecord,
+)
 from scvi_codegen.codegen.statements.printing import Layout
 from scvi_codegen.codegen.statements.steps import pair_rattle_functions, rattle_iteration, splitting_header
 
@@ -261,9 +266,6 @@ def render_double_double(
         program: with a fixed-point iteration of separable systems, or with Newton's method, also as the fallback of
             another iteration.
         derivatives: at the points of a fixed-point iteration, which correct it to two words.
-
-    Raises:
-        MethodError: for a function that has no double-double form.
     """
     fixed_point = program.fixed_point
     if in_pairs(program):
@@ -415,7 +417,8 @@ def _render_mixed_newton(program: Program, correction: PointDerivatives | None, 
     )
     rattle, vectors = program.rattle, tuple[Kernel, ...]()
     plain = not (program.damping or quantities.integrals)
-    if rattle and constraints and rattle.points > 1 and plain and _of_forces_alone(rattle):
+    of_forces = rattle and rattle.part == "rattle" and not rattle.macros  # of constant masses and forces of positions
+    if rattle and constraints and rattle.points > 1 and plain and of_forces:
         kernels = *kernels, *rattle.kernels
         of_points = *rattle.kernels, replace(constraints.kernel, values=len(constraints.kernel.results))
         vectors = tuple(replace(kernel, name=f"{kernel.name}_of_points") for kernel in of_points)
@@ -441,17 +444,8 @@ def _render_mixed_newton(program: Program, correction: PointDerivatives | None, 
     return _render(program.prefix, context)
 
 
-def _of_forces_alone(rattle: Rattle) -> bool:
-    """Return whether masses are constant, and forces and momenta do not depend on velocities and positions."""
-    return rattle.part == "rattle" and not rattle.macros
-
-
 def render_embedded(program: Program, precision: Embedded, control: Control | None = None) -> Source:
-    """Return the source for a microcontroller: one file, bounded iterations, scalars of its registers.
-
-    Raises:
-        MethodError: for a number outside the range of single precision.
-    """
+    """Return one file for a microcontroller, bounded iterations in its scalars; MethodError out of their range."""
     target = TARGETS[precision]
     target.check((*program.layout.defaults, *chain(*map(constants, _scalar_kernels(program, control)))))
     bound = f"{program.prefix.upper()}_MAX_ITERATIONS"
@@ -713,13 +707,7 @@ def _scalar_kernels(
 
 
 def _lane_context(program: Program, beside: Sequence[Kernel], *, changes: bool) -> dict[str, object]:
-    """Return the template's context for the fixed-point iteration.
-
-    Args:
-        program: the program.
-        beside: kernels of its derivative.
-        changes: whether tangent and adjoint vectors are propagated, too.
-    """
+    """Return the template's context for the iteration, with kernels of its derivative; ``changes``: it has tangents."""
     fixed_point = program.fixed_point
     hot_kernels = (fixed_point or program.splitting or program).kernels
     operations = sum(sum(kernel.operation_counts().values()) for kernel in hot_kernels)
@@ -795,12 +783,7 @@ def with_xla_flow(derivatives: Source, version: str, *, second: bool = False) ->
 
 
 def with_flow_of_rows(derivatives: Source, *, second: bool = False) -> Source:
-    """Return a source with the flow of many rows, ``<prefix>_flow_rows``.
-
-    Args:
-        derivatives: a source with derivatives of steps.
-        second: whether to add second derivatives, ``<prefix>_hessian_rows``, which the source must have.
-    """
+    """Return a source with derivatives of steps and the flow of many rows; ``second``: with second derivatives."""
     prefix = derivatives.prefix
     shape = "long long steps, long long every, int count, long long rows"
     rest = f"double *found, {prefix}_report *report"

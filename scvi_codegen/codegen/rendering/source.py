@@ -190,11 +190,7 @@ class Source:
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Source:
-        """Return the source from :meth:`to_record`.
-
-        Raises:
-            ValueError: for invalid names of files, and contents that are not lists of lines.
-        """
+        """Return the source from :meth:`to_record`; ValueError for invalid names of files, and other contents."""
         names = record["prefix"], *record["support"]
         for name, pattern in zip(names, (PREFIX, *[SUPPORT] * len(names)), strict=False):
             if not (isinstance(name, str) and pattern.fullmatch(name)):
@@ -501,11 +497,7 @@ class Interface:
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Interface:
-        """Return the interface from :meth:`to_record`, also from its JSON.
-
-        Raises:
-            ValueError, TypeError: for other fields, and values of other types.
-        """
+        """Return the interface from :meth:`to_record`, also from its JSON; ValueError or TypeError for other fields."""
         contacts = tuple(_contact_of(row) for row in record.get("contacts", ()))
         interface = cls(**_checked(cls, {**record, "contacts": contacts}))
         if interface.words not in (1, 2):

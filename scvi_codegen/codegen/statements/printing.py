@@ -85,12 +85,7 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Layout:
-    """Numbers and SIMD lanes of the C of a step without points.
-
-    Attributes:
-        words: of the numbers that statements compute.
-        lanes: whether SIMD lanes are trajectories.
-    """
+    """C of a step without points: numbers of one or two ``words``, and ``lanes`` if SIMD lanes are trajectories."""
 
     words: int = 1
     lanes: bool = False
@@ -128,19 +123,11 @@ class Layout:
         return f"{self.read(quantity, at).text} = {value};"
 
     def former(self, quantity: Quantity, at: At) -> Value:
-        """Return the value at the point before.
-
-        Raises:
-            MethodError: if the layout has no points.
-        """
+        """Return the value at the point before; MethodError if the layout has no points."""
         raise MethodError(f"former({quantity.text}[{at.text}]) is a value of points, which this step has not")
 
     def over_points(self, table: str, quantity: Quantity, at: At) -> Value:
-        """Return the sum over points with the row of a table.
-
-        Raises:
-            MethodError: if the layout has no points.
-        """
+        """Return the sum over points with the row of a table; MethodError if the layout has no points."""
         raise MethodError(f"{table} @ {quantity.text}[{at.text}] is a sum over points, which this step has not")
 
 
@@ -390,8 +377,9 @@ class Printer:
     def operation(self, operation: Operation) -> Value:
         """Return the C of an operation; what is added to a state is added to its low word first."""
         match operation:
-            case Operation("+", (Read(name=name, at=At() as at), increment)) if self.adds_low_words(name):
-                state = self.quantity(name)
+            case Operation("+", (Read(name=name, at=At() as at), increment)) if (
+                state := self.quantity(name)
+            ).place is Place.STATE and self.layout.words == 1:
                 low = Value(f"{state.low}[{at.text}]", uniform=state.uniform)
                 return combine("+", self.layout.read(state, at), combine("+", low, self.value(increment)))
             case Operation("-", (operand,)):
@@ -401,10 +389,6 @@ class Printer:
             case Operation(operator, (left, right)):
                 return combine(operator, self.value(left), self.value(right))
         raise AssertionError(operation)
-
-    def adds_low_words(self, name: str) -> bool:
-        """Return whether sums with a quantity are compensated: of a state in one word."""
-        return self.quantity(name).place is Place.STATE and self.layout.words == 1
 
 
 def _letter(statement: Assign) -> str | None:
@@ -473,11 +457,6 @@ def _all_names(statement: Statement) -> set[str]:
 def _is_of_one_loop(name: str, statements: Sequence[Statement]) -> bool:
     """Return whether one loop over an index computes a quantity, once, and uses it, at its own index alone."""
     users = [loop for loop in _loops(statements) if any(name in _all_names(statement) for statement in loop)]
-    if len(users) > 1 or any(_is_whole(name, statement) for statement in users[0]):
+    if len(users) > 1 or any(isinstance(statement, Apply) and name in _all_names(statement) for statement in users[0]):
         return False
     return sum(target_name(statement) == name for statement in users[0]) == 1
-
-
-def _is_whole(name: str, statement: Statement) -> bool:
-    """Return whether an operation or a kernel reads or computes all values of a quantity."""
-    return isinstance(statement, Apply) and name in _all_names(statement)

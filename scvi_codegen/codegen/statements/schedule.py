@@ -28,12 +28,7 @@ Simple = Assign | Apply
 
 @dataclass(frozen=True, slots=True)
 class PointLoop:
-    """Loop over groups of points.
-
-    Attributes:
-        body: statements.
-        summed_later: values that later loops sum over points, which must be in memory when it ends.
-    """
+    """Loop over groups of points; values ``summed_later`` by other loops must be in memory when it ends."""
 
     body: tuple[Simple, ...]
     summed_later: tuple[str, ...]

@@ -23,13 +23,7 @@ def listed(names: Sequence[object]) -> Html:
 
 
 def card(title: str, facts: Iterable[tuple[str, Html]], *parts: Html) -> str:
-    """Return a card: a title, a line for each fact, and further parts.
-
-    Args:
-        title: text.
-        facts: name, as text, and value.
-        parts: below the facts.
-    """
+    """Return a card: a title, a line for each fact (its name, as text, and value), and further parts below."""
     body = [f'<div style="font-weight:600;margin-bottom:0.3em">{plain(title)}</div>']
     body.append(grid([(plain(name), value) for name, value in facts]))
     return f'<div class="scvi-codegen" style="overflow-x:auto">{"".join([*body, *parts])}</div>'
@@ -51,12 +45,7 @@ def grid(rows: Iterable[Sequence[Html]], *, head: Sequence[str] = (), caption: s
 
 
 def sparkline(values: Sequence[float], label: str) -> Html:
-    """Return a curve without axes, without values that are not finite.
-
-    Args:
-        values: at equal distances.
-        label: description for screen readers.
-    """
+    """Return a curve of finite values at equal distances, without axes; ``label`` describes it to screen readers."""
     finite = [(k, value) for k, value in enumerate(values) if abs(value) < float("inf")]
     low = min((value for _, value in finite), default=0.0)
     span = (max((value for _, value in finite), default=0.0) - low) or 1.0

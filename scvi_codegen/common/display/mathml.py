@@ -252,9 +252,7 @@ def mathml(expression: sympy.Basic) -> str:
 def mathml_terms(right: sympy.Basic, left: sympy.Basic | None = None) -> tuple[str, ...]:
     """Return the terms of an expression or an equation as ``<math>`` elements of full size; each begins with its sign.
 
-    Args:
-        right: an expression, or an equation if ``left`` is ``None``.
-        left: the left side; the first term of the right side begins with the equals sign.
+    ``left``: the left side of an equation, whose right side then begins with the equals sign.
     """
     if left is None and isinstance(right, sympy.Eq):
         left, right = right.lhs, right.rhs

@@ -115,13 +115,7 @@ Content: TypeAlias = Block | TableBlock | Code | Drawing | SideBySide
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Section:
-    """A part of a page.
-
-    Attributes:
-        name: anchor of links.
-        title: its heading.
-        contents: in order.
-    """
+    """A part of a page: anchor of links, heading, and contents in order."""
 
     name: str
     title: str
@@ -145,13 +139,7 @@ def operations(expression: sympy.Basic) -> int:
 
 
 def formulas(all_formulas: Sequence[Formula], noun: str, *, together: int = MOST_TOGETHER) -> Iterator[Content]:
-    """Yield the first formulas, and the number of the others.
-
-    Args:
-        all_formulas: all of them.
-        noun: the word for one of them.
-        together: operations of those shown.
-    """
+    """Yield the first formulas, of ``together`` operations in all, and the number of the others, called ``noun``."""
     shown, large, total = 0, [], 0
     for formula in all_formulas[:MOST_FORMULAS]:
         size = operations(formula.right)

@@ -20,11 +20,7 @@ DIGITS = 17
 
 @dataclass(frozen=True, slots=True)
 class ArrayStepEquations:
-    """Compiled kernels of a system of arrays, with the loops around them, and the equations of a step.
-
-    Attributes:
-        system, method: the system and the method.
-    """
+    """Compiled kernels of a system of arrays, with the loops around them, and the equations of a step."""
 
     system: ArraySystem
     method: Method
@@ -34,11 +30,7 @@ class ArrayStepEquations:
 
     @property
     def program(self) -> ArrayProgram:
-        """Lowered program.
-
-        Raises:
-            MethodError: for a method without fixed-point iteration, and a system that requires known sizes.
-        """
+        """Lowered program; MethodError without fixed-point iteration, and for a system that requires known sizes."""
         self.system.check_run_time_sizes()
         return lower_arrays(self.system, self.method, prefix="derived")
 

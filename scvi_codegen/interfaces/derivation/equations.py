@@ -93,11 +93,6 @@ class StepEquations:
     initial_guess: Mapping[sympy.Symbol, sympy.Expr]
 
     @property
-    def stage_equations(self) -> tuple[Equation, ...]:
-        """Equations of interior stages, multipliers and the Legendre transform."""
-        return tuple(equation for equation in self.equations if equation.kind != "IDEL")
-
-    @property
     def idel_equations(self) -> tuple[Equation, ...]:
         """The implicit discrete Euler-Lagrange equations (5): those with p_k, then those for p_{k+1}."""
         return (*(equation for equation in self.equations if equation.kind == "IDEL"), *self.end_momentum)

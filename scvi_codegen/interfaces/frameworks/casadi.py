@@ -104,11 +104,7 @@ class EndConditions:
 
     @cached_property
     def legendre(self) -> Any:
-        """Residual of the Legendre transform: p - L_v, or v - H_p for a Hamiltonian.
-
-        Raises:
-            MethodError: if it contains an input, at whose jumps it would be discontinuous.
-        """
+        """Residual of the Legendre transform, p - L_v or v - H_p; MethodError for an input, which may jump."""
         forms, system = forms_of(self.system), self.system
         conditions = forms.constitutive or tuple(map(sympy.Add, system.momentum_symbols, (-p for p in forms.momentum)))
         if any(condition.free_symbols - {*self.symbols} for condition in conditions):
@@ -117,11 +113,7 @@ class EndConditions:
 
     @cached_property
     def constraint_residual(self) -> Any:
-        """Residual of the constraints g(q) = 0 and of their time derivatives.
-
-        Raises:
-            MethodError: if they contain an input.
-        """
+        """Residual of the constraints g(q) = 0 and of their time derivatives; MethodError if they contain an input."""
         conditions = (*position_conditions(self.system), *constraint_rates(self.system))
         residuals = [condition for condition in conditions if condition != 0]
         if any(residual.free_symbols - {*self.symbols} for residual in residuals):

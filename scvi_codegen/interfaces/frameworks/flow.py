@@ -43,12 +43,7 @@ class Flow:
 
     @classmethod
     def checked(cls, stepper: Stepper, steps: int, save_every: int | None) -> Self:
-        """Return a flow for arguments of users.
-
-        Raises:
-            MethodError: for a stepper without derivatives, without fixed steps or of arrays of run-time sizes.
-            StateError: for invalid numbers of steps.
-        """
+        """Return a flow; MethodError without derivatives or fixed steps, StateError for invalid numbers of steps."""
         require(stepper, "flow")
         stepper = stepper.known
         steps = checked_count(steps, "steps", least=1)
@@ -90,11 +85,7 @@ class Flow:
         return source
 
     def parameter_values(self, parameters: Any) -> Any:
-        """Return all parameters in order as a list, or, unless passed by name, unchanged.
-
-        Raises:
-            StateError: for unknown names, and missing inputs.
-        """
+        """Return all parameters in order as a list, or, unless passed by name, unchanged."""
         interface = self.stepper.interface
         check_inputs_given(interface, parameters)
         if parameters is not None and not isinstance(parameters, Mapping):

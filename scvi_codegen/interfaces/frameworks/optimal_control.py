@@ -250,13 +250,7 @@ class Task:
         return values if len(values) == 2 else (values or [0.0]) * 2
 
     def motion(self, program: NonlinearProgram, result: Any, stats: Mapping[str, Any]) -> ControlledMotion:
-        """Return the solution, with the multipliers of the step equations as costates.
-
-        Args:
-            program: the nonlinear program.
-            result: minimiser ``x``, cost ``f`` and multipliers ``lam_g`` of ``casadi.nlpsol``.
-            stats: its statistics.
-        """
+        """Return the solution from that of ``casadi.nlpsol``, with multipliers of the step equations as costates."""
         m, n = self.system.dimension, self.steps
         unknowns = program.split(result["x"])
         states = unknowns["states"]  # (2m, n + 1)
@@ -285,11 +279,7 @@ class Task:
 
 
 def interval(name: str, value: Any) -> tuple[float, float]:
-    """Return least and largest value of a condition or bound.
-
-    Raises:
-        StateError: unless it is a number or two numbers in ascending order.
-    """
+    """Return least and largest value of a condition or bound; StateError unless one or two ascending numbers."""
     if not isinstance(value, tuple | list):
         number = checked_number(value, name)
         return number, number

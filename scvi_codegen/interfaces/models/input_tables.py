@@ -35,12 +35,7 @@ MAX_SHOWN_LENGTH = 60
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CsvTable:
-    """Columns of numbers.
-
-    Attributes:
-        columns: (n,) values by name, in the order of the file.
-        lines: (n,) line numbers of the rows, from 1; empty for a file without lines.
-    """
+    """Columns of numbers by name in the order of the file, and line numbers of the rows from 1, if there are lines."""
 
     columns: dict[str, NDArray[np.float64]]
     lines: tuple[int, ...]
@@ -53,11 +48,7 @@ class CsvTable:
 def parse_table(
     text: str, check: Callable[[list[str]], None] | None = None, number: Callable[[str], float] = float
 ) -> CsvTable:
-    """Parse a table; ``check`` is called with its names before its numbers are parsed, by ``number``.
-
-    Raises:
-        ModelFileError: naming the column or line at fault.
-    """
+    """Parse a table, its cells by ``number``, its names first checked by ``check``; ModelFileError names the place."""
     reader = csv.reader(text.splitlines(), skipinitialspace=True)
     try:
         lines = [(reader.line_num, [cell.strip() for cell in line]) for line in reader if any(map(str.strip, line))]
@@ -101,11 +92,7 @@ class InputTable(NamedTuple):
 
 
 def checked_tables(system: MechanicalSystem, tables: Mapping[str, Any]) -> dict[str, InputTable | float]:
-    """Return validated tables and constants by name, as plain numbers; some may be missing.
-
-    Raises:
-        ModelFileError: for a name that is not an input of the system, and a value that is neither table nor number.
-    """
+    """Return tables and constants of inputs as plain numbers, some may be missing; ModelFileError for other names."""
     checked = dict[str, InputTable | float]()
     for name, table in tables.items():
         if name not in system.inputs:
@@ -150,16 +137,7 @@ KEYS = ("file", "t", "values", "kind")
 
 
 def read_input(name: str, entry: Any, folder: str | os.PathLike[str]) -> InputTable | float:
-    """Read the entry of an input in a model file.
-
-    Args:
-        name: of the input.
-        entry: a number, ``{file, kind}`` or ``{t, values, kind}``.
-        folder: base of relative paths.
-
-    Raises:
-        ModelFileError: naming the input, the file and the line or row at fault.
-    """
+    """Read the entry of an input: a number, ``{t, values, kind}``, or ``{file, kind}`` with a path below ``folder``."""
     where = f"[inputs] {name}"
     if isinstance(entry, int | float):
         return real(entry, where)

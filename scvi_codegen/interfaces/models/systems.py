@@ -11,13 +11,7 @@ MAX_CHAIN = 1024
 
 
 def fput_chain(n: int = 8, *, alpha: float = 0.0, beta: float = 1.0) -> LagrangianSystem:
-    """Fermi-Pasta-Ulam-Tsingou chain: n unit masses between fixed ends, V(d) = d^2/2 + alpha d^3/3 + beta d^4/4.
-
-    Args:
-        n: the number of moving masses, 1 to ``MAX_CHAIN``.
-        alpha: default value of the cubic coefficient.
-        beta: default value of the quartic coefficient.
-    """
+    """Fermi-Pasta-Ulam-Tsingou chain: n unit masses between fixed ends, V(d) = d^2/2 + alpha d^3/3 + beta d^4/4."""
     if isinstance(n, bool) or not isinstance(n, int) or not 1 <= n <= MAX_CHAIN:
         raise SystemDefinitionError(f"a chain must have 1 to {MAX_CHAIN} masses, not {n!r}")
     names = [f"q{index}" for index in range(1, n + 1)]

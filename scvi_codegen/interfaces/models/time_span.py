@@ -172,8 +172,7 @@ class TimeSpan(RunOptions):
     def step_count(self) -> int:
         """Number of fixed steps: ``steps``, or ``span`` / h rounded up, as the last step may be shorter.
 
-        Raises:
-            ModelFileError: if the number is not known in advance, because the run ends at a time.
+        ModelFileError if the number is not known in advance, because the run ends at a time.
         """
         if self.steps is not None:
             return self.steps

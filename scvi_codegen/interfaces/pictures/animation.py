@@ -72,12 +72,7 @@ class _Positions(MovingShape):
 def drawn_shape(
     motion: Trajectory, positions: Callable[[Array], Array] | None = None, picture: Mapping[str, Any] | None = None
 ) -> MovingShape:
-    """Return the shape of a trajectory: that of a function or a picture if one is given, else recognised.
-
-    Raises:
-        StateError: if ``positions`` returns another shape.
-        ModelFileError: for mistakes in ``picture``.
-    """
+    """Return the shape of a trajectory: that of a function or a picture if one is given, else recognised."""
     if positions is None:
         system = drawn_system_of(motion)
         return shape_of(system) if picture is None else shape_of_picture(system, picture)

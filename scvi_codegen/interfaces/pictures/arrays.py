@@ -33,11 +33,7 @@ def mesh_of(motion: Trajectory) -> Any:
 
 
 def array_values(motion: Trajectory, name: str | None) -> tuple[str, NDArray[np.float64]]:
-    """Return name and values (n, ..) of an array or of a field on a mesh, by default the first one with an index.
-
-    Raises:
-        StateError: for an unknown name.
-    """
+    """Return name and values (n, ..) of an array or field, by default the first with an index; else StateError."""
     mesh = mesh_of(motion)
     arrays = mesh.fields_of(np.asarray(motion.q), np.asarray(motion.p)) if mesh else motion.stepper.arrays(motion.q)
     if name is None:

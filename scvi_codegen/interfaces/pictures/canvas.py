@@ -44,12 +44,7 @@ STYLE = {
 
 
 def check_plot_path(path: str | os.PathLike[str], suffixes: tuple[str, ...] = PICTURES) -> None:
-    """Check before a long run that a picture can be written.
-
-    Raises:
-        StateError: for a suffix that is none of ``suffixes``.
-        PlotError: without matplotlib.
-    """
+    """Check before a long run that a picture can be written; StateError for its suffix, PlotError without library."""
     if Path(path).suffix.lower() not in suffixes:
         formats = f"{', '.join(suffixes[:-1])} or {suffixes[-1]}"
         raise StateError(f"a picture is saved as {formats}, not as {str(path)!r}")
@@ -144,11 +139,7 @@ MOTIONS = ArgumentType(
 
 
 def several(motions: Motions) -> list[Trajectory]:
-    """Return one or several trajectories as a list, those recorded in folders with all their states in memory.
-
-    Raises:
-        StateError: if there is none.
-    """
+    """Return trajectories as a list, recorded ones with all their states in memory; StateError if there is none."""
     members = motions if isinstance(motions, Sequence) else [motions]
     if not members:
         raise StateError("there is no trajectory to draw")
@@ -190,11 +181,7 @@ def at_times(motion: Trajectory, times: Array) -> Trajectory:
 
 
 def column(interface: Interface, states: Any, name: str) -> Array:
-    """Return (n,) values of a coordinate or momentum of states with q and p (n, m).
-
-    Raises:
-        StateError: for another name.
-    """
+    """Return (n,) values of a coordinate or momentum of states with q and p (n, m); StateError for another name."""
     columns = dict(zip(interface.momenta, states.p.T, strict=True))
     columns |= dict(zip(interface.coordinates, states.q.T, strict=True))
     if name not in columns:

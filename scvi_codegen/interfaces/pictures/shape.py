@@ -219,9 +219,6 @@ def shape_of_picture(system: DrawnSystem, picture: Mapping[str, Any], where: str
             those that move and are not ends of walls, and the bodies. Of a field on a mesh instead ``fields``, the
             names of fields or momenta that are drawn.
         where: of it, for messages.
-
-    Raises:
-        ModelFileError: for unknown keys and points, and formulas that are wrong.
     """
     if isinstance(picture, Mapping) and "fields" in picture:
         if system.mesh is None or len(picture) > 1:

@@ -3,9 +3,7 @@
 from sympy import Expr
 
 from scvi_codegen.common.errors import MethodError, SystemDefinitionError, closest
-from scvi_codegen.methods.controllers.controller import Controller
-from scvi_codegen.methods.controllers.predictive import PREDICTIVE
-from scvi_codegen.methods.controllers.reversible import REVERSIBLE
+from scvi_codegen.methods.controllers.controller import PREDICTIVE, REVERSIBLE, Controller
 from scvi_codegen.systems.system import MechanicalSystem
 from scvi_codegen.systems.time_transformation import reparametrise, time_rescaling_function
 
@@ -33,11 +31,7 @@ def default_controller(*, in_tau: bool) -> str:
 
 
 def controller_named(name: str | None, *, in_tau: bool) -> Controller:
-    """Return the controller of a name, ``None`` for the default one.
-
-    Raises:
-        MethodError: if the name is unknown, or the controller is not one of steps in tau, or only of these.
-    """
+    """Return the controller of a name, ``None`` for the default one; MethodError unless it is one of such steps."""
     name = default_controller(in_tau=in_tau) if name is None else name
     if name not in CONTROLLERS:
         names = ", ".join(CONTROLLERS)
@@ -60,9 +54,6 @@ def with_time_transformation(
             among :data:`CONTROLLERS`, such as ``"reversible"``: unchanged, for ``compile_stepper(...,
             time_transformation=...)``. Source of these names: E. Hairer, Ch. Lubich, G. Wanner, *Geometric Numerical
             Integration*, VIII.2 and VIII.3.
-
-    Raises:
-        SystemDefinitionError: as :func:`check_controller` and as :func:`reparametrise`.
     """
     check_controller(controller, transformed=g is not None)
     if g is None:

@@ -3,9 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import sympy
 from sympy import Expr
 
+from scvi_codegen.systems.derived_expressions import forms_of
+from scvi_codegen.systems.formulas.expressions import derivative_along
 from scvi_codegen.systems.system import MechanicalSystem
+from scvi_codegen.systems.time_transformation import time_rescaling_function
 
 __all__ = ["Controller"]
 
@@ -41,3 +45,32 @@ class Controller:
     def in_tau(self) -> bool:
         """True if steps are of equal size in tau, which requires a time-rescaling function."""
         return self.values is not None
+
+
+PREDICTIVE = Controller(
+    summary="adaptive steps (default)", code='#include "support/step_size/predictive_controller.h"\n'
+)
+"""Source: K. Gustafsson, ACM Trans. Math. Softw. 20 (1994) 496."""
+
+
+def density_and_growth(system: MechanicalSystem, g: str | Expr) -> tuple[Expr, ...]:
+    """Return 1/g and -d(log g)/dt along the motion of a system in physical time; SystemDefinitionError for other g."""
+    rate = time_rescaling_function(system, g, in_time=True)
+    forms = forms_of(system)
+    rates = dict(zip(system.coordinates, forms.legendre if system.auxiliaries else system.velocities, strict=True))
+    if system.auxiliaries:
+        rates |= dict(zip(system.auxiliaries, forms.momentum_rate, strict=True))
+    rates[system.time] = sympy.S.One
+    change = derivative_along(rate, list(rates), list(rates.values()))
+    return 1 / rate, -change / rate
+
+
+REVERSIBLE = Controller(
+    summary="equal steps of tau in any system (default of compiled time transformations)",
+    code='#include "support/step_size/density.h"\n',
+    memory=(
+        ("density", "step density, in the middle of the last step; 0 before the first"),
+        ("part", "fraction of a whole step that the last one was: less than 1 if it ended at t_end"),
+    ),
+    values=density_and_growth,
+)

@@ -41,9 +41,6 @@ def newton(residual: Solve, linearised: Callable[[Array], Solve], x: Array, digi
         x: initial guess.
         digits: requested digits, relative to the largest entry of x.
         stale: convergence factor above which the Jacobian is recomputed; larger for expensive Jacobians.
-
-    Raises:
-        NotConvergedError: if the iteration does not converge.
     """
     scale, value, solve = largest(x), residual(x), linearised(x)
     update = solve(value)

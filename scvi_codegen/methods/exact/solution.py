@@ -142,11 +142,7 @@ class ExactMotion:
         return np.asarray(np.kron([[0, 1], [-1, 0]], np.eye(len(q))), dtype=np.float64)
 
     def velocity(self, q: Numbers, p: Numbers, t: Number, digits: int = DIGITS) -> Numbers:
-        """Return the (m,) velocities: dH/dp, or the v with dL/dv = p, by Newton's iteration from v = 0.
-
-        Raises:
-            StateError: if there is none.
-        """
+        """Return the (m,) velocities: dH/dp, or v with dL/dv = p by Newton's iteration from v = 0; or StateError."""
         if self.hamiltonian:
             return self._values(self._by_second, q, p, t)
         m = len(q)
@@ -331,11 +327,7 @@ class FirstOrderMotion(ExactMotion):
         return self._one_form(q, p, t)[0]
 
     def variables(self, q: Numbers, theta: Numbers, t: Number, guess: Numbers) -> Numbers:
-        """Return y with theta(q, y, t) = theta, by Newton's iteration.
-
-        Raises:
-            StateError: if there is none.
-        """
+        """Return y with theta(q, y, t) = theta, by Newton's iteration; StateError if there is none."""
 
         def derivatives(y: Numbers) -> Solve:
             return solver(self._one_form(q, y, t)[2].astype(float))

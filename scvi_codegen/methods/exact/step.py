@@ -110,11 +110,7 @@ class DerivedStep:
         return EVALUATIONS * (time.perf_counter() - began)
 
     def __call__(self, q: Any, p: Any, h: Any, t: Any = 0) -> SolvedStep:
-        """Compute the step from (q, p) at t to t + h; numbers are converted exactly, so 0.1 is the double.
-
-        Raises:
-            StateError: if Newton's iteration does not converge.
-        """
+        """Compute the step to t + h of numbers as they are, 0.1 the double; StateError if Newton's iteration fails."""
         start = self._start_of(q, p, h, t)
 
         def linearised(z: Numbers) -> Solve:
@@ -146,11 +142,7 @@ class DerivedStep:
         return self._end(z, self._rows(z, start), start)
 
     def duration(self, solved: SolvedStep, q: Any, p: Any, h: Any) -> Number:
-        """Return the physical time of a step: the integral of dt/dtau along its curve by the method's quadrature.
-
-        Raises:
-            StateError: without a time transformation.
-        """
+        """Return the physical time of a step, the integral of dt/dtau by the method's quadrature; or StateError."""
         shape = self.stages.shape
         if self.rate is None or not isinstance(shape, Velocities):
             raise StateError(f"'{self.system.name}' has no time transformation")

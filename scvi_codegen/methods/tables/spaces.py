@@ -320,11 +320,7 @@ def _composite(rule: Quadrature, ends: tuple[tuple[Number, Number], ...]) -> Qua
 
 
 def space_by_name(name: str) -> CurveSpace:
-    """Return the space ``"polynomials"``, ``"trigonometric:0.5"``, ``"trigonometric:0.5:1"`` or ``"splines:2"``.
-
-    Raises:
-        MethodError: for any other text.
-    """
+    """Return ``"polynomials"``, ``"trigonometric:0.5"``, ``"trigonometric:0.5:1"``, ``"splines:2"``; or MethodError."""
     family, *words = name.split(":")
     try:
         match family, len(words):

@@ -27,11 +27,7 @@ ORDERS = range(2, 25, 2)
 def actions_of_steps(
     stepper: LinearisedMethod, starts: Starts, parameters: Array, options: SolverOptions | None
 ) -> tuple[Array, Array]:
-    """Return the (n,) actions of n steps without forces and constraints, and their (n, 2m) ends.
-
-    Raises:
-        StepFailedError: if Newton's iteration does not converge.
-    """
+    """Return the (n,) actions of n steps without forces and constraints, and their (n, 2m) ends."""
     binding, count = stepper.tangent, len(starts.h)
     (q1, p1), actions = np.empty((2, count, stepper.dimension)), np.empty(count)
     report = binding.new("report *")
@@ -50,12 +46,7 @@ def actions_of_steps(
 
 
 def actions_between(states: SavedStates) -> Array:
-    """Return the (n - 1,) actions from each saved state to the next.
-
-    Raises:
-        MethodError: if the method or the system has no action.
-        StateError: if the states are not at whole steps, or recomputed steps differ.
-    """
+    """Return the (n - 1,) actions from each saved state to the next."""
     require(states.stepper, "action")
     result = np.zeros(len(states) - 1)
     ends = np.concatenate([states.q, states.p], axis=1)

@@ -52,11 +52,7 @@ class Gradient:
 
 
 def tangents_from_directions(stepper: LinearisedMethod, directions: Array) -> Array:
-    """Return (k, variables) tangent vectors from directions of (q, p), or of (q, p, parameters, t, h).
-
-    Raises:
-        StateError: if the directions have another shape.
-    """
+    """Return (k, variables) tangents from directions of (q, p) or (q, p, parameters, t, h); else StateError."""
     size, input_size = 2 * stepper.dimension, stepper._input_size
     if directions.ndim not in (1, 2) or len(directions) not in (size, input_size):
         raise StateError(
@@ -99,11 +95,7 @@ def backward(states: SavedStates, seeds: Array, now: Array) -> Array:
 
 
 def checked_cotangents(stepper: LinearisedMethod, count: int, cotangents: ArrayLike) -> Array:
-    """Return validated (n, 2m) or (n, 2m, c) cotangents; in transformed time they may include one of t.
-
-    Raises:
-        StateError: if the shape does not match the number of states.
-    """
+    """Return valid (n, 2m) or (n, 2m, c) cotangents, in transformed time also with one of t; StateError for others."""
     size, derivatives = 2 * stepper.dimension, finite(cotangents, "cotangents")
     sizes = {size, len(stepper._output_indices)}
     if derivatives.ndim not in (2, 3) or derivatives.shape[0] != count or derivatives.shape[1] not in sizes:

@@ -24,11 +24,7 @@ T = -2
 
 @dataclass(frozen=True)
 class PhysicalTime:
-    """Run without time transformation: the maps below are identities.
-
-    Attributes:
-        states: states of the run at the ends of steps.
-    """
+    """Run without time transformation: the maps below are identities."""
 
     states: SavedStates
 
@@ -66,7 +62,10 @@ class TransformedTime(PhysicalTime):
         """Construct from the states of a run."""
         end_is_fixed = len(states) > 1 and bool(np.isnan(states.step_sizes[-1]))
         repeated = end_is_fixed and bool(states.stepped[-1] == states.stepped[-2])
-        return cls(_before_last(states) if repeated else states, end_is_fixed, repeated)
+        if repeated:
+            before = ("t", "q", "p", "step_sizes", "tau")
+            states = replace(states, **{name: getattr(states, name)[:-1] for name in before})
+        return cls(states, end_is_fixed, repeated)
 
     @cached_property
     def energy_gradient(self) -> Array:
@@ -120,7 +119,3 @@ class TransformedTime(PhysicalTime):
 def time_of(states: SavedStates) -> PhysicalTime:
     """Return the treatment of time for the states of a run."""
     return PhysicalTime(states) if states.tau is None else TransformedTime.of(states)
-
-
-def _before_last(states: SavedStates) -> SavedStates:
-    return replace(states, **{name: getattr(states, name)[:-1] for name in ("t", "q", "p", "step_sizes", "tau")})

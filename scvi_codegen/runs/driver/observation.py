@@ -7,7 +7,7 @@ event or at the final time, before the observer receives it.
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,10 +17,8 @@ from scvi_codegen.codegen.native.arguments import real_array
 from scvi_codegen.codegen.native.capacity import room_for_states, too_many_states
 from scvi_codegen.common.errors import EventError, StateError, StepFailedError, closest
 from scvi_codegen.common.validation import checked_count
-from scvi_codegen.runs.driver.observer import Observer, StateChunk
-from scvi_codegen.runs.driver.run_loop import record, trajectory_of
+from scvi_codegen.runs.driver.run_loop import end_run, record, trajectory_of
 from scvi_codegen.runs.driver.singular_time import ProgressWatch
-from scvi_codegen.runs.driver.table_ranges import end_run
 from scvi_codegen.runs.events.refinement import search_of
 from scvi_codegen.runs.results.dense_output import states_and_steps_at, step_sizes_at, stepped_to
 from scvi_codegen.runs.results.output import Output
@@ -32,6 +30,45 @@ from scvi_codegen.runs.stepping.chunks import drive
 from scvi_codegen.runs.stepping.memory import Memory
 from scvi_codegen.runs.stepping.step_plan import Adaptive, Fixed, Until
 from scvi_codegen.runs.trajectory import Trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class StateChunk:
+    """Consecutive states of a run.
+
+    Attributes:
+        run: the run, at the last state unless that is within a step.
+        states: the states; the first one is the last of the previous chunk, if there is one.
+        numbers: (n,) numbers of the steps that end at the states, -1 within a step.
+        iterations: (n,) numbers of solver iterations since the start.
+        is_first: whether the chunk consists of the initial state.
+        is_last: whether the run has ended.
+        within_step: whether the last state is within a step, so that the run is at the one before.
+    """
+
+    run: Memory
+    states: Trajectory
+    numbers: NDArray[np.int64]
+    iterations: NDArray[np.int64]
+    is_first: bool
+    is_last: bool
+    within_step: bool
+
+
+class Observer:
+    """Observer of a run, as passed to ``integrate(observe=)``."""
+
+    def most_steps(self, run: Memory) -> float:
+        """Return the largest number of steps of the next chunk."""
+        return math.inf
+
+    def receive(self, chunk: StateChunk) -> None:
+        """Receive the next states; those of the first chunk are the initial state alone."""
+        raise NotImplementedError
+
+    def result(self) -> ArrayLike:
+        """Return ``observed`` of the trajectory."""
+        raise NotImplementedError
 
 
 class Extremes(Observer):
@@ -208,11 +245,7 @@ class Observed(Saver):
 
 
 def saver_of(output: Output) -> Saver:
-    """Return the observer that saves the states of an output, or calls its observer.
-
-    Raises:
-        StateError: for another observer.
-    """
+    """Return the observer that saves the states of an output, or calls its observer; StateError for others."""
     observe = output.observe
     if output.times is not None:
         return AtTimes(output.times)

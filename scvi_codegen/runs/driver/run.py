@@ -12,8 +12,8 @@ from scvi_codegen.runs.accuracy.local_error import warn_of_inaccuracy
 from scvi_codegen.runs.accuracy.warning_switch import warn_of_failed_check
 from scvi_codegen.runs.driver.observation import Observation, Saver, saver_of
 from scvi_codegen.runs.driver.run_loop import ShortRuns, plain_trajectory, record
-from scvi_codegen.runs.results.descriptions import describe_run
 from scvi_codegen.runs.results.output import ALL_STATES, Output
+from scvi_codegen.runs.results.quantities import describe_run
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.layout import InitialData
 from scvi_codegen.runs.states.validation import Array, Parameters, States
@@ -98,9 +98,7 @@ class Run(Memory, AttitudeHistory):
     def _integrated(self, initial: InitialData, growth: int, steps: int | None, output: Output) -> Trajectory:
         """Start a run that is set up and record it: by one C call if it ends within ``FIRST_STEPS`` saved states.
 
-        Args:
-            growth: value of ``measures_growth`` in C.
-            initial, steps, output: as of :meth:`_recorded`.
+        ``growth``: value of ``measures_growth`` in C.
         """
         plan, h, save_every, short = self._plan, self._h, output.save_every, self._rows
         most = FIRST_STEPS if save_every == 1 else self._first_steps(save_every)

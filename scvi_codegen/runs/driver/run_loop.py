@@ -3,6 +3,7 @@
 import math
 import struct
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import lru_cache, partial
 from math import isfinite
 from typing import Any, cast
@@ -11,18 +12,51 @@ import numpy as np
 
 from scvi_codegen.codegen.native.arguments import empty_array
 from scvi_codegen.codegen.native.capacity import room_for_states, too_many_states
-from scvi_codegen.common.errors import StepFailedError
+from scvi_codegen.common.errors import ScviCodegenError, StepFailedError
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.driver.singular_time import ProgressWatch, check_energy_surface
-from scvi_codegen.runs.driver.table_ranges import end_run
 from scvi_codegen.runs.states.times import times_after
-from scvi_codegen.runs.states.validation import BINARY64, FEW, NUMBERS, SEQUENCES, Array
+from scvi_codegen.runs.states.validation import BINARY64, FEW, NUMBERS, SEQUENCES, Array, evaluation
 from scvi_codegen.runs.states.words import block_of, from_block
 from scvi_codegen.runs.stepping.chunks import drive
 from scvi_codegen.runs.stepping.memory import FIRST_STEPS, Memory
 from scvi_codegen.runs.stepping.step_plan import Adaptive, FixedSteps, InTau, ending_at
 from scvi_codegen.runs.trajectory import Trajectory
 from scvi_codegen.systems.event import Crossings
+from scvi_codegen.systems.formulas.symbols import DOT
+
+NEAR = 0.1
+"""Distance from an end, relative to the range, within which an argument at the last state is named."""
+
+
+def end_run(failure: StepFailedError, run: Memory, trajectory: Trajectory) -> None:
+    """Give a failure the states before it, and once the argument of a table that leaves its range."""
+    if failure.trajectory is None:
+        failure.args = (f"{failure}{_left_range(run)}",)
+    failure.trajectory = trajectory
+
+
+def _left_range(run: Memory) -> str:
+    stepper, t, q, p = run.stepper, run.t, np.array(run.q), np.array(run.p)
+    interface = stepper.interface
+    if not interface.ranges:
+        return ""
+    values = {"t": float(t), **dict(zip(interface.parameters, run.parameters, strict=True))}
+    values |= {**dict(zip(interface.momenta, p, strict=False)), **dict(zip(interface.coordinates, q, strict=False))}
+    with suppress(ScviCodegenError):
+        v = stepper.velocity(q, p, t, run.parameters)
+        values |= {name + DOT: rate for name, rate in zip(interface.coordinates, v, strict=True)}
+    for call, argument, *ends in interface.ranges:
+        with suppress(ScviCodegenError, ArithmeticError, KeyError):
+            evaluate, names = evaluation(argument)
+            u, (low, high) = evaluate([float(values[name]) for name in names]), map(float, ends)
+            if not low + NEAR * (high - low) < u < high - NEAR * (high - low):
+                return (
+                    f". The table {call} is given for {low:g} <= {argument} <= {high:g}; before this step {argument} = "
+                    f'{u:.6g}: extend it, or give it outside="constant" or "linear"'
+                )
+    return ""
+
 
 States = tuple[Any, ...]
 """Times, positions, momenta, iterations and, of a run that sums it, the action."""
@@ -84,11 +118,7 @@ def record(
 def record_with_stops(
     memory: Memory, stops: Sequence[float], *, progress: Callable[[int], None] | None = None
 ) -> Trajectory:
-    """Advance with adaptive steps that end at each of the times ``stops``, and save all states.
-
-    Raises:
-        StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
-    """
+    """Advance as :func:`record` with adaptive steps that end at each of the times ``stops``, and save all states."""
     recorder, first, target = _StateRecorder(memory, 1, None, 0), memory.steps, memory._plan
     try:
         for t_end in stops:
@@ -138,11 +168,7 @@ class StateRows:
 
 
 class ShortRuns(StateRows):
-    """Memory of runs of at most ``FIRST_STEPS`` saved states, each started and recorded by one C call.
-
-    Args:
-        memory: the run, whose parameters, options and plan the call uses.
-    """
+    """Memory of runs of at most ``FIRST_STEPS`` saved states by the plan of a run, each recorded by one C call."""
 
     def __init__(self, memory: Memory) -> None:
         super().__init__(memory, FIRST_STEPS + 3)

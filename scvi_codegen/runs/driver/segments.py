@@ -24,10 +24,9 @@ from scvi_codegen.runs.driver.run_loop import record_with_stops
 from scvi_codegen.runs.results.dense_output import checked_times
 from scvi_codegen.runs.results.joining import joined
 from scvi_codegen.runs.results.output import Output
-from scvi_codegen.runs.states.pairs import exact_product
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import Array, check_left_to_inputs, no_input
-from scvi_codegen.runs.states.words import low_words, split, with_low
+from scvi_codegen.runs.states.words import exact_product, low_words, split, with_low
 from scvi_codegen.runs.stepping.features import refusal
 from scvi_codegen.runs.stepping.memory import Memory
 from scvi_codegen.runs.stepping.step_plan import Adaptive, Fixed, FixedSteps, StepPlan, ending_at
@@ -72,9 +71,6 @@ def checked_inputs(
     """Return validated inputs: (t, values), (t, values, kind), a number or a piecewise polynomial of SciPy by name.
 
     With a number of trajectories, values may have one row for each trajectory, and constants one number.
-
-    Raises:
-        StateError: if a name is no input, an input is missing, or data define no function of time.
     """
     if interface.in_tau and argument is not None:
         raise refusal("inputs", "in transformed time")
@@ -233,13 +229,9 @@ def record_segments(
     recorded: Callable[[int | None], Trajectory],
     stopped: Callable[[], bool] = lambda: False,
 ) -> Trajectory:
-    """Record a run segment by segment; the states at their ends, and the last one before a failure, are also saved.
+    """Record a run by :func:`prepared_segments`; their ends, and the last state before a failure, are also saved.
 
-    Args:
-        run: the run.
-        segments: prepares the run for each segment and yields its number of steps, as :func:`prepared_segments`.
-        recorded: records a number of steps.
-        stopped: returns whether the run was stopped in the last segment; a terminal event ends it as well.
+    ``recorded`` records a number of steps; ``stopped`` tells whether the run was stopped; terminal events end it, too.
     """
     pieces, size = list[Trajectory](), 0
     for steps in segments:

@@ -22,7 +22,7 @@ from scvi_codegen.common.representation import one_line
 from scvi_codegen.runs.ensembles.lanes import CommonRuns, Departure, follow
 from scvi_codegen.runs.ensembles.result import EnsembleRuns, EnsembleTrajectory
 from scvi_codegen.runs.ensembles.thread_pool import StopCheck, run_jobs
-from scvi_codegen.runs.results.descriptions import short_title
+from scvi_codegen.runs.results.quantities import short_title
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.chunks import drive
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.codegen.native.arguments import real_array
-from scvi_codegen.codegen.native.cuda import DEVICES
+from scvi_codegen.codegen.native.cuda import DEVICES, Device, has_device_memory
 from scvi_codegen.codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.validation import checked_count
@@ -24,19 +24,78 @@ from scvi_codegen.runs.driver.segments import (
     inputs_of_slice,
     parameters_at,
 )
-from scvi_codegen.runs.ensembles.initial_states import momenta_of_each, on_processor, start_of_ensemble
 from scvi_codegen.runs.ensembles.schedule import CommonSteps
+from scvi_codegen.runs.events.contacts import in_first_modes
 from scvi_codegen.runs.results.dense_output import times_of_run
 from scvi_codegen.runs.states.validation import (
     Array,
     EnsembleParameters,
     States,
+    check_inputs_given,
     check_left_to_inputs,
     columns_of_inputs,
 )
-from scvi_codegen.runs.states.words import check_doubles, hashed
+from scvi_codegen.runs.states.words import check_doubles, hashed, stacked
 from scvi_codegen.runs.stepping.features import check_together, require
+from scvi_codegen.runs.stepping.integrator import Integrator
+from scvi_codegen.runs.stepping.projection import make_consistent
+from scvi_codegen.runs.stepping.state_functions import neither_or_both
 from scvi_codegen.runs.stepping.step_plan import Adaptive, ErrorControl, KindOfSteps, check_max_step, planned_steps
+
+
+def on_processor(value: Any) -> Any:
+    """Return a copy on the processor of an array of a GPU, alone or in a mapping; other values unchanged."""
+    if isinstance(value, Mapping):
+        return {name: on_processor(entry) for name, entry in value.items()}
+    return Device().copy_of(value) if has_device_memory(value) else value
+
+
+def checked_ensemble(stepper: Integrator, q: States, other: States, name: str) -> tuple[Array, Array]:
+    """Return validated (k, m) initial positions, and momenta or velocities ``name``."""
+    positions, others = stepper._states.members(q, "q"), stepper._states.members(other, name)
+    if positions.shape != others.shape:
+        raise StateError(f"q and {name} must have equal shapes, not {positions.shape} and {others.shape}")
+    return positions, others
+
+
+def momenta_of_each(
+    stepper: Integrator, q: States, p: States | None, velocity: States | None, t: float, parameters: EnsembleParameters
+) -> States:
+    """Return the momenta of states specified by p or by velocity, each with its own parameters."""
+    if (p is None) == (velocity is None):
+        raise neither_or_both(p)
+    if velocity is None:
+        return cast(States, p)
+    positions, velocities = checked_ensemble(stepper, q, velocity, "velocity")
+    t, values = stepper._states.time(t), stepper._states.parameters_of_each(parameters, len(positions))
+    interface = stepper.interface
+    if interface.words > 1 or interface.in_tau or interface.layout.momenta:
+        starts = zip(positions, velocities, values, strict=True)
+        return stacked([stepper.initial_momentum(position, v, t, value) for position, v, value in starts])
+    momenta = np.empty_like(positions)  # p = dL/dv
+    done = stepper.binding.of_each("momenta", t, values, positions, velocities, momenta)
+    dropped = ((momenta[:done] == 0.0) & (velocities[:done] != 0.0)).any(axis=1)
+    for j in (*np.flatnonzero(dropped).tolist(), *range(done, len(momenta))):
+        momenta[j] = stepper.initial_momentum(positions[j], velocities[j], t, values[j])  # may raise
+    return momenta
+
+
+def start_of_ensemble(
+    stepper: Integrator, q: States, p: States, t: float, parameters: EnsembleParameters
+) -> tuple[Array, Array, Array]:
+    """Return (k, m) positions and momenta, projected onto constraints, and (k, number of parameters) parameters."""
+    check_inputs_given(stepper.interface, parameters)
+    positions, momenta = checked_ensemble(stepper, q, p, "p")
+    values = stepper._states.parameters_of_each(parameters, len(positions))
+    if stepper.interface.constraints:
+        if stepper.interface.words == 1:
+            positions, momenta = (np.ascontiguousarray(each) for each in (positions, momenta))
+        if stepper.interface.contacts:
+            for k, start in enumerate(zip(positions.copy(), momenta.copy(), values, strict=True)):
+                positions[k], momenta[k] = in_first_modes(stepper, *start[:2], t, start[2])
+        else:
+            make_consistent(stepper, positions, momenta, t, values)
+    return positions, momenta, values
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,11 +144,7 @@ class EnsembleSettings:
         return bool(stepper.searched) and self.observe != "events"
 
     def steps_or_ends(self, t: float, words: int) -> tuple[int | None, Array | None]:
-        """Return the number of common steps or the final time; with adaptive steps the final time or times.
-
-        Raises:
-            StateError: for missing or contradictory arguments.
-        """
+        """Return the number of common steps or the final times; StateError for missing or contradictory arguments."""
         h, t_end = self.h, self.t_end
         check_together(inputs=self.inputs, t_eval=self.t_eval)
         if words > 1:
@@ -143,16 +198,7 @@ class Ensemble:
     def of(
         cls, stepper: Any, q: States, p: States | None, settings: EnsembleSettings, *, velocity: States | None = None
     ) -> Self:
-        """Return the ensemble of validated arguments.
-
-        Args:
-            stepper: the compiled integrator.
-            q, p, velocity: (k, m) initial state, of which p or the velocity is ``None``.
-            settings: other arguments.
-
-        Raises:
-            StateError: if a shape, name or number is invalid, or the stepper has a time transformation.
-        """
+        """Return the ensemble of (k, m) states with p or velocity; StateError if invalid, or in transformed time."""
         settings.check(stepper)
         layout, parameters = stepper._states, settings.parameters
         t0 = layout.time(settings.t)
@@ -180,7 +226,8 @@ class Ensemble:
         start = {"t0": t0, "q": positions, "p": momenta, "parameters": values}
         ensemble = cls(stepper=stepper, settings=settings, **start, inputs=inputs, fixed=fixed, save_every=save_every)
         if not stepper._has_energy(parameters):
-            ensemble._set_energies()
+            for member, at, momentum in zip(values, positions, momenta, strict=True):
+                member[stepper.interface.energy_index] = stepper.energy(at, momentum, 0.0, member)
         if fixed is None:
             ensemble._set_ends(cast(Array, ends))
         if inputs:
@@ -189,11 +236,6 @@ class Ensemble:
 
     def __len__(self) -> int:
         return len(self.q)
-
-    def _set_energies(self) -> None:
-        """Set the parameter of transformed time, the energy of each initial state."""
-        for values, q, p in zip(self.parameters, self.q, self.p, strict=True):
-            values[self.stepper.interface.energy_index] = self.stepper.energy(q, p, 0.0, values)
 
     def _set_ends(self, ends: Array) -> None:
         """Set the plan of adaptive steps, their final times and output times; all run forward or all backward."""

@@ -83,14 +83,7 @@ class CommonRuns:
         return self.steps.steps
 
     def run(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> None:
-        """Integrate all trajectories with ``threads`` threads; an exception raised by ``progress`` stops them promptly.
-
-        Afterwards, also after an exception, :meth:`result` returns what was computed.
-
-        Args:
-            progress: called with the number of completed steps, see :attr:`length`.
-            threads: number of threads, by default one per core.
-        """
+        """Integrate all trajectories as :meth:`IndividualRuns.run`; ``progress`` is called with the number of steps."""
         batch, steps, count = self.batch(), self.steps.steps, len(self)
         if batch is None:
             starts = [Departure(j, 0, self.q[0, j], self.p[0, j]) for j in range(count)]

@@ -21,10 +21,9 @@ from scvi_codegen.common.representation import one_line
 from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.runs.accuracy.global_error import ConfirmedEnsemble, GlobalError
 from scvi_codegen.runs.forwarding import Pictured
-from scvi_codegen.runs.results.descriptions import short_title
 from scvi_codegen.runs.results.export import FORMATS, LABELLED, check_format, write_whole
 from scvi_codegen.runs.results.joining import joined, relative_changes
-from scvi_codegen.runs.results.quantities import quantities
+from scvi_codegen.runs.results.quantities import quantities, short_title
 from scvi_codegen.runs.results.saved_states import ModeHistory, checked_row
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.rotation_quantities import named_quantities

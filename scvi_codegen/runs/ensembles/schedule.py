@@ -17,12 +17,7 @@ from scvi_codegen.runs.states.words import low_words, with_low
 
 
 class StepChunk(NamedTuple):
-    """Chunk of steps for one call into C.
-
-    Attributes:
-        save_every: steps between saved states.
-        entered: segment that begins with the chunk, or ``None``.
-    """
+    """Chunk of steps for one call into C, and the segment that begins with it, or ``None``."""
 
     steps: int
     save_every: int

@@ -22,9 +22,7 @@ def run_jobs(
 ) -> None:
     """Call ``work(j, check_stop)`` for j < count; an exception of ``progress`` or ``work`` stops all jobs promptly.
 
-    Args:
-        progress: called with the number of completed jobs.
-        threads: number of threads, by default one per core.
+    ``progress`` is called with the number of completed jobs; by default there is one thread per core.
     """
     argument = 0 if threads is None else checked_count(threads, "threads", least=1)
     workers, stop = min(count, argument or os.cpu_count() or 1), threading.Event()

@@ -79,11 +79,7 @@ def chunk_path(folder: Path, number: int) -> Path:
 
 
 def chunk_paths(folder: Path) -> list[Path]:
-    """Return the existing files of states, in order.
-
-    Raises:
-        RecordingError: if a file between them is missing.
-    """
+    """Return the existing files of states, in order; RecordingError if a file between them is missing."""
     numbers = sorted(int(match[1]) for path in folder.iterdir() if (match := NAME.fullmatch(path.name)))
     for expected, number in enumerate(numbers):
         if number != expected:
@@ -132,11 +128,7 @@ NO_COMMENT = b"\0\0"
 
 
 def read_chunk(path: Path, interface: Interface, rows: int) -> Chunk:
-    """Return the contents of a file of states after checking checksums, shapes and number of rows.
-
-    Raises:
-        RecordingError: if the file cannot be read or is damaged.
-    """
+    """Return the contents of a file of states with right checksums, shapes and rows; RecordingError if damaged."""
     try:
         with loaded(_unsealed(regular(path).read_bytes())) as arrays:
             t, q, p, iterations = (arrays[name] for name in COLUMNS)
@@ -378,11 +370,7 @@ def _double(*records: Any) -> tuple[Source, Interface, Source | None] | tuple[()
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """Return the manifest in a folder.
-
-    Raises:
-        RecordingError: if there is none, or it is damaged.
-    """
+    """Return the manifest in a folder; RecordingError if there is none, or it is damaged."""
     path = folder / MANIFEST
     try:
         return Manifest.from_json(read_text(path, "utf-8"))

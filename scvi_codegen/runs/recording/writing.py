@@ -311,11 +311,7 @@ class _Recorder:
         self.pending = ([*pieces, piece], crossings, run.steps, run.t, run.checkpoint())
 
     def checkpoint(self) -> None:
-        """Write the states computed since the last checkpoint.
-
-        Raises:
-            RecordingError: if that fails; the message reports the last step in the folder.
-        """
+        """Write the states since the last checkpoint; RecordingError with the last step in the folder if that fails."""
         with self.reporting_recovery():
             self.write()
 

@@ -32,12 +32,7 @@ Array = NDArray[np.float64]
 
 
 def states_at(states: SavedStates, times: Array) -> tuple[Array, Array]:
-    """Return (n, m) positions and momenta at (n,) times within the range of the saved states, in any order.
-
-    Raises:
-        StateError: if a time is outside the range, or if the saved states are not at whole steps (those of ``t_eval``).
-        StepFailedError: if a partial step fails.
-    """
+    """Return (n, m) positions and momenta at (n,) times within the range of the saved states, in any order."""
     q, p, _ = states_and_steps_at(states, times)
     return q, p
 

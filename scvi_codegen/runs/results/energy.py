@@ -66,11 +66,9 @@ class EnergyAccount(NamedTuple):
 
 
 def energy_account(states: Any, *, limited: bool = False) -> EnergyAccount:
-    """Return the change of the energy along states with ``t`` and ``energy()``.
+    """Return the change of the energy along a trajectory, or a recorded run, of which the work is unknown.
 
-    Args:
-        states: a trajectory, or a recorded run, of which the work is unknown.
-        limited: whether the work is computed only for short runs of few coordinates.
+    ``limited``: compute the work only for short runs of few coordinates.
     """
     energy, stepper = np.asanyarray(states.energy()), states.stepper
     reason, work = energy_reason(stepper), None

@@ -146,12 +146,7 @@ def chunk_rows(dimension: int) -> int:
 
 
 def check_format(path: str | os.PathLike[str]) -> None:
-    """Check, before a long run, that states can be written to a file of this suffix.
-
-    Raises:
-        StateError: for an unknown suffix.
-        MissingLibraryError: if its library is not installed.
-    """
+    """Check before a long run that states can be written to a file of this suffix; StateError, MissingLibraryError."""
     suffix = Path(path).suffix.lower()
     if suffix not in WRITERS:
         raise StateError(f"the format of a trajectory is the suffix of its file, one of {FORMATS}, not {str(path)!r}")
@@ -161,13 +156,7 @@ def check_format(path: str | os.PathLike[str]) -> None:
 
 
 def write_states(states: States, path: str | os.PathLike[str]) -> None:
-    """Write states atomically in the format of the suffix.
-
-    Raises:
-        StateError, MissingLibraryError: as :func:`check_format`; StateError also if ``path`` is an unrelated folder,
-            and for units in a format that does not support them.
-        OSError: if it cannot be written.
-    """
+    """Write states atomically in the format of the suffix; raises as :func:`check_format`, and OSError."""
     check_format(path)
     suffix = Path(path).suffix.lower()
     if states.units and suffix not in LABELLED:

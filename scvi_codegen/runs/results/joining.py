@@ -78,11 +78,7 @@ def relative_changes(values: Array, sizes: Array, bounds: Callable[[NDArray[np.b
     """Return changes since the first value along axis 0, relative to the largest size; NaN if sizes overflow.
 
     If the terms of a quantity are rounding errors, as of the angular momentum of a fall along an axis, changes are
-    relative to a bound of its values.
-
-    Args:
-        values, sizes: (n, ..) values and sizes of their terms.
-        bounds: function that returns (..) bounds where a mask (..) is true.
+    relative to a bound of its values, (..) ``bounds`` where a mask (..) is true.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         scales = np.fmax.reduce(sizes, axis=0)

@@ -29,13 +29,7 @@ SAME_STATE = 1e-6
 
 
 def work_and_impulses_until(states: SavedStates) -> Array:
-    """Return (n, 1 + k) work of the forces from the first state to each, and their impulses on the momentum maps.
-
-    Raises:
-        MethodError: if no forces act, or the method has no curve of positions.
-        StateError: if the states are not at whole steps, or recomputed steps differ.
-        StepFailedError: if Newton's iteration does not converge.
-    """
+    """Return (n, 1 + k) work of the forces from the first state to each, and their impulses on the momentum maps."""
     stepper = states.stepper
     values = [np.zeros(1)]  # of the first state; the number of impulses of arrays is known after a step
     ends = np.concatenate([states.q, states.p], axis=1)

@@ -23,12 +23,7 @@ ROUNDINGS, STEP_END_TOLERANCE = 4.0, 1e-6
 
 
 def checked_row(row: Any, count: int) -> int:
-    """Return a row index counted from the start; negative indices count from the end.
-
-    Raises:
-        IndexError: if the index is out of range.
-        TypeError: if the index is not a whole number.
-    """
+    """Return a row index counted from the start, negative ones from the end; IndexError or TypeError for others."""
     if isinstance(row, bool) or not hasattr(row, "__index__"):
         raise TypeError(f"the index of a state must be a whole number or a slice (run[-1], run[10:]), not {row!r}")
     number = operator.index(row)

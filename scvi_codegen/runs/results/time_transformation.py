@@ -26,9 +26,6 @@ def part_of_step(
     """Return the state at the time ``end`` within a step of h from (q, p) at t, and the fraction of the step taken.
 
     ``along``: the run or its states, with the parameters and options of the step.
-
-    Raises:
-        StepFailedError: if a partial step fails.
     """
     if along.stepper.interface.words > 1:  # systems in transformed time are autonomous
         return _part_of_two_words(along, h, fraction_of(end) - fraction_of(t), q, p)

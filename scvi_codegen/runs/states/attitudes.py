@@ -33,9 +33,6 @@ def quaternions(value: Any, name: str) -> Array:
             ``order``, ``"wxyz"`` or ``"xyzw"`` (scalar part first or last, as in ROS, SciPy and most files); or a
             ``scipy.spatial.transform.Rotation``.
         name: of the rotation, for messages.
-
-    Raises:
-        StateError: if the value is none of these, a quaternion is zero, or a matrix is not a rotation.
     """
     array = _components(value, name)
     if not array.ndim or array.shape[-1] != 4:
@@ -93,9 +90,6 @@ def scaled_vectors(value: Any, name: str) -> tuple[Array, Array, Array]:
     """Return (.., 3) vectors divided by powers of two near their largest components, their lengths, and the exponents.
 
     Squares then neither overflow nor underflow.
-
-    Raises:
-        StateError: unless there are three components, finite and not all zero.
     """
     vector = real_array(value, name)
     if not vector.ndim or vector.shape[-1] != 3:

@@ -170,13 +170,9 @@ class StateLayout:
     def parameters_of_each(self, values: EnsembleParameters, count: int) -> Array:
         """Return (k, number of parameters) values: defaults replaced by name, one or k numbers each, or by an array."""
         numbers = parameters_of_each(self.interface, values, count, np.asarray(self.interface.defaults, dtype=float))
-        self.check_lengths_of_each(numbers)
+        for j, row in enumerate(numbers if self.interface.lengths else ()):
+            check_lengths(self.interface, row, f" of trajectory {j}")
         return numbers
-
-    def check_lengths_of_each(self, parameters: Array) -> None:
-        """Raise ``StateError`` for lengths of lists of neighbours that are impossible, with the trajectory."""
-        for j, values in enumerate(parameters if self.interface.lengths else ()):
-            check_lengths(self.interface, values, f" of trajectory {j}")
 
     def time(self, t: Any) -> float:
         """Return a finite time."""

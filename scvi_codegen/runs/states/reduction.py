@@ -31,11 +31,7 @@ SMALL = 0.13
 
 
 class Reduction:
-    """Maps between tangent vectors of (q, p) and those of the reduced space, in canonical coordinates (a, b).
-
-    Attributes:
-        size: dimension of the reduced space.
-    """
+    """Maps between tangent vectors of (q, p) and those of the reduced space, in canonical coordinates (a, b)."""
 
     def __init__(self, interface: Interface) -> None:
         self.dimension, self.members = interface.dimension, members_of(interface.dimension, interface.rotations)

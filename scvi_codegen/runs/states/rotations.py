@@ -48,12 +48,7 @@ class Member:
 
 
 def members_of(dimension: int, declarations: Sequence[str]) -> tuple[Member, ...]:
-    """Return the rotations, directions and spins of a system, whose coordinates follow the ordinary ones.
-
-    Args:
-        dimension: number of all coordinates.
-        declarations: as of :attr:`~scvi_codegen.codegen.rendering.source.Interface.rotations`.
-    """
+    """Return the rotations, directions and spins of a system, whose coordinates follow the ordinary ones."""
     parts = [text.split() for text in declarations]
     first = dimension - sum(COMPONENTS[kind] for kind, *_ in parts)
     members = []
@@ -109,9 +104,6 @@ def state_of(
         velocity: by name: of ordinary coordinates and directions, and the angular velocity under its own name (body
             frame) or with ``_space``.
         shapes: names and shapes of arrays of coordinates, ``("R", (3, 4))`` of three rotations.
-
-    Raises:
-        StateError: naming what is unknown, missing or invalid.
     """
     q, p, velocity = (_by_entry(shapes, members, part) for part in (q, p, velocity))
     ordinary = coordinates[: members[0].columns.start]

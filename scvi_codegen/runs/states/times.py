@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.runs.states.pairs import exact_product, exact_sum
 from scvi_codegen.runs.states.validation import Array
+from scvi_codegen.runs.states.words import exact_product, exact_sum
 
 WHOLE = 1e-9
 """Fraction of a step that rounding may leave of a span."""
@@ -39,12 +39,9 @@ def steps_within(spans: ArrayLike, h: float) -> NDArray[np.intp]:
 
 
 def steps_to(t: float | Fraction, t_end: float, h: float, *, exactly: bool = False) -> int | None:
-    """Return the number of steps h from t to t_end, or ``None`` if the last has to be shorter.
+    """Return the number of steps h from t to t_end, ``None`` if the last is shorter; StateError for an impossible h.
 
     ``exactly``: without an allowance for the rounding of h.
-
-    Raises:
-        StateError: if h has the wrong sign or is too small.
     """
     span = (checked_number(t_end, "t_end") - checked_number(t, "the time t")) / checked_step(h)
     if span < 0.0:

@@ -84,11 +84,7 @@ def shapes_of(interface: Interface) -> Shapes | None:
 
 
 def common_shape(shapes: Mapping[str, tuple[int, ...]]) -> tuple[int, ...]:
-    """Return the shape of the states that all parts by name describe; a part of one state is that of all states.
-
-    Raises:
-        StateError: naming two parts of different numbers of states.
-    """
+    """Return the shape of the states by name, of which one counts for all; StateError for two numbers of states."""
     try:
         return np.broadcast_shapes(*shapes.values())
     except ValueError:
@@ -237,9 +233,7 @@ def parameters_of_each(interface: Interface, argument: EnsembleParameters, count
 def check_lengths(interface: Interface, values: Array, where: str = "") -> None:
     """Raise :class:`StateError` unless lengths of lists of neighbours are positive and periods two cutoffs or more.
 
-    Args:
-        values: parameters in order.
-        where: words that follow the value in a message, as of which trajectory.
+    ``where`` follows the value in a message, as of which trajectory.
     """
     cutoffs: dict[str, tuple[str, float]] = {}
     for near, kind, formula in interface.lengths:

@@ -251,11 +251,7 @@ def as_text(values: Any) -> list[str]:
 
 
 def two_words(value: Any, name: str) -> tuple[float, float]:
-    """Return the nearest double to a number, and the nearest double to the rest.
-
-    Raises:
-        StateError: for anything but a finite real number.
-    """
+    """Return the nearest double to a number, and that to the rest; StateError for anything but a finite real number."""
     if type(value) is float and np.isfinite(value):
         return value, 0.0
     if isinstance(value, ExactNumber | Word) and np.isfinite(value):
@@ -301,11 +297,7 @@ def check_doubles(**times: Any) -> None:
 
 
 def split(values: Any, name: str) -> tuple[Any, Any]:
-    """Return the high and the low words of numbers of any kind, also by name; ``None`` of ``None``.
-
-    Raises:
-        StateError: if a value is not a finite real number.
-    """
+    """Return high and low words of numbers, also by name, or ``None``; StateError unless finite and real."""
     if isinstance(values, Mapping):
         parts = {key: split(value, f"{name}: '{key}'") for key, value in values.items()}
         return {key: part[0] for key, part in parts.items()}, {key: part[1] for key, part in parts.items()}
@@ -357,3 +349,55 @@ class TwoWords:
         if isinstance(self.q, Words) and not isinstance(values, Words):
             raise StateError(f"'{name}' has one word of double-double arithmetic: compute it from mp('q') and mp('p')")
         return as_mpmath(values)
+
+
+SPLITTER = 2.0**27 + 1.0
+"""Factor that splits a double into two halves of 26 bits (Dekker 1971)."""
+
+
+def exact_product(x: Array, y: Array | float) -> tuple[Array, Array]:
+    """Return x y without rounding error as a double-double number (Dekker's product)."""
+    product = x * y
+    x_high, y_high = SPLITTER * x - (SPLITTER * x - x), SPLITTER * y - (SPLITTER * y - y)
+    x_low, y_low = x - x_high, y - y_high
+    return product, ((x_high * y_high - product) + x_high * y_low + x_low * y_high) + x_low * y_low
+
+
+def exact_sum(x: Array | float, y: Array) -> tuple[Array, Array]:
+    """Return x + y without rounding error as a double-double number (Knuth's sum)."""
+    total = x + y
+    part = total - x
+    return total, (x - (total - part)) + (y - part)
+
+
+def sum_of(x: Array, y: Array) -> Array:
+    """Return x + y, in two words if one of them has two."""
+    if not (isinstance(x, Words) or isinstance(y, Words)):
+        return x + y
+    high, rest = exact_sum(np.asarray(x), np.asarray(y))
+    return _normalised(high, rest + (low_words(x) + low_words(y)))
+
+
+def product_of(x: Array, y: Array) -> Array:
+    """Return x y, in two words if one of them has two."""
+    if not (isinstance(x, Words) or isinstance(y, Words)):
+        return x * y
+    first, second = np.asarray(x), np.asarray(y)
+    high, rest = exact_product(first, second)
+    return _normalised(high, rest + (first * low_words(y) + low_words(x) * second))
+
+
+def quotient_of(x: Array, y: Array) -> Array:
+    """Return x / y, in two words if one of them has two."""
+    if not (isinstance(x, Words) or isinstance(y, Words)):
+        return x / y
+    first, second = np.asarray(x), np.asarray(y)
+    high = first / second
+    product, cut = exact_product(high, second)
+    rest = ((first - product) - cut) + (low_words(x) - high * low_words(y))
+    return _normalised(high, rest / second)
+
+
+def _normalised(high: Array, rest: Array) -> Array:
+    result: Array = with_low(*map(np.asarray, exact_sum(high, rest)))
+    return result

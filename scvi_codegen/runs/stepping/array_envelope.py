@@ -30,14 +30,9 @@ class Envelope(NamedTuple):
 
 
 def envelope_of(layout: ArrayLayout, arrays: RunSizes) -> Envelope | None:
-    """Return the envelope of the unknowns of a run: coordinates, and the momenta of a Hamiltonian.
+    """Return the envelope of the unknowns of a run, also of momenta of a Hamiltonian; ``None`` without couplings.
 
-    Returns:
-        ``None`` without couplings.
-
-    Raises:
-        StateError: if a linear part that is not symmetric has more couplings than factors can have, since there is no
-            other preconditioner.
+    StateError for a linear part that is not symmetric and too large, since there is no other preconditioner.
     """
     if not layout.couplings or (layout.momenta and _has_modes(layout)):
         return None

@@ -50,11 +50,7 @@ def read_arrays(
     parameters: Mapping[str, ArrayLike] | None,
     tables: Mapping[str, ArrayLike] | None,
 ) -> RunArrays:
-    """Return the arrays of a run, validated against their declarations and each other.
-
-    Raises:
-        StateError: if a name, shape or number is invalid, or an index would leave its array.
-    """
+    """Return the arrays of a run, valid by their declarations and together; StateError otherwise."""
     index_tables, state = read_tables(interface, tables), read_state(interface, q, "positions")
     shapes = [(array, state[array.name].shape) for array in interface.layout.coordinates]
     if (mesh := interface.layout.mesh) is not None:
@@ -94,11 +90,7 @@ def first_state(interface: Interface, argument: Any) -> Any:
 
 
 def read_state(interface: Interface, argument: ArrayLike | Mapping[str, ArrayLike], label: str) -> dict[str, Numbers]:
-    """Return the coordinate arrays (or velocities, momenta) by name, from a mapping or a single array.
-
-    Raises:
-        StateError: if a name, a number of axes or a value is invalid.
-    """
+    """Return the arrays of coordinates, velocities or momenta by name, from a mapping or one array; else StateError."""
     names = list(interface.coordinates)
     if isinstance(argument, NamedState):
         argument = dict(argument.items())
@@ -173,11 +165,7 @@ def _read_only(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def sizes_of(arrays: Sequence[tuple[Array, tuple[int, ...]]], names: Sequence[str]) -> dict[str, int]:
-    """Return the value of every size, from the shapes of arrays.
-
-    Raises:
-        StateError: if two arrays imply different values, or none implies any.
-    """
+    """Return every size, from the shapes of arrays; StateError if two imply different values, or none implies any."""
     lengths: dict[str, tuple[int, Array]] = {}
     for array, shape in arrays:
         for axis, length in zip(array.axes, shape, strict=True):
@@ -272,12 +260,7 @@ def sizes_of_run(
     tables: Mapping[str, ArrayLike] | None,
     threads: int | None,
 ) -> RunSizes:
-    """Return the sizes and tables of arrays; of several states the first determines them.
-
-    Raises:
-        StateError: if a name, shape or number is invalid, or an index would leave its array.
-        MethodError: for several threads with constraints.
-    """
+    """Return the sizes and tables of arrays; of several states the first determines them."""
     for name, value in (("parameters", parameters), ("tables", tables)):
         if value is not None:
             check_kind(MAPPING, value, name, StateError)

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.codegen.native import building
-from scvi_codegen.codegen.native.binding import Binding
-from scvi_codegen.codegen.native.calls import with_calls
+from scvi_codegen.codegen.native.binding import Binding, with_calls
 from scvi_codegen.codegen.rendering.source import Interface, Source
 from scvi_codegen.codegen.variants import Acting, Derivatives, Lanes, NewtonFallback, Variant, WithEvents
 from scvi_codegen.common.cache import cached_source

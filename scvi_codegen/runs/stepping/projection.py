@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.codegen.native.options import REASONS, STATUS
 from scvi_codegen.codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
 from scvi_codegen.common.errors import AccuracyWarning, StateError, warn
-from scvi_codegen.runs.states.pairs import quotient_of
 from scvi_codegen.runs.states.validation import Array, Parameters, States, inputs_not_given, missing_input
+from scvi_codegen.runs.states.words import quotient_of
 from scvi_codegen.runs.stepping.features import require
 from scvi_codegen.runs.stepping.integrator import Integrator
 
@@ -51,9 +51,6 @@ def projected(
     """Return the nearest state on the constraints, and (2,) its relative distance in q and in p.
 
     Distances are in the metric of the mass matrix at the projected state, hence independent of coordinate units.
-
-    Raises:
-        StateError: if the iteration fails, or if the constraints are linearly dependent there.
     """
     q0, p0 = stepper._states.pair(q, p)
     _of_constrained(stepper, q0, p0, t)
@@ -216,11 +213,7 @@ def _massless(stepper: Integrator, q: Array, t: float, parameters: Parameters) -
 
 
 def _at_unit_velocities(stepper: Integrator, q: Array, t: float, parameters: Parameters) -> tuple[Array, Array]:
-    """Return (1 + m, m) equal positions and the momenta there of no velocity and of a unit velocity of each coordinate.
-
-    Raises:
-        StateError: where velocities have no momenta.
-    """
+    """Return (1 + m, m) equal positions and the momenta there, of no and of unit velocities; StateError without any."""
     unit = np.concatenate([np.zeros((1, stepper.dimension)), np.eye(stepper.dimension)])
     positions = np.tile(q, (len(unit), 1))
     return positions, stepper.momentum(positions, unit, t, parameters)
@@ -316,11 +309,7 @@ def nearly_dependent(jacobian: Array) -> str:
 def rank_deficiency(names: Sequence[str], q: Array, at: Jacobian, *, nearest: bool = False) -> str | None:
     """Return what is wrong with constraints of deficient rank, and what to do; ``None`` if they are independent.
 
-    Args:
-        names: formulas of the constraints.
-        q: (m,) positions.
-        at: function that returns g and G at positions.
-        nearest: first minimise the constraint residual by Gauss-Newton iteration.
+    ``nearest``: first minimise the constraint residual by Gauss-Newton iteration.
     """
     for _ in range(ITERATIONS if nearest else 0):
         g, jacobian = at(q)

@@ -59,15 +59,7 @@ def read_checkpoint(
 ) -> tuple[Integrator, bytes, dict[str, Any], ErrorControl]:
     """Return the stepper, bound to the sizes of the run, the state, the parameters by name and the error control.
 
-    Args:
-        saved: bytes of :func:`checkpoint`.
-        stepper: of the system and method of the run; of run-time sizes, of any size.
-        threads: number of threads per step of run-time sizes.
-        adaptive: whether the run continues with adaptive steps.
-
-    Raises:
-        StateError: if the bytes are damaged or belong to another integrator or another kind of steps, or, of run-time
-            sizes, for an invalid ``threads``.
+    ``adaptive``: whether the run continues with adaptive steps.
     """
     body = unsealed(saved)
     try:

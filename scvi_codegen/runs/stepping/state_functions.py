@@ -11,9 +11,8 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.codegen.native.options import REASONS
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.runs.states.pairs import product_of, quotient_of, sum_of
 from scvi_codegen.runs.states.validation import Array, Parameters, States, coordinate_shapes
-from scvi_codegen.runs.states.words import by_name, low_words, scalar, unnamed
+from scvi_codegen.runs.states.words import by_name, low_words, product_of, quotient_of, scalar, sum_of, unnamed
 from scvi_codegen.runs.stepping.array_interface import constraint_shapes
 from scvi_codegen.runs.stepping.compiled_method import CompiledMethod
 
@@ -70,11 +69,7 @@ class StateFunctions(CompiledMethod):
     def _initial_momenta(
         self, q: States, p: States | None, velocity: States | None, t: float, parameters: Parameters
     ) -> States:
-        """Return the momenta of a state specified by p or by velocity.
-
-        Raises:
-            StateError: unless exactly one of both is passed.
-        """
+        """Return the momenta of a state by p or by velocity; StateError unless exactly one of both is passed."""
         if velocity is None and p is not None:
             return p
         if velocity is None or p is not None:
@@ -82,11 +77,7 @@ class StateFunctions(CompiledMethod):
         return self.initial_momentum(q, velocity, t, parameters)
 
     def initial_momentum(self, q: States, velocity: States, t: float, parameters: Parameters) -> Array:
-        """Return the (m,) momentum of the initial state of a run.
-
-        Raises:
-            StateError: if the mass matrix is singular along the velocity, so the momentum does not determine it.
-        """
+        """Return the (m,) momentum of the initial state of a run."""
         q, v = self._states.pair(q, velocity, "velocity")
         p = self._transformed("momentum", self._states.time(t), q, v, self._parameters(parameters))
         dropped = (p == 0.0) & (v != 0.0)
@@ -127,11 +118,7 @@ class StateFunctions(CompiledMethod):
         return parts
 
     def _energies_of(self, t: Array, q: Array, p: Array, parameters: Array) -> Array:
-        """Return (n,) energies of unchecked contiguous arrays of shapes (n,), (n, m), (n, m) and (k,).
-
-        Raises:
-            StateError: if a state is outside the domain of L.
-        """
+        """Return (n,) energies of unchecked contiguous arrays of shapes (n,), (n, m), (n, m) and (k,)."""
         result, binding = np.empty(len(t) * self.interface.words), self.binding
         states = self._states
         arrays = states.times_block(t), *map(states.block, (q, p)), result

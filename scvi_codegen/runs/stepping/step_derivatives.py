@@ -109,11 +109,7 @@ class LinearisedMethod(StateFunctions):
         return 2 * self.dimension + self.interface.energy_index
 
     def _energy_gradient(self, q: Array, p: Array, parameters: Array) -> Array:
-        """Return the (variables,) gradient of the energy of a state by all variables; 0 if time is not transformed.
-
-        Raises:
-            StateError: if the gradient is undefined.
-        """
+        """Return the (variables,) gradient of the energy of a state, 0 unless time is transformed; or StateError."""
         gradient, name = np.zeros(self._input_size), self.interface.energy_parameter
         if name is None:
             return gradient
@@ -268,14 +264,10 @@ class LinearisedMethod(StateFunctions):
             vectors: (n + 1, count, 2m + k + 2) variations of (q, p, parameters, t, h): the image of row i under step i
                 is added to row i + 1.
             parameters: (k,) values in order.
-            options: solver options.
             transpose: apply the transpose: the image of row i + 1 is added to row i.
 
         Returns:
             (n, m) recomputed positions and momenta at the ends of the steps.
-
-        Raises:
-            StepFailedError: if Newton's iteration does not converge.
         """
         binding, m = self.tangent, self.dimension
         report = binding.new("report *")
@@ -310,10 +302,6 @@ class LinearisedMethod(StateFunctions):
             vectors: (n + 1, 2, count, 2m + k + 2) cotangents and their tangents: the image of row i + 1 under step i
                 is added to row i.
             parameters, options: as of :meth:`_propagate`.
-
-        Raises:
-            MethodError: if second derivatives are unavailable.
-            StepFailedError: if Newton's iteration does not converge.
         """
         binding = self._second_derivatives
         report = binding.new("report *")

@@ -28,11 +28,7 @@ AbsoluteTolerance: TypeAlias = float | tuple[tuple[str, float], ...]
 
 @dataclass(frozen=True, slots=True)
 class FixedSteps:
-    """Steps of one size; base of :class:`Fixed` and :class:`Until`.
-
-    Attributes:
-        h: step size, of tau in transformed time.
-    """
+    """Steps of one size h, of tau in transformed time; base of :class:`Fixed` and :class:`Until`."""
 
     h: float
 
@@ -44,11 +40,7 @@ class Fixed(FixedSteps):
 
 @dataclass(frozen=True, slots=True)
 class Until(FixedSteps):
-    """Fixed steps to a target time, the last of which is shorter; it is not taken by the run itself.
-
-    Attributes:
-        t_end: target time.
-    """
+    """Fixed steps to the time ``t_end``, the last of which is shorter; it is not taken by the run itself."""
 
     t_end: float
 
@@ -81,12 +73,7 @@ class Adaptive:
 
 @dataclass(frozen=True, slots=True)
 class InTau:
-    """Steps of one size in the fictitious time of a controller, to a target time.
-
-    Attributes:
-        t_end: target time.
-        tau: step size.
-    """
+    """Steps of one size in the fictitious time ``tau`` of a controller, to the time ``t_end``."""
 
     t_end: float
     tau: float
@@ -103,12 +90,7 @@ def ending_at(plan: StepPlan, t_end: float) -> StepPlan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdaptivePlans(Sequence[Adaptive]):
-    """Adaptive steps of trajectories to times of their own, made when they are read.
-
-    Attributes:
-        ends: (k,) target times.
-        plan: that of a trajectory, whose target time is replaced.
-    """
+    """Adaptive steps of trajectories by one plan to (k,) ``ends`` of their own, made when they are read."""
 
     ends: NDArray[np.float64]
     plan: Adaptive
@@ -168,11 +150,7 @@ class ErrorControl(NamedTuple):
         )
 
     def to(self, t_end: float) -> Adaptive:
-        """Return the step plan to a target time.
-
-        Raises:
-            StateError: if a number is invalid.
-        """
+        """Return the step plan to a target time; StateError if a number is invalid."""
         return Adaptive(checked_number(t_end, "t_end"), **self.checked())
 
     def checked(self) -> dict[str, Any]:
@@ -204,11 +182,7 @@ def plan_to_record(plan: Fixed | Adaptive | InTau) -> dict[str, Any]:
 
 
 def plan_from_record(*, h: Any = None, tau: Any = None, **control: Any) -> Fixed | Adaptive | InTau:
-    """Return the step plan of :func:`plan_to_record`.
-
-    Raises:
-        StateError, TypeError: for other names and numbers.
-    """
+    """Return the step plan of :func:`plan_to_record`; StateError or TypeError for other names and numbers."""
     if h is not None:
         if control or tau is not None:
             raise StateError("steps of one size have neither a target time nor a tolerance")
@@ -239,11 +213,7 @@ def _not_negative(value: Any, name: str) -> float:
 
 
 def absolute_tolerances(interface: Interface, dimension: int, absolute: AbsoluteTolerance) -> NDArray[np.float64]:
-    """Return the (m,) absolute tolerances of the coordinates.
-
-    Raises:
-        StateError: if there is no coordinate, array or rotation of a name.
-    """
+    """Return the (m,) absolute tolerances of the coordinates; StateError for names of no coordinates or rotation."""
     if not isinstance(absolute, tuple):
         return np.full(dimension, absolute)
     from scvi_codegen.runs.states.rotations import members_of  # here, because it imports runs
@@ -270,15 +240,7 @@ def absolute_tolerances(interface: Interface, dimension: int, absolute: Absolute
 
 
 def step_control(stepper: Any, plan: StepPlan) -> tuple[Any, ...]:
-    """Return the control of steps in C, NULL for fixed ones, and the numbers that it refers to.
-
-    Args:
-        stepper: :class:`~scvi_codegen.runs.stepping.integrator.Integrator` of the run.
-        plan: step plan.
-
-    Raises:
-        StateError: if there is no coordinate, array or rotation of a name, or a tolerance cannot be met.
-    """
+    """Return the control of steps in C, NULL for fixed ones, and its numbers; StateError if they cannot be met."""
     binding = stepper.binding
     match plan:
         case InTau(tau=tau):
@@ -336,16 +298,7 @@ def _check_resolved(tolerance: float | None, least: float) -> None:
 
 
 def checked_plan(kind: KindOfSteps, h: float | None, t_end: float | None, control: ErrorControl) -> StepPlan:
-    """Return the step plan of arguments of users.
-
-    Args:
-        kind: of the stepper.
-        h, t_end: step size; target time.
-        control: of adaptive steps.
-
-    Raises:
-        StateError: if a number is invalid, or they do not determine the steps.
-    """
+    """Return the step plan of arguments of users; StateError if they are invalid or do not determine the steps."""
     if kind.time_transformation is not None:
         if h is None or t_end is None or control.named:
             remedy = FEATURES["adaptive", "with a time transformation"]
@@ -383,13 +336,7 @@ def planned_steps(
 ) -> tuple[StepPlan, int | None]:
     """Return the plan of :meth:`Stepper.integrate` and its number of steps, ``None`` to t_end.
 
-    Args:
-        kind: of the stepper; runs in double-double end at t_end to 32 digits.
-        h, steps, t_end, tolerance, absolute_tolerance, max_step, first_step, save_every, t: arguments of
-            :meth:`Stepper.integrate`; t matters with h and t_end.
-
-    Raises:
-        StateError: if a number is invalid, or they do not determine the steps.
+    Runs in double-double end at t_end to 32 digits; t matters with h and t_end.
     """
     fixed = h is not None and kind.time_transformation is None
     control = ErrorControl(tolerance, absolute_tolerance, max_step, first_step)

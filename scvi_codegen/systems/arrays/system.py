@@ -154,13 +154,7 @@ def loops_text(loops: Sequence[Loop]) -> str:
 
 
 def check_constraint(term: ArrayTerm, coordinates: Sequence[Array], fields: Sequence[Array], inputs: str) -> None:
-    """Raise :class:`SystemDefinitionError` unless a constraint contains coordinates, and neither velocities nor inputs.
-
-    Args:
-        term: the constraint.
-        coordinates, fields: arrays that it may contain.
-        inputs: regular expression that matches the symbols of inputs.
-    """
+    """Raise SystemDefinitionError unless a constraint has coordinates, but neither velocities nor ``inputs``."""
     shown = constraint_text(term)
     if problem := unsupported_part(term.formula):
         raise SystemDefinitionError(f"in the constraint '{shown}': {problem}")

@@ -96,8 +96,7 @@ def unbounded_slope_of(
 ) -> tuple[Expr, Expr] | None:
     """Return a function u and the term of a formula whose second derivatives grow without bound where u is 0.
 
-    Args:
-        formula, moving, constants: as of :func:`jump_of`. Terms that are infinite where u is 0 are left out.
+    Arguments as of :func:`jump_of`; terms that are infinite where u is 0 are left out.
     """
     variables = set(moving)
     powers = [part for part in parts(formula) if part.is_Pow and not part.exp.is_Integer]

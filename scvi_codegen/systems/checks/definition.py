@@ -3,15 +3,24 @@
 import random
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from functools import reduce
+from typing import TypeAlias
 
+import numpy as np
 import sympy
+from numpy.typing import NDArray
 from sympy import Expr, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
 from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.systems.checks.continuity import corner_in, irregularity
-from scvi_codegen.systems.constraints import constraint_jacobian, forms_of_constraints, without_coordinate
+from scvi_codegen.systems.constraints import (
+    constraint_jacobian,
+    constraint_rates,
+    forms_of_constraints,
+    without_coordinate,
+)
 from scvi_codegen.systems.derived_expressions import (
+    DEPENDENT,
     Entries,
     dense,
     forms_of,
@@ -19,13 +28,13 @@ from scvi_codegen.systems.derived_expressions import (
     row_rank,
     sample_points,
     singular_part,
+    unit_rows,
     values_at,
 )
 from scvi_codegen.systems.forces import check_damping
 from scvi_codegen.systems.formulas.expressions import Tape, hessian, jacobian, unsupported_part
 from scvi_codegen.systems.formulas.kinks import Mode
 from scvi_codegen.systems.formulas.symbols import DOT, PARTS, TIME, check_names, number, symbol
-from scvi_codegen.systems.massless import gauge_of_rates
 from scvi_codegen.systems.system import MechanicalSystem
 
 REQUIRED = "A regular Lagrangian is required: d2L/dv2 must be invertible."
@@ -184,11 +193,7 @@ def _check_continuity(
 
 
 def checked_gauge(system: MechanicalSystem) -> Expr:
-    """Return the energy of the rates of constraints that L needs for a regular mass matrix, 0 if its own is regular.
-
-    Raises:
-        SystemDefinitionError: for an invalid or singular Lagrangian, or invalid constraints.
-    """
+    """Return the energy of the rates of constraints that L needs for a regular mass matrix, 0 if its own is regular."""
     check_definition(system, "Lagrangian", system.velocities, "a velocity")
     if system.constraints:
         _check_constraints(system)
@@ -312,3 +317,37 @@ def _dependent(system: MechanicalSystem) -> int:
             return 0
         first = max(first, next(k for k in range(count) if row_rank(matrix[: k + 1]) <= k))
     return first
+
+
+Array: TypeAlias = NDArray[np.float64]
+SHARE = 1e-6
+"""Smallest entry of a motion of length 1 by which a coordinate takes part in it, and smallest rate of a constraint that
+hinders it."""
+
+
+def gauge_of_rates(system: MechanicalSystem) -> tuple[Expr, tuple[str, ...]]:
+    """Return U of the constraints that hinder massless motions, and the coordinates that move in the others.
+
+    The sum of masses is that of the constant ones, if there are any. U is 0 without masses, and if the formulas have no
+    value at any sampled point.
+    """
+    mass, jacobian = hessian(system.lagrangian, system.velocities), constraint_jacobian(system)
+    rates = constraint_rates(system)
+    diagonal = [entry for (i, j), entry in mass.items() if i == j]
+    constant = [entry for entry in diagonal if entry.free_symbols <= set(system.parameters)]
+    m = system.dimension
+    points = sample_points(system.velocities, (*system.coordinates, system.time), system.constants)
+    for values in values_at(points, [*mass.values(), *jacobian.values()]):
+        motions = _null_space(unit_rows(dense(mass, values[: len(mass)], (m, m))))
+        hindered = unit_rows(dense(jacobian, values[len(mass) :], (len(rates), m))) @ motions
+        used = [rate for rate, row in zip(rates, hindered, strict=True) if np.abs(row).max(initial=0.0) > SHARE]
+        moving = np.abs(motions @ _null_space(hindered)).max(axis=1, initial=0.0) > SHARE
+        free = tuple(q.name for q, moves in zip(system.coordinates, moving, strict=True) if moves)
+        return sympy.Add(*(constant or diagonal)) / 2 * sympy.Add(*(rate**2 for rate in used)), free
+    return sympy.S.Zero, ()
+
+
+def _null_space(matrix: Array) -> Array:
+    """Return an orthonormal basis of the null space of a matrix whose rows have length 1 at most, as columns."""
+    _, values, right = np.linalg.svd(matrix)
+    return right[np.count_nonzero(values > DEPENDENT) :].T

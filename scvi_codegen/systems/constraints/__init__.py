@@ -14,9 +14,7 @@ from sympy import Expr, Symbol
 from sympy.core.function import AppliedUndef
 
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.systems.constraints.holonomic import HOLONOMIC
-from scvi_codegen.systems.constraints.kind import Constrained, ConstraintKind
-from scvi_codegen.systems.constraints.nonholonomic import NONHOLONOMIC
+from scvi_codegen.systems.constraints.kind import HOLONOMIC, NONHOLONOMIC, Constrained, ConstraintKind
 from scvi_codegen.systems.formulas.expressions import derivative_along, jacobian
 from scvi_codegen.systems.formulas.grammar import sides_of
 from scvi_codegen.systems.formulas.symbols import DOT, symbol
@@ -67,16 +65,7 @@ def constraint_sides(formula: Any) -> tuple[list[Any], Callable[[Sequence[Expr],
 
 
 def constraints_of(constraints: Iterable[Any] | None, read: Callable[[Any], Expr], rate: Rate) -> tuple[Expr, ...]:
-    """Return the expression of each constraint, a formula that is 0 or an equation.
-
-    Args:
-        constraints: formulas and equations.
-        read: converts a side to an expression in canonical symbols.
-        rate: returns the time derivative of such an expression.
-
-    Raises:
-        SystemDefinitionError: for a formula of numbers.
-    """
+    """Return the expressions of constraints, formulas that are 0 or equations, with sides by ``read``."""
     result = []
     for formula in constraints or ():
         sides, expression = constraint_sides(formula)

@@ -82,3 +82,15 @@ class ConstraintKind:
     velocity: Callable[[Expr], Expr] = no_condition
     function: str = ""
     expression: Callable[[Sequence[Expr], Callable[[Expr], Expr]], Expr] = difference
+
+
+HOLONOMIC = ConstraintKind(
+    form="g(q, t) = 0",
+    applies=lambda expression, velocities: not expression.free_symbols & velocities,
+    position=lambda expression: expression,
+)
+NONHOLONOMIC = ConstraintKind(
+    form="A(q, t) v + b(q, t) = 0",
+    applies=lambda expression, velocities: bool(expression.free_symbols & velocities),
+    velocity=lambda expression: expression,
+)

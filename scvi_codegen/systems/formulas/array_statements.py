@@ -270,10 +270,7 @@ def _place_text(subscript: Place) -> str:
 
 
 def array_text(expression: Expr) -> str:
-    """Return the text of a sum of sums.
-
-    Raises:
-        SystemDefinitionError: for other limits than those above.
+    """Return the text of a sum of sums; SystemDefinitionError for other limits than those above.
 
     >>> from sympy import IndexedBase, symbols
     >>> q, (i, N) = IndexedBase("q"), symbols("i N", integer=True)
@@ -365,13 +362,7 @@ def formula_of_entries(
 ) -> Expr:
     """Return a formula in index notation, which may be nonlinear in its sums, as a formula of the entries of arrays.
 
-    Args:
-        text, arrays, symbols, tables: as of :func:`~scvi_codegen.systems.formulas.arrays.parse_sums`.
-        rules: sizes, index tables and names of entries, those of velocity arrays left out; by default those of arrays
-            whose sizes are numbers.
-
-    Raises:
-        SystemDefinitionError: for anything outside the grammar, and for an index outside its array.
+    ``rules``: sizes, tables and names of entries; by default those of arrays whose sizes are numbers.
     """
     rules = rules or EntryRules(
         {}, {}, {array.name: entry_names(array, {}) for array in arrays if not array.name.endswith(DOT)}

@@ -56,20 +56,12 @@ class ArrayTerm:
 
 
 def parse_array(text: str) -> Array:
-    """Parse the declaration of an array, ``"q[N]"``.
-
-    Raises:
-        ExpressionError: for other text.
-    """
+    """Parse the declaration of an array, ``"q[N]"``; ExpressionError for other text."""
     return _Declaration(text, {}).read()
 
 
 def parse_coordinate(text: str) -> Array:
-    """Parse the declaration of an array of coordinates, ``"q[N]"``, or the name of a single coordinate, ``"x"``.
-
-    Raises:
-        ExpressionError, SystemDefinitionError: for other text.
-    """
+    """Parse the declaration of an array of coordinates, ``"q[N]"``, or the name of one, ``"x"``; or ExpressionError."""
     if "[" in text:
         return parse_array(text)
     check_name(text)

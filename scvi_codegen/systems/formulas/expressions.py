@@ -105,12 +105,7 @@ CONSTANT_VALUES = {sympy.S.Pi: mp.mpf(mp.pi), sympy.S.Exp1: mp.mpf(mp.e)}
 
 
 class Tape:
-    """Straight-line program of several expressions in the same symbols.
-
-    Args:
-        expressions: of the grammar of :mod:`~scvi_codegen.systems.formulas.grammar`.
-        symbols: all that occur in them.
-    """
+    """Straight-line program of several expressions of the grammar, in the same symbols."""
 
     def __init__(self, expressions: Sequence[sympy.Expr], symbols: Sequence[sympy.Symbol]) -> None:
         self.symbols = tuple(symbols)
@@ -122,11 +117,7 @@ class Tape:
         self._results = [self._place(expression) for expression in expressions]
 
     def __call__(self, numbers: Sequence[Number]) -> list[Number]:
-        """Return the values at a point.
-
-        Raises:
-            ArithmeticError: if a value is not real or not within the range of a C double.
-        """
+        """Return the values at a point; ArithmeticError if one is not real or not within the range of a C double."""
         values = [*numbers, *self._start[len(numbers) :]]
         try:
             for register, operation, operands in self._steps:
@@ -173,15 +164,7 @@ def _operation(expression: sympy.Expr, operands: tuple[int, ...]) -> tuple[Calla
 
 
 def evaluate(expression: sympy.Expr, values: Mapping[sympy.Symbol, Number]) -> Number:
-    """Return the value of an expression at one point, in 60 digits.
-
-    Args:
-        expression: of the grammar.
-        values: a number for each of its symbols.
-
-    Raises:
-        ArithmeticError: if the value, or that of a subexpression, is not real or exceeds the range of a C double.
-    """
+    """Return the value of an expression at a point, in 60 digits; ArithmeticError if not real, or beyond C doubles."""
     try:
         return Tape(list(parts(expression)), list(values))(list(map(mp.mpf, values.values())))[0]
     except ArithmeticError as error:

@@ -116,11 +116,7 @@ def parse_expression(text: str, symbols: Mapping[str, Symbol]) -> Expr:
 
 
 def named_tables(functions: Iterable[tuple[str, Table]], names: Container[str] = ()) -> dict[str, NamedTable]:
-    """Return functions by name, for formulas.
-
-    Raises:
-        SystemDefinitionError: for an invalid name, and for one of ``names``.
-    """
+    """Return functions by name, for formulas; SystemDefinitionError for an invalid name, and for one of ``names``."""
     tables = {}
     for name, table in functions:
         check_name(name)

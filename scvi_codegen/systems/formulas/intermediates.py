@@ -167,11 +167,7 @@ def separated(expressions: Sequence[Expr], variables: Collection[Symbol]) -> tup
 
 
 def written_out(expression: Expr) -> Expr:
-    """Return an expression without intermediate quantities, for display; tables are written by name.
-
-    Raises:
-        SystemDefinitionError: if it is too long.
-    """
+    """Return an expression without intermediate quantities, tables by name; SystemDefinitionError if it is too long."""
     size = written_size(expression)
     if size > LONGEST_WRITTEN and inner_of(expression):
         raise SystemDefinitionError(

@@ -69,9 +69,6 @@ def parse_neighbours(
             or one per component, and absent without a periodic boundary.
         arrays: coordinates.
         symbols: parameters by name.
-
-    Raises:
-        SystemDefinitionError: if a key is missing or unknown, or ``of`` is not an array of positions.
     """
     by_name, results = {array.name: array for array in arrays}, []
     for name, entry in argument.items():
@@ -111,14 +108,7 @@ NESTED = (
 def convolution_of(
     term: Expr, loop: Loop, accesses: Mapping[Symbol, Access], bounds: Mapping[str, object]
 ) -> tuple[Expr, Access] | None:
-    """Return the factor and the access of a term of the summand of a convolution; ``None`` if it is not one.
-
-    Args:
-        term: the product of a factor, c[j-i] and q[j].
-        loop: of j.
-        accesses: array entries by symbol.
-        bounds: loops of the enclosing sums by index.
-    """
+    """Return the factor and the access q[j] of a term with c[j-i] q[j] in a sum over j; ``None`` if it is another."""
     entries = {slot: access for slot, access in accesses.items() if loop.index in access.indices}
     slots = sorted(
         (slot for slot in term.free_symbols if slot in entries),

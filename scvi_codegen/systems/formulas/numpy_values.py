@@ -21,9 +21,7 @@ MAX_ELEMENTS = 5_000_000
 def array_value(expression: Expr, values: dict[Expr, Any]) -> Any:
     """Return the values of an expression, with the broadcast shape of the arrays in ``values``; NaN where undefined.
 
-    Args:
-        expression: an expression.
-        values: a number or an array for each symbol; values of subexpressions are added.
+    ``values`` has a number or an array for each symbol; values of subexpressions are added.
 
     >>> x = Symbol("x", real=True)
     >>> array_value(x**2 + 1, {x: np.arange(3.0)}).tolist()
@@ -109,14 +107,7 @@ class Elements:
         arrays: Mapping[str, NDArray[np.float64]],
         numbers: Mapping[Expr, float],
     ) -> Any:
-        """Return the values of a formula at every element.
-
-        Args:
-            formula: in the symbols of slots and numbers.
-            slots: symbol and access of each array entry.
-            arrays: arrays by name.
-            numbers: values by symbol.
-        """
+        """Return the values of a formula at every element, with arrays by name and numbers by symbol."""
         entries_by_slot: dict[Expr, Any] = {
             slot: convolved(arrays[access.array.name], access, arrays)[self.of(access)] for slot, access in slots
         }

@@ -368,12 +368,7 @@ class RotationNames:
         dissipation: Any,
         others: Iterable[tuple[str, Iterable[Expr]]] = (),
     ) -> Forces:
-        """Return the forces by name of a coordinate (one), rotation or direction (three components), and ``others``.
-
-        Raises:
-            SystemDefinitionError: for forces and torques on other names, of other numbers of components, and a
-                dissipation without velocities.
-        """
+        """Return the forces by name of a coordinate (one), rotation or direction (three components), and ``others``."""
         if not isinstance(forces or {}, Mapping):
             raise SystemDefinitionError(f"forces must be a mapping from coordinates to formulas, not {forces!r}")
         rotating = {member.name: member for member in self.rotations}
@@ -431,13 +426,7 @@ class RotationNames:
         variables: Sequence[str],
         parameters: Sequence[Symbol],
     ) -> dict[str, Any]:
-        """Return the fields of a system that are formulas, as functions of its coordinates.
-
-        Args:
-            function: ``"lagrangian"`` or ``"hamiltonian"``.
-            formula, forces, constraints: in the names of formulas.
-            variables, parameters: names of all coordinates, symbols of the parameters.
-        """
+        """Return the fields of a system that are formulas, as functions of its coordinates."""
         fields = {
             "forces": self.forces(forces, variables),
             "constraints": tuple(map(self.in_coordinates, constraints)),
@@ -497,12 +486,7 @@ class _RotatingParser(Parser):
 
 @dataclass(frozen=True, slots=True)
 class MemberArray:
-    """Array of rotations, directions or spins; a single one without axes.
-
-    Attributes:
-        member: its name and that of its rate, ``R`` and ``omega`` of ``R_33[i]`` and ``omega_1[i]``.
-        axes: sizes.
-    """
+    """Array of rotations, directions or spins, ``R_33[i]`` and ``omega_1[i]``; a single one without axes."""
 
     member: Homogeneous
     axes: tuple[Size, ...]

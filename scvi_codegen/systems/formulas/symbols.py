@@ -149,11 +149,7 @@ def input_parameters(inputs: Sequence[str]) -> dict[str, float]:
 
 
 def with_inputs(parameters: Mapping[str, float], inputs: Sequence[str]) -> dict[str, float]:
-    """Return the default values of parameters, including those of inputs.
-
-    Raises:
-        SystemDefinitionError: if a parameter has the name of an input's parameter.
-    """
+    """Return the default values of parameters and inputs; SystemDefinitionError if two have the same name."""
     parts = input_parameters(inputs)
     for name in parameters:
         if name in parts:

@@ -75,11 +75,7 @@ def _numbers(values: Any) -> NDArray[np.float64]:
 
 
 def tables_of(functions: Mapping[str, Table | Mapping[str, Any]] | None) -> dict[str, dict[str, Any]]:
-    """Return functions as tables of their arguments, as of ``[functions.F]`` in model files.
-
-    Raises:
-        SystemDefinitionError: naming the function, if its points are invalid.
-    """
+    """Return functions as tables, as ``[functions.F]`` of model files; SystemDefinitionError for invalid points."""
     plain = {}
     for name, function in (functions or {}).items():
         try:

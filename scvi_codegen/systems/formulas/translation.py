@@ -19,11 +19,7 @@ from scvi_codegen.systems.formulas.tables import Tabulated
 
 
 def sympy_expression(value: Any, role: str) -> Expr:
-    """Return a SymPy expression; numbers are converted.
-
-    Raises:
-        SystemDefinitionError: for anything else; text would be read with SymPy's names, where E is 2.718..
-    """
+    """Return a SymPy expression, also of a number; SystemDefinitionError for text, where SymPy's E is 2.718.."""
     try:
         expression = sympy.sympify(value, strict=True)
     except sympy.SympifyError:
@@ -159,9 +155,7 @@ def format_expression(expression: Expr) -> str:
     """Return an expression as text of the grammar, from which ``parse_expression`` rebuilds it node by node.
 
     The expression is taken as SymPy's constructors leave it; one built with ``evaluate=False`` comes back evaluated.
-
-    Raises:
-        SystemDefinitionError: for an expression outside the grammar.
+    SystemDefinitionError for an expression outside the grammar.
 
     >>> import sympy
     >>> x, y = sympy.symbols("x y", real=True)

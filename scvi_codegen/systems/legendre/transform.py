@@ -56,11 +56,7 @@ def legendre_dual(system: MechanicalSystem, variables: Sequence[Symbol], duals: 
 
 
 def energy_of_states(system: MechanicalSystem) -> Expr:
-    """Return the energy as a function of coordinates and ``momentum_symbols``.
-
-    Raises:
-        SystemDefinitionError: if velocities at given momenta have no formula.
-    """
+    """Return the energy as a function of coordinates and ``momentum_symbols``."""
     forms, momenta = forms_of(system), system.momentum_symbols
     if system.auxiliaries:
         return forms.energy

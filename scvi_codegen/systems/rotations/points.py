@@ -40,9 +40,6 @@ def forces_at_points(
         coordinates: names of the ordinary coordinates.
         members: rotations, directions and spins.
         read: converts a formula to an expression.
-
-    Raises:
-        SystemDefinitionError: for other keys, bodies or frames, other numbers of formulas, and moving points.
     """
     rotations = {member.name: member for member in members if isinstance(member, Rotation)}
     for k, entry in enumerate(entries):
@@ -107,9 +104,6 @@ def rotations_of_frames(rotations: Mapping[Any, Any] | None) -> tuple[dict[str, 
     Args:
         rotations: rate by name, or for a frame with ``B.orient_quaternion(N, ..)`` the frame N by the frame B. The
             rotation is then called as the frame, and its rate ``omega``, or ``omega_B`` if there are several frames.
-
-    Raises:
-        SystemDefinitionError: if a frame is not oriented by a quaternion of four functions of time.
     """
     names: dict[str, str] = {}
     rules: dict[Expr, Expr] = {}

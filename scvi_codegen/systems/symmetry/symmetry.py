@@ -189,11 +189,7 @@ def symmetries(system: MechanicalSystem) -> tuple[Symmetry, ...] | tuple[ArrayMa
 
 
 def all_symmetries(system: MechanicalSystem, additional: Sequence[Symmetry]) -> tuple[Symmetry, ...]:
-    """Return the detected symmetries followed by those of the user.
-
-    Raises:
-        SystemDefinitionError: if one of ``additional`` belongs to another system, or two have the same name.
-    """
+    """Return detected symmetries and those of the user; SystemDefinitionError for another system, and equal names."""
     result = (*symmetries(system), *additional)
     variables = (system.coordinates, system.momentum_symbols)
     for symmetry in additional:

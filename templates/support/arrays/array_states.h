@@ -37,14 +37,12 @@ static int legendre_transform(double t, const double *q, const double *x, const 
 #endif
 }
 
-int NAME(velocity)(double t, const double *q, const double *p, const double *parameters, double *v,
-    double *workspace)
+int NAME(velocity)(double t, const double *q, const double *p, const double *parameters, double *v, double *workspace)
 {
   return legendre_transform(t, q, p, parameters, v, 0, workspace);
 }
 
-int NAME(momentum)(double t, const double *q, const double *v, const double *parameters, double *p,
-    double *workspace)
+int NAME(momentum)(double t, const double *q, const double *v, const double *parameters, double *p, double *workspace)
 {
   return legendre_transform(t, q, v, parameters, p, 1, workspace);
 }

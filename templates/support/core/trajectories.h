@@ -30,29 +30,9 @@ static inline lanes lanes_of_number(number x)
   return x;
 }
 
-static inline number magnitude(number x)
-{
-  lane_view view = {x};
-  for (int j = 0; j < LANES; j++)
-    view.lane[j] = fabs(view.lane[j]);
-  return view.all;
-}
-
-static inline number exponential(number x)
-{
-  lane_view view = {x};
-  for (int j = 0; j < LANES; j++)
-    view.lane[j] = exp(view.lane[j]);
-  return view.all;
-}
-
-static inline number exponential_less_1(number x)
-{
-  lane_view view = {x};
-  for (int j = 0; j < LANES; j++)
-    view.lane[j] = expm1(view.lane[j]);
-  return view.all;
-}
+LANE_BY_LANE(magnitude, fabs);
+LANE_BY_LANE(exponential, exp);
+LANE_BY_LANE(exponential_less_1, expm1);
 
 /* Maximum of x_first .. x_(end - 1). */
 static inline number largest_between(const number *x, int first, int end)

@@ -116,8 +116,7 @@ static linearised_step linearised_in(const step_data *step, real *workspace)
 }
 
 /* Solves the step as the fallback does, factorises its equations and evaluates the derivatives at the points. */
-static int linearise_step(linearised_step *at, const solver_options *options, real *q1, real *p1,
-    solver_report *report)
+static int linearise_step(linearised_step *at, const solver_options *options, real *q1, real *p1, solver_report *report)
 {
 #ifdef FIRST_ORDER_SYSTEM
   const int known = transform(at->step->t, at->step->q0, at->step->p0, at->step->parameters, at->momenta.theta,

@@ -196,9 +196,8 @@ static int hessian_of_vectors(const linearised_step *at, int count, const real *
 }
 
 int NAME(second_order)(long long steps, const real *t, const real *h, const real *q, const real *p,
-    const real *parameters,
-    const solver_options *options, int count, const real *changes, real *vectors, solver_report *report,
-    real *workspace)
+    const real *parameters, const solver_options *options, int count, const real *changes, real *vectors,
+    solver_report *report, real *workspace)
 {
   const solver_options standard = NAME(default_options)();
   const real carry[M] = {0};

@@ -175,8 +175,7 @@ static dd duration_of_velocity_pairs(const velocity_pairs *at)
 
 /* Replaces the increments of a step that the iteration solved in double by those in two words. On failure they are
  * undefined. */
-static int refine_velocities(const step_data *step, double t_low, double h_low, double *dq, double *dp,
-    double *passed)
+static int refine_velocities(const step_data *step, double t_low, double h_low, double *dq, double *dp, double *passed)
 {
   velocity_pairs at;
   lanes f[GROUPS][2 * M];

@@ -2,37 +2,16 @@
 #include "words.h"
 
 /* Operations on single words, lane by lane. */
-#define LANE_OPERATION(f)                  \
-  static inline lanes ddl_##f(lanes x)     \
-  {                                        \
-    lane_view view = {x};                  \
-    for (int j = 0; j < LANES; j++)        \
-      view.lane[j] = dd_##f(view.lane[j]); \
-    return view.all;                       \
-  }                                        \
-  static inline lanes ddl_##f(lanes x)
-
-LANE_OPERATION(root);
-LANE_OPERATION(log_of);
-LANE_OPERATION(asinh_of);
-LANE_OPERATION(sign);
-LANE_OPERATION(is_small);
-LANE_OPERATION(angle);
-LANE_OPERATION(power_of_2);
-
-#define LANE_OPERATION_OF_TWO(f)                          \
-  static inline lanes ddl_##f(lanes x, lanes y)           \
-  {                                                       \
-    lane_view view = {x}, other = {y};                    \
-    for (int j = 0; j < LANES; j++)                       \
-      view.lane[j] = dd_##f(view.lane[j], other.lane[j]); \
-    return view.all;                                      \
-  }                                                       \
-  static inline lanes ddl_##f(lanes x, lanes y)
-
-LANE_OPERATION_OF_TWO(atan2_of);
-LANE_OPERATION_OF_TWO(are_equal);
-LANE_OPERATION_OF_TWO(whole);
+LANE_BY_LANE(ddl_root, dd_root);
+LANE_BY_LANE(ddl_log_of, dd_log_of);
+LANE_BY_LANE(ddl_asinh_of, dd_asinh_of);
+LANE_BY_LANE(ddl_sign, dd_sign);
+LANE_BY_LANE(ddl_is_small, dd_is_small);
+LANE_BY_LANE(ddl_angle, dd_angle);
+LANE_BY_LANE(ddl_power_of_2, dd_power_of_2);
+LANE_BY_LANE_OF_TWO(ddl_atan2_of, dd_atan2_of);
+LANE_BY_LANE_OF_TWO(ddl_are_equal, dd_are_equal);
+LANE_BY_LANE_OF_TWO(ddl_whole, dd_whole);
 
 static inline lanes ddl_select(lanes chosen, lanes a, lanes b)
 {

@@ -55,8 +55,7 @@ ABSENT(GetAdjointDerivative, const fmi3ValueReference *unknowns, size_t unknown,
     size_t known, const double *seed, size_t seeds, double *sensitivity, size_t size)
 ABSENT(GetOutputDerivatives, const fmi3ValueReference *references, size_t count, const fmi3Int32 *orders,
     fmi3Float64 *values, size_t size)
-ABSENT(GetIntervalDecimal, const fmi3ValueReference *references, size_t count, fmi3Float64 *intervals,
-    int *qualifiers)
+ABSENT(GetIntervalDecimal, const fmi3ValueReference *references, size_t count, fmi3Float64 *intervals, int *qualifiers)
 ABSENT(GetIntervalFraction, const fmi3ValueReference *references, size_t count, fmi3UInt64 *counters,
     fmi3UInt64 *resolutions, int *qualifiers)
 ABSENT(GetShiftDecimal, const fmi3ValueReference *references, size_t count, fmi3Float64 *shifts)

@@ -68,8 +68,7 @@ static inline double correct_start(const step_data *step, const iteration_data *
 
 /* p1 - p0, with p1 the momentum at the end of a curve with the increment dq; NaN if it is undefined. */
 static void momentum_increment(const step_data *step, const iteration_data *data, const curve_data *curve,
-    const double *dq,
-    double *dp)
+    const double *dq, double *dp)
 {
   double u[2 * M];
   (void)data;
@@ -91,8 +90,7 @@ static void momentum_increment(const step_data *step, const iteration_data *data
 /* Computes the increments of one step. Each iteration corrects the accelerations at the nodes and, where it is unknown,
  * the initial velocity. On failure the increments are undefined. */
 HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, double *dq,
-    double *dp,
-    const solver_options *options, solver_report *report)
+    double *dp, const solver_options *options, solver_report *report)
 {
   curve_data curve;
   lanes u[2 * M], force[M], mass[MASS];

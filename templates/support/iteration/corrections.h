@@ -67,8 +67,7 @@ static inline void correct(const iteration_data *data, lanes (*value)[VALUES], l
 
 /* Forces at the converged velocities z, linearised at the last correction r, which is small. */
 static inline void converged_forces(const step_data *step, const iteration_data *data, lanes (*value)[VALUES],
-    lanes (*z)[M],
-    lanes (*r)[M], lanes (*F)[M])
+    lanes (*z)[M], lanes (*r)[M], lanes (*F)[M])
 {
   lanes momentum[GROUPS][M];
   (void)step, (void)z;
@@ -92,8 +91,7 @@ static inline void correct(const iteration_data *data, lanes (*value)[VALUES], l
 
 /* Forces at the converged velocities z, after the last correction r. */
 static inline void converged_forces(const step_data *step, const iteration_data *data, lanes (*value)[VALUES],
-    lanes (*z)[M],
-    lanes (*r)[M], lanes (*F)[M])
+    lanes (*z)[M], lanes (*r)[M], lanes (*F)[M])
 {
   lanes u[2 * M], scaled[GROUPS][M];
   (void)value, (void)r;

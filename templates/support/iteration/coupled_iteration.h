@@ -45,8 +45,7 @@ static __attribute__((noinline)) void keep_early(const step_data *step, const it
  * converge; the increments follow from the forces at the converged points. The velocities are stored for the predictor.
  * On failure the increments are undefined. */
 HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, number *dq,
-    number *dp,
-    const solver_options *options, solver_report *report)
+    number *dp, const solver_options *options, solver_report *report)
 {
   coordinates own[GROUPS], *z = kept(past, own);
   lanes u[2 * M], value[GROUPS][VALUES], scaled[GROUPS][M], impulse[GROUPS][M], r[GROUPS][M], mass[GROUPS][MASS];

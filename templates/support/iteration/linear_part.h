@@ -21,8 +21,7 @@ static inline int places_before(int i)
   return i < LINEAR_BAND ? i : LINEAR_BAND;
 }
 
-static void factorise_linear_part(const double *parameters, double square, const double *inverse_mass,
-    linear_part *all)
+static void factorise_linear_part(const double *parameters, double square, const double *inverse_mass, linear_part *all)
 {
   const complex_shifts mu = {shifts_at(MU), shifts_at(MU + SHIFTS)};
   double sum[M] = {0.0}, fastest = 0.0;

@@ -60,8 +60,7 @@ static inline double action_of_curve(const step_data *step, const iteration_data
 /* Computes the increments of one step: accelerations, momentum, initial velocity and multipliers m are corrected in
  * turn until all converge. On failure the increments are undefined. */
 HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, double *dq,
-    double *dp,
-    const solver_options *options, solver_report *report)
+    double *dp, const solver_options *options, solver_report *report)
 {
   curve_data curve;
   lanes m[M], node[3 * M], action[2 * M], mass[MASS];

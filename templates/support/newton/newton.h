@@ -110,8 +110,7 @@ static int has_converged(const solver_options *options, const movement *moved, i
 }
 
 /* Replaces the row of p1 - p0 by q0 + h sum_b beta_b z_b = q1, with p0 as a further unknown. */
-static void add_boundary(const step_data *step, newton_data *data, const real *q1, int with_jacobian,
-    const band *shape)
+static void add_boundary(const step_data *step, newton_data *data, const real *q1, int with_jacobian, const band *shape)
 {
   for (int i = 0; i < M; i++) {
     real *row = data->rows + i * (B + 1) + B;

@@ -9,21 +9,8 @@ typedef struct {
   lanes triangle[TANGENTS][TANGENTS];
 } tangent_growth;
 
-static inline lanes root_of(lanes x)
-{
-  lane_view view = {x};
-  for (int j = 0; j < LANES; j++)
-    view.lane[j] = sqrt(view.lane[j]);
-  return view.all;
-}
-
-static inline lanes logarithm_of(lanes x)
-{
-  lane_view view = {x};
-  for (int j = 0; j < LANES; j++)
-    view.lane[j] = log(view.lane[j]);
-  return view.all;
-}
+LANE_BY_LANE(root_of, sqrt);
+LANE_BY_LANE(logarithm_of, log);
 
 /* 1 / length - 1, or 0 for a vector of length 0. */
 static inline lanes normalising(lanes length)

@@ -10,9 +10,10 @@ uses a second library, compiled when the iteration first fails; an exported sour
 library is set once, for all steppers of a source: one generator makes one Newton solver for the same iteration.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Literal, TypeAlias
+from dataclasses import dataclass, field, replace
+from typing import Literal, NamedTuple, TypeAlias
 
 from scvi_codegen.codegen.ir.equations import (
     AdaptivePredictor,
@@ -23,7 +24,16 @@ from scvi_codegen.codegen.ir.equations import (
     Splitting,
     StoredValues,
 )
-from scvi_codegen.codegen.ir.kernel import Kernel, Number, NumberTable
+from scvi_codegen.codegen.ir.kernel import (
+    Constant,
+    Expression,
+    Kernel,
+    Load,
+    Number,
+    NumberTable,
+    Operation,
+    subexpressions,
+)
 from scvi_codegen.codegen.rendering.kernels.printer import (
     DOUBLE,
     INVERSE_ROOT,
@@ -33,8 +43,94 @@ from scvi_codegen.codegen.rendering.kernels.printer import (
     print_number,
     scalar_functions,
 )
-from scvi_codegen.codegen.rendering.kernels.roots import with_factors_in_roots
 from scvi_codegen.codegen.rendering.text import table
+
+MOST_ROOTS, MOST_PRODUCTS = 1, 3
+"""Largest numbers of roots in a kernel, and of products with them."""
+
+
+class _Product(NamedTuple):
+    """Root of the argument times a factor."""
+
+    root: str
+    argument: Expression
+    factor: Expression | None
+
+
+def with_factors_in_roots(kernel: Kernel) -> Kernel:
+    """Return the kernel with products of a root as ``inverse_root_k_times(x, factor)``, if they are few."""
+    rewritten = _Rewriting(kernel).kernel()
+    roots = _roots(kernel)
+    products = Counter(root.operator.endswith(TIMES) for root in _roots(rewritten))
+    few = 0 < len(roots) <= MOST_ROOTS and not products[False] and products[True] <= MOST_PRODUCTS
+    return rewritten if few and not kernel.sums else kernel
+
+
+def _roots(kernel: Kernel) -> list[Operation]:
+    """Return the inverse roots of a kernel, with or without a factor."""
+    operations = (x for x in subexpressions(*kernel.temporaries, *kernel.results) if isinstance(x, Operation))
+    return [operation for operation in operations if operation.operator.startswith(INVERSE_ROOT)]
+
+
+class _Rewriting:
+    """Kernel whose temporaries that are products with a root are parts of the products that use them."""
+
+    def __init__(self, kernel: Kernel) -> None:
+        self.original = kernel
+        self.temporaries: list[Expression] = []
+        self.loads: dict[int, Expression] = {}
+        self.products: dict[int, _Product] = {}
+
+    def kernel(self) -> Kernel:
+        for k, expression in enumerate(self.original.temporaries):
+            product = self.product(expression)
+            if product is None:
+                self.loads[k] = self.temporary(self.rewritten(expression))
+            else:
+                self.products[k] = product
+        results = tuple(map(self.rewritten, self.original.results))
+        return replace(self.original, temporaries=tuple(self.temporaries), results=results)
+
+    def temporary(self, expression: Expression) -> Expression:
+        """Return a load of a new temporary."""
+        self.temporaries.append(expression)
+        return Load("w", len(self.temporaries) - 1)
+
+    def product(self, expression: Expression) -> _Product | None:
+        """Return an expression as a product with exactly one root, ``None`` if it is none."""
+        if isinstance(expression, Load):
+            return self.products.get(expression.index) if expression.source == "w" else None
+        if not isinstance(expression, Operation):
+            return None
+        if expression.operator.startswith(INVERSE_ROOT):
+            argument = self.rewritten(expression.operands[0])
+            return _Product(
+                expression.operator, argument if isinstance(argument, Load) else self.temporary(argument), None
+            )
+        if expression.operator not in ("neg", "*"):
+            return None
+        products = [(operand, self.product(operand)) for operand in expression.operands]
+        with_root = [product for _, product in products if product is not None]
+        if len(with_root) != 1:
+            return None
+        product, factor = with_root[0], with_root[0].factor
+        if expression.operator == "neg":  # -(r f) = r (-f)
+            return product._replace(factor=Operation("neg", (factor or Constant(1),)))
+        other = next(self.rewritten(operand) for operand, within in products if within is None)
+        # (r f) g = r (f g)
+        return product._replace(factor=Operation("*", (factor, other)) if factor else other)
+
+    def rewritten(self, expression: Expression) -> Expression:
+        product = self.product(expression)
+        if product is not None:
+            root, argument, factor = product
+            return Operation(f"{root}{TIMES}", (argument, factor)) if factor else Operation(root, (argument,))
+        if isinstance(expression, Load):
+            return self.loads[expression.index] if expression.source == "w" else expression
+        if isinstance(expression, Operation):
+            return replace(expression, operands=tuple(map(self.rewritten, expression.operands)))
+        return expression
+
 
 Fallback: TypeAlias = Literal["own", "external", "provided", "none"]
 """Fallback of a source: its own, that of another library (``external``), one for others (``provided``), or none."""
@@ -124,11 +220,7 @@ def iteration_source(
 ) -> IterationSource:
     """Return the template data of a fixed-point iteration.
 
-    Args:
-        fixed_point: the iteration.
-        meaning: of a lane.
-        kernels: those applied to vectors, if they are not the iteration's own.
-        changes: whether it also propagates tangent and adjoint vectors.
+    ``kernels``: those applied to vectors, if not its own; ``changes``: tangent and adjoint vectors are propagated, too.
     """
     kernels = tuple(fixed_point.kernels if kernels is None else kernels)
     if meaning.are_points:

@@ -236,16 +236,7 @@ def _place(group: StageGroup) -> str:
 
 
 def derivation_html(system: MechanicalSystem, method: Method, *, events: Sequence[Event] = ()) -> str:
-    """Return the derivation of ``method`` for ``system`` as a self-contained page of HTML.
-
-    Args:
-        system: the mechanical system.
-        method: its discretisation.
-        events: of runs, which may change the state.
-
-    Raises:
-        MethodError: for a system that the method does not support.
-    """
+    """Return the derivation of ``method`` for ``system``, with ``events`` of runs, as a self-contained page of HTML."""
     system = in_all_modes(system)
     check_regular(method, system)
     more = [Section(name="events", title="Events", contents=(Listing(events_text(events, system)),))] if events else []

@@ -39,12 +39,7 @@ MOST = 10**8
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EnsembleStates:
-    """Initial values of k trajectories from a file.
-
-    Attributes:
-        columns: (k,) values by name; exact numbers where states have two words.
-        model: provides all other values.
-    """
+    """Initial values of k trajectories from a file, exact numbers in two words; the model has all others."""
 
     columns: Mapping[str, Array]
     model: Model
@@ -64,11 +59,7 @@ class EnsembleStates:
         return self._table(_names_of(self.model)[0], self.model.q)
 
     def momenta(self, stepper: Stepper) -> Array:
-        """Return (k, m) momenta: those of the file, or Legendre transforms of its velocities; others from the model.
-
-        Raises:
-            StateError: if a velocity has no momentum.
-        """
+        """Return (k, m) momenta: those of the file, or Legendre transforms of its velocities; others from the model."""
         model = self.model
         _, velocities, momenta = _names_of(model)
         moving = not self.columns.keys().isdisjoint(velocities)
@@ -107,11 +98,7 @@ def _names_of(model: Model) -> tuple[list[str], list[str], list[str]]:
 
 
 def load_ensemble(path: str | os.PathLike[str], model: Model) -> EnsembleStates:
-    """Read a grid (``.toml``) or a table (``.csv``).
-
-    Raises:
-        ModelFileError: beginning with the path and naming the name or line at fault.
-    """
+    """Read a grid (``.toml``) or a table (``.csv``); ModelFileError names the path and the line at fault."""
     number = ExactNumber if model.in_double_double else float
     readers: dict[str, Callable[[str, Check], dict[str, Array]]]
     readers = {

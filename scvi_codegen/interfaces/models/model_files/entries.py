@@ -51,11 +51,7 @@ class Entry(NamedTuple):
 
 
 def read_entry(section: Section, folder: str | os.PathLike[str]) -> Entry | None:
-    """Return the system that a section ``[system]`` names, if it names one.
-
-    Raises:
-        ModelFileError: for other keys than those of the entry, an unknown name and a file that is no robot.
-    """
+    """Return the system that a section ``[system]`` names, if it names one; ModelFileError for other keys and names."""
     if "catalogue" in section:
         check_keys(section, ("catalogue", "time_transformation"), "key", "[system] beside catalogue")
         entry = in_section("[system]", lambda: problem(text_of(section, "catalogue", "[system]")))

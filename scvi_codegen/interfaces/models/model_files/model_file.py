@@ -124,13 +124,7 @@ def catalogue_model(name: str, changes: Document | None = None) -> Model:
 
 
 def parse_model(text: str, changes: Document | None = None, *, folder: str | os.PathLike[str] = ".") -> Model:
-    """Return the model of TOML text; see the module's docstring. Raises as :func:`load_model`.
-
-    Args:
-        text: of the file.
-        changes: sections merged over it.
-        folder: base of relative paths.
-    """
+    """Return the model of TOML text, sections ``changes`` merged over it; raises as :func:`load_model`."""
     document = read_toml(text)
     if DOUBLE_DOUBLE in (_precision(document), _precision(changes or {})):
         document = read_toml(text, ExactNumber)

@@ -62,11 +62,7 @@ class ArrayValue(NamedTuple):
 def read_values(
     document: Document, system: MechanicalSystem, folder: str | os.PathLike[str]
 ) -> tuple[MechanicalSystem, dict[str, Any]]:
-    """Return the system with the values of its parameters, and the fields of a model for state, arrays and tables.
-
-    Raises:
-        ModelFileError: naming the key at fault.
-    """
+    """Return the system with the values of its parameters, and the fields of a model for state, arrays and tables."""
     section = document["initial"]
     check_one(section, "initial", "p", "q_dot")
     time = {"t": float(real(section.get("t", 0.0), "[initial] t"))}
@@ -250,19 +246,7 @@ def read_array(
     sizes: Mapping[str, int],
     parameters: Mapping[str, float],
 ) -> Numbers:
-    """Return the array defined by a value of a model file.
-
-    Args:
-        array: its declaration.
-        value: of the file.
-        where: beginning of error messages.
-        folder: base of relative paths.
-        sizes: known sizes, for numbers and formulas.
-        parameters: numbers that formulas may use.
-
-    Raises:
-        ModelFileError: naming the key, the file and the line at fault.
-    """
+    """Return an array from its value in a model file: numbers, a formula or a file; ``where`` begins messages."""
     if isinstance(value, dict):
         return _from_file(array, value, where, Path(folder))
     if not is_filled(value):

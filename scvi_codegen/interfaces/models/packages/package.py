@@ -131,11 +131,7 @@ def read_record(folder: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def source_in(folder: Path, prefix: str) -> Source:
-    """Return the C code in a generated folder.
-
-    Raises:
-        PackageError: if the folder lacks a file or was written by another version.
-    """
+    """Return the C code in a generated folder; PackageError if it is incomplete or of another version."""
     if not PREFIX.fullmatch(prefix):
         raise damaged(folder, ValueError(f"{prefix!r} is not a prefix of C names"))
     try:
