@@ -55,6 +55,7 @@ def test_periods_of_a_pendulum_are_elliptic_integrals(pendulum):
     assert longer[-1].period == pytest.approx(4 * ellipk((longer[-1].energy + 1) / 2), rel=1e-11)
 
 
+@pytest.mark.second
 def test_family_along_a_parameter_at_fixed_energy(pendulum):
     """The period of q'' = -g sin q with the energy E is 4 K((E + g)/(2 g))/sqrt(g)."""
     orbit = sc.periodic_orbit(pendulum, [0.5], [0.0], period=6.3)
