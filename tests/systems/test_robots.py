@@ -157,7 +157,7 @@ MUJOCO_CHANGES = {
     "class": ('childclass="limb"', 'childclass="lim"', "of the class 'lim'"),
     "orientations": ('quat="1 0.1 0.2 0.3"', 'quat="1 0 0 0" euler="0 0 0"', "quat and euler"),
     "free inside": ('type="ball"', 'type="free"', "inside another body"),
-    "replicate": ("</worldbody>", "<replicate/></worldbody>", "write out what it makes"),
+    "composite": ("</worldbody>", "<composite/></worldbody>", "write out what it makes"),
     "axes": ('eulerseq="zyx"', 'eulerseq="zy"', "is not three of the letters"),
     "name": ('name="slip"', 'name="flex"', "<joint> 'flex' is the second joint of this name"),
     "include": ("<option", '<include file="none.xml"/><option', "none.xml cannot be read"),

@@ -9,7 +9,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NamedTuple, NoReturn
 from xml.etree import ElementTree
 from xml.parsers import expat
 
@@ -28,8 +28,13 @@ NAMED = 5
 """Number of names that a warning lists of each kind of parts."""
 
 
-Place = tuple[str, int, str]
-"""Path of a document, number of a line, and for messages the nearest element around it that has a name."""
+class Place(NamedTuple):
+    """Path of a document, number of a line, the nearest element around it that has a name, and ``<compiler>``."""
+
+    file: str
+    line: int
+    around: str
+    settings: Any = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +52,13 @@ class Element:
     @property
     def file(self) -> str:
         """Path of the document."""
-        return self.places[self.node][0]
+        return self.places[self.node].file
+
+    @property
+    def settings(self) -> Element:
+        """Settings of the compiler of the document."""
+        settings: Element = self.places[self.node].settings
+        return settings
 
     @property
     def name(self) -> str:
@@ -117,7 +128,7 @@ class Element:
 
     def refuse(self, problem: str) -> NoReturn:
         """Raise an error that names the file, the line and the element."""
-        file, line, around = self.places[self.node]
+        file, line, around, _ = self.places[self.node]
         inside = f" in {around}" if around and not self.node.get("name") else ""
         raise SystemDefinitionError(f"{file}:{line}: <{self.tag}> '{self.name}'{inside} {problem}")
 
@@ -227,7 +238,7 @@ def _parsed(data: bytes, file: str) -> tuple[ElementTree.Element, dict[ElementTr
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         node = builder.start(tag, attributes)
-        places[node] = file, parser.CurrentLineNumber, around[-1]
+        places[node] = Place(file, parser.CurrentLineNumber, around[-1])
         around.append(f"<{tag}> '{attributes['name']}'" if attributes.get("name") else around[-1])
 
     def end(tag: str) -> None:

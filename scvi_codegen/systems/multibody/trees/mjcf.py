@@ -20,6 +20,7 @@ from scvi_codegen.common.errors import closest
 from scvi_codegen.systems.formulas.rotations import matrix_of
 from scvi_codegen.systems.multibody.trees.closures import Closure, Coupling, at_reference
 from scvi_codegen.systems.multibody.trees.document import Element, Unread, root_of
+from scvi_codegen.systems.multibody.trees.macros import Macros
 from scvi_codegen.systems.multibody.trees.schema import MJCF, TURN
 from scvi_codegen.systems.multibody.trees.tendons import Tendon
 from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about, named
@@ -67,6 +68,7 @@ length along z, of a capsule without its caps."""
 
 WEIGHTLESS = ("plane", "hfield")
 ORIENTATIONS = TURN.split()
+OUTSIDE = f"outside the folder of the main document: copy it there, or name its folder ({FOLDERS})"
 AXES = dict(zip("xyz", np.eye(3), strict=True))
 Defaults = dict[str, dict[str, str]]
 """Attributes by kind of element."""
@@ -83,13 +85,36 @@ def links_of_mjcf(
         SystemDefinitionError: naming file and element, if something is malformed or unknown, or changes the motion and
             is not read.
     """
-    root = root_of(Path(path), "mujoco")
-    _include(root)
-    _apply_defaults(root)
+    root = _document(Path(path))
     model = _MujocoModel(root, limits)
     closures, tendons = [*model.closures()], [*model.tendons()]
     model.unread.warn(root.file)
     return root.node.get("model") or Path(path).stem, model.scaled(), model.gravity, closures, tendons
+
+
+def _document(path: Path, around: tuple[Path, ...] = ()) -> Element:
+    """Return a document with the contents of others, explicit attributes, and without macros.
+
+    Args:
+        path: the file.
+        around: files of the documents that it is part of.
+    """
+    root = root_of(path, "mujoco")
+    _include(root)
+    settings = _merged(root, "compiler", root.children("compiler"))
+    root.places.update({node: root.places[node]._replace(settings=settings) for node in root.node.iter()})
+    _apply_defaults(root)
+
+    def part(model: Element) -> Element:
+        file = path.parent / model.text("file")
+        if not is_inside(path.parent, file):
+            model.refuse(f"names '{model.text('file')}' {OUTSIDE}")
+        if file.resolve() in (inner := (*around, path.resolve())):
+            model.refuse(f"names '{model.text('file')}', which contains this document")
+        return _document(file, inner)
+
+    Macros(root, part, _MujocoModel.pose)
+    return root
 
 
 class _MujocoModel:
@@ -97,17 +122,15 @@ class _MujocoModel:
 
     def __init__(self, root: Element, limits: bool) -> None:
         self.root, self.unread, self.limits = root, Unread(), limits
-        self.settings, option, flags = (
+        option, flags = (
             _merged(root, tag, parts)
             for tag, parts in (
-                ("compiler", root.children("compiler")),
                 ("option", root.children("option")),
                 ("flag", [flag for element in root.children("option") for flag in element.children("flag")]),
             )
         )
         self.disabled = {key for key in flags.node.attrib if flags.choice(key, "enable", "disable") == "disable"}
         self.gravity = option.vector("gravity", (0, 0, -9.81)) * ("gravity" not in self.disabled)
-        self.turn = np.pi / 180 if self.settings.choice("angle", "degree", "radian") == "degree" else 1.0
         self.links: list[Link] = []
         self.compensating: list[Element] = []
         self.labels = set[str | None]()
@@ -199,7 +222,7 @@ class _MujocoModel:
         if body.choice("mocap", "false", "true") == "true":
             self.unread.add("motion of mocap bodies", name)
         carried = Joint(name=name, kind="fixed", pose=pose @ Pose(-anchor))
-        fixed = self.carriers[place] < 0 and not self.settings.has("settotalmass")  # to the world
+        fixed = self.carriers[place] < 0 and not self.root.settings.has("settotalmass")  # to the world
         lift = body.number("gravcomp", 0) * (not {"spring", "damper"} <= self.disabled)
         inertia = Inertia() if fixed else self.inertia(body)
         lifted = lift * inertia.mass, lift * inertia.mass * inertia.center
@@ -259,7 +282,7 @@ class _MujocoModel:
         """Return the range and the dry friction of a joint or tendon, in the units of the file, that are in force."""
         limited = element.choice("limited", "auto", "true", "false")
         low, high = element.vector("range", (0, 0), (2,))
-        if limited == "auto" and low < high and self.settings.choice("autolimits", "true", "false") == "true":
+        if limited == "auto" and low < high and element.settings.choice("autolimits", "true", "false") == "true":
             limited = "true"
         limits = (low, high) if limited == "true" and not self.disabled & {"limit", "constraint"} else None
         friction = element.number("frictionloss", 0, 0) * (not self.disabled & {"frictionloss", "constraint"})
@@ -340,7 +363,7 @@ class _MujocoModel:
         kind = "free" if bare else joint.choice("type", "hinge", "slide", "ball", "free")
         if kind == "free" and parent >= 0:
             joint.refuse("is free, but its body is inside another body")
-        turn = self.turn if kind == "hinge" else 1.0
+        turn = _unit(joint) if kind == "hinge" else 1.0
         rest, zero = (joint.number(key, 0) for key in ("springref", "ref"))
         if joint.choice("actuatorgravcomp", "false", "true") == "true":
             self.compensating.append(joint)
@@ -369,14 +392,14 @@ class _MujocoModel:
 
     def inertia(self, body: Element) -> Inertia:
         """Return the inertia of a body, by its inertial or, as ``inertiafromgeom`` says, by its geoms."""
-        rule = self.settings.choice("inertiafromgeom", "auto", "true", "false")
+        rule = body.settings.choice("inertiafromgeom", "auto", "true", "false")
         inertials = [*self.contents(body, "inertial")]
         if len(inertials) > 1:
             inertials[1][0].refuse("is the second of its body: one is allowed")
         if rule == "false" or (rule == "auto" and inertials):
             return self.inertial(inertials[0][0]).seen_from(inertials[0][1]) if inertials else Inertia()
         total = Inertia()
-        low, high = self.settings.vector("inertiagrouprange", (0, 5), (2,))
+        low, high = body.settings.vector("inertiagrouprange", (0, 5), (2,))
         for geom, frame in self.contents(body, "geom"):
             if low <= geom.number("group", 0) <= high:
                 total += self.geom(geom).seen_from(frame)
@@ -417,10 +440,11 @@ class _MujocoModel:
         mass = density * volume if np.isnan(mass) else mass
         return Inertia(mass, matrix=mass * np.diag(moments)).seen_from(self.pose(geom))
 
-    def pose(self, element: Element) -> Pose:
+    @staticmethod
+    def pose(element: Element) -> Pose:
         """Return the pose of an element in its parent, by position and orientation or by ``fromto``."""
         if not element.has("fromto"):
-            return Pose(element.vector("pos", (0, 0, 0)), self.orientation(element))
+            return Pose(element.vector("pos", (0, 0, 0)), _orientation(element))
         if element.vector("pos", (0, 0, 0)).any():
             element.refuse("has pos and fromto: one is needed")
         ends = element.vector("fromto", sizes=(6,))
@@ -430,45 +454,51 @@ class _MujocoModel:
             element.refuse("has fromto, which needs two different points")
         return Pose((ends[:3] + ends[3:]) / 2, _shortest_turn(line / length))
 
-    def orientation(self, element: Element) -> Vector:
-        """Return the rotation matrix of the one attribute of orientation that an element has."""
-        present = [attribute for attribute in ORIENTATIONS if attribute in element.node.attrib]
-        if len(present) > 1:
-            element.refuse(f"has {' and '.join(present)}: one orientation is needed")
-        kind = present[0] if present else ""
-        if kind == "quat":
-            return _of_quaternion(element, element.vector("quat", sizes=(4,)))
-        if kind == "axisangle":
-            *axis, angle = element.vector("axisangle", sizes=(4,))
-            length = float(np.linalg.norm(axis))
-            if length == 0:
-                element.refuse("has an axis of length 0")
-            return about(np.array(axis) / length, angle * self.turn)
-        if kind == "euler":
-            rotation = np.eye(3)
-            sequence = self.settings.text("eulerseq", "xyz")
-            if not re.fullmatch("[xyzXYZ]{3}", sequence):
-                element.refuse(f"has euler, and eulerseq='{sequence}' is not three of the letters xyzXYZ")
-            for letter, angle in zip(sequence, element.vector("euler"), strict=True):
-                turned = about(AXES[letter.lower()], angle * self.turn)
-                rotation = rotation @ turned if letter.islower() else turned @ rotation
-            return rotation
-        if kind == "xyaxes":
-            axes = element.vector("xyaxes", sizes=(6,))
-            z = np.cross(axes[:3], axes[3:])
-            if not z.any():
-                element.refuse(f"has xyaxes='{element.text('xyaxes')}', which must be two different directions")
-            x, z = axes[:3] / np.linalg.norm(axes[:3]), z / np.linalg.norm(z)
-            return np.column_stack([x, np.cross(z, x), z])
-        return _shortest_turn(element.unit("zaxis")) if kind else np.eye(3)
-
     def scaled(self) -> list[Link]:
         """Return the links, with inertias scaled to ``settotalmass``."""
-        total = self.settings.number("settotalmass", -1)
+        total = self.root.settings.number("settotalmass", -1)
         masses = sum(link.inertia.mass for link in self.links)
         if total <= 0 or masses == 0:
             return self.links
         return [replace(link, inertia=link.inertia.scaled(total / masses)) for link in self.links]
+
+
+def _unit(element: Element) -> float:
+    """Return the radians of a unit of angles."""
+    return np.pi / 180 if element.settings.choice("angle", "degree", "radian") == "degree" else 1.0
+
+
+def _orientation(element: Element) -> Vector:
+    """Return the rotation matrix of the one attribute of orientation that an element has."""
+    present = [attribute for attribute in ORIENTATIONS if attribute in element.node.attrib]
+    if len(present) > 1:
+        element.refuse(f"has {' and '.join(present)}: one orientation is needed")
+    kind = present[0] if present else ""
+    if kind == "quat":
+        return _of_quaternion(element, element.vector("quat", sizes=(4,)))
+    if kind == "axisangle":
+        *axis, angle = element.vector("axisangle", sizes=(4,))
+        length = float(np.linalg.norm(axis))
+        if length == 0:
+            element.refuse("has an axis of length 0")
+        return about(np.array(axis) / length, angle * _unit(element))
+    if kind == "euler":
+        rotation = np.eye(3)
+        sequence = element.settings.text("eulerseq", "xyz")
+        if not re.fullmatch("[xyzXYZ]{3}", sequence):
+            element.refuse(f"has euler, and eulerseq='{sequence}' is not three of the letters xyzXYZ")
+        for letter, angle in zip(sequence, element.vector("euler"), strict=True):
+            turned = about(AXES[letter.lower()], angle * _unit(element))
+            rotation = rotation @ turned if letter.islower() else turned @ rotation
+        return rotation
+    if kind == "xyaxes":
+        axes = element.vector("xyaxes", sizes=(6,))
+        z = np.cross(axes[:3], axes[3:])
+        if not z.any():
+            element.refuse(f"has xyaxes='{element.text('xyaxes')}', which must be two different directions")
+        x, z = axes[:3] / np.linalg.norm(axes[:3]), z / np.linalg.norm(z)
+        return np.column_stack([x, np.cross(z, x), z])
+    return _shortest_turn(element.unit("zaxis")) if kind else np.eye(3)
 
 
 def _merged(root: Element, tag: str, parts: list[Element]) -> Element:
@@ -498,8 +528,7 @@ def _include(root: Element) -> None:
             folders = [Path(file).parent for file in (root.file, child.file)]
             path = next((folder / name for folder in folders if (folder / name).exists()), folders[0] / name)
             if not is_inside(folders[0], path):
-                where = "outside the folder of the main document"
-                child.refuse(f"names '{name}' {where}: copy it there, or name its folder ({FOLDERS})")
+                child.refuse(f"names '{name}' {OUTSIDE}")
             if path.resolve() in read:
                 child.refuse(f"names '{name}', which is included already")
             read.add(path.resolve())
@@ -520,7 +549,7 @@ def _apply_defaults(root: Element) -> None:
             continue
         inherited = element.node.get("childclass", "")
         for child in element.node if inherited else ():
-            if child.tag in ("body", "frame") or (child.tag in MJCF and MJCF[child.tag].defaults):
+            if child.tag in ("body", "frame", "replicate") or (child.tag in MJCF and MJCF[child.tag].defaults):
                 child.attrib.setdefault("class" if MJCF[child.tag].defaults else "childclass", inherited)
         name = inherited or element.text("class", "main")
         if name not in classes:

@@ -41,7 +41,7 @@ TURN = "quat axisangle euler xyaxes zaxis"
 SOFTNESS = "solref solimp"
 SENSELESS = "group user margin solreflimit solimplimit solreffriction solimpfriction"
 """Attributes of joints and tendons without effect on the motion without limits and friction."""
-BODIES = "body* frame* geom* site* camera~ light~ attach! replicate! composite! flexcomp! plugin!"
+BODIES = "body* frame* geom* site* camera~ light~ attach* replicate* composite! flexcomp! plugin!"
 JOINTS = "inertial joint* freejoint"
 TENDON = Kind(
     "name class limited range frictionloss stiffness damping armature springlength",
@@ -56,7 +56,7 @@ ACTUATORS = "general motor position velocity intvelocity orientation pid damper 
 MJCF = {
     "mujoco": Kind(
         "model",
-        children="compiler* option* default* worldbody* deformable* equality* tendon* actuator* contact* asset~ "
+        children="compiler* option* default* worldbody* deformable* equality* tendon* actuator* contact* asset* "
         "custom~ extension~ keyframe~ sensor~ size~ statistic~ visual~",
     ),
     "compiler": Kind(
@@ -86,9 +86,13 @@ MJCF = {
         children="default* joint geom site equality=any_equality tendon=spatial mesh~ texture~ material~ "
         f"camera~ light~ pair~ {' '.join(f'{tag}=actuated' for tag in ACTUATORS.split())}",
     ),
+    "asset": Kind(children="model=asset_model* mesh~ hfield~ skin~ texture~ material~"),
+    "asset_model": Kind("name file", "content_type"),
     "worldbody": Kind(children=BODIES),
     "body": Kind(f"name childclass pos {TURN} gravcomp mocap", "fuse simple sleep user", None, f"{BODIES} {JOINTS}"),
     "frame": Kind(f"name childclass pos {TURN}", "", None, f"{BODIES} {JOINTS}"),
+    "replicate": Kind("childclass count euler offset sep", children=f"{BODIES} {JOINTS}"),
+    "attach": Kind("model body frame prefix"),
     "inertial": Kind(f"pos {TURN} mass diaginertia fullinertia"),
     "joint": Kind(
         "name class type pos axis ref stiffness springref damping armature frictionloss limited range actuatorgravcomp",
