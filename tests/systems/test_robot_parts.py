@@ -7,6 +7,7 @@ from random_robots import errors_of_motion
 
 import scvi_codegen as sc
 from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.systems.multibody.trees.mjcf import links_of_mjcf
 
 LEG = """<mujoco model="leg"><compiler angle="radian" eulerseq="ZYX"/><default><geom size=".1"/></default><worldbody>
 <body name="thigh" pos="0 0 -.3"><joint name="hip" ref=".2"/><geom pos="0 .1 -.2"/><frame name="f" euler=".3 .2 .1">
@@ -56,3 +57,65 @@ def test_malformed_macros_are_refused_by_name(change, tmp_path):
     (tmp_path / "macros.xml").write_text(MACROS.replace(old, new))
     with pytest.raises(SystemDefinitionError, match=re.escape(message)):
         sc.LagrangianSystem.from_mjcf(tmp_path / "macros.xml")
+
+
+BOX = "-1 -.5 -.25 0 -.5 -.25 -1 .5 -.25 0 .5 -.25 -1 -.5 .25 0 -.5 .25 -1 .5 .25 0 .5 .25"
+FACES = "0 2 1 1 2 3 4 5 6 5 7 6 0 1 4 1 5 4 2 6 3 3 6 7 0 4 2 2 4 6 1 3 5 3 7 5"
+BOXES = f'vertex="{BOX} {BOX.replace("-1", "2").replace(" 0 ", " 3 ")}"'
+BOXES += f' face="{FACES} {" ".join(str(int(k) + 8) for k in FACES.split())}"'
+MESH = """<mujoco><option><flag contact="disable"/></option><asset><mesh name="m" {}/></asset><worldbody><body>
+<joint name="j" axis="1 2 3"/>{}</body></worldbody></mujoco>"""
+RULES = {
+    "exact": '<geom type="box" size=".5 .5 .25" pos="-.5 0 0"/><geom type="box" size=".5 .5 .25" pos="2.5 0 0"/>',
+    "convex": '<geom type="box" size="2 .5 .25" pos="1 0 0"/>',
+    "legacy": "",
+    "shell": "",
+}
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_inertias_of_meshes_are_integrals(rule, tmp_path):
+    file, geom, one = tmp_path / "mesh.xml", '<geom type="mesh" mesh="m" mass="2" pos=".1 0 0"/>', []
+    for shape in ('<geom type="mesh" mesh="m"/>', RULES[rule]):
+        file.write_text(MESH.format(f'{BOXES} inertia="{rule}"', shape))
+        one += [links_of_mjcf(file)[1][-1].inertia] if shape else []
+    for part in ("mass", "center", "matrix"):
+        assert getattr(one[0], part) == pytest.approx(getattr(one[-1], part), rel=1e-14, abs=1e-13)
+    pytest.importorskip("mujoco", reason="pip install mujoco")
+    turned = f'{BOXES} inertia="{rule}" scale="1 -2 3" refpos=".1 .2 .3" refquat="1 .2 .3 .4"'
+    file.write_text(MESH.format(turned, geom))
+    assert max(errors_of_motion(sc.LagrangianSystem.from_mjcf(file), file)) < 1e-7  # MuJoCo's axes have 8 digits
+
+
+def test_meshes_are_read_from_files(tmp_path):
+    trimesh = pytest.importorskip("trimesh", reason="pip install trimesh")
+    (tmp_path / "parts").mkdir()
+    file, box = tmp_path / "mesh.xml", trimesh.creation.box((1, 2, 3))
+    settings = '<asset/><compiler assetdir="parts" strippath="true"/>'
+    for kind in ("stl", "stl_ascii", "obj"):
+        path = tmp_path / "parts" / f"m.{kind[:3]}"
+        box.export(path, file_type=kind)
+        text = MESH.format(f'file="/away/{path.name}" scale=".1 .1 .1" class="main"', '<geom mesh="m" type="mesh"/>')
+        file.write_text(text.replace('name="m" ', "").replace("<asset>", f"{settings}<asset>"))
+        assert links_of_mjcf(file)[1][-1].inertia.mass == pytest.approx(6.0)
+
+
+MESHES = {
+    "file": ('file="no.stl"', "no.stl cannot be read"),
+    "format": ('file="mesh.xml"', "cannot be read as STL, OBJ or another known format"),
+    "outside": ('file="../m.stl"', "outside the folder of the main document"),
+    "orientation": (BOXES.replace("0 2 1", "0 1 2") + ' inertia="exact"', "has triangles with opposite orientations"),
+    "volume": (f'vertex="{BOX}" face="0 1 2" inertia="exact"', "has the volume"),
+    "corner": (BOXES.replace("0 2 1", "0 2 99"), "has faces of vertices that do not exist"),
+    "flat": ('vertex="0 0 0 1 0 0 0 1 0 1 1 0"', "has no convex hull"),
+}
+
+
+@pytest.mark.parametrize("case", MESHES)
+def test_malformed_meshes_are_refused_by_name(case, tmp_path):
+    if "file=" in MESHES[case][0]:
+        pytest.importorskip("trimesh", reason="pip install trimesh")
+    file, (attributes, message) = tmp_path / "mesh.xml", MESHES[case]
+    file.write_text(MESH.format(attributes, '<geom type="mesh" mesh="m"/>'))
+    with pytest.raises(SystemDefinitionError, match=message):
+        links_of_mjcf(file)

@@ -153,7 +153,7 @@ MUJOCO_CHANGES = {
         '<tendon><spatial name="t" stiffness="1"><pulley divisor="2"/></spatial></tendon></mujoco>',
         "<pulley> 'pulley' in <spatial> 't' is on the tendon 't', which is read through sites only",
     ),
-    "mesh": ('type="box"', 'type="mesh"', "give its body an <inertial>"),
+    "mesh": ('type="box"', 'type="box" mesh="m"', "give its body an <inertial>"),
     "class": ('childclass="limb"', 'childclass="lim"', "of the class 'lim'"),
     "orientations": ('quat="1 0.1 0.2 0.3"', 'quat="1 0 0 0" euler="0 0 0"', "quat and euler"),
     "free inside": ('type="ball"', 'type="free"', "inside another body"),

@@ -210,16 +210,7 @@ def root_of(path: Path, *tags: str) -> Element:
             entities, or has another outermost element.
     """
     try:
-        if not stat.S_ISREG(path.stat().st_mode):  # a device may have no end
-            raise OSError(errno.EINVAL, "it is no regular file")
-        with path.open("rb") as file:
-            data = file.read(LARGEST_FILE + 1)
-    except (OSError, ValueError) as error:
-        raise SystemDefinitionError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    if len(data) > LARGEST_FILE:
-        raise SystemDefinitionError(f"{path} has more than {LARGEST_FILE} bytes, the most that are read")
-    try:
-        node, places = _parsed(data, str(path))
+        node, places = _parsed(bytes_of(path), str(path))
     except (expat.ExpatError, ValueError, LookupError) as error:
         raise SystemDefinitionError(f"{path} is not XML: {error}") from error
     if node.tag not in tags:
@@ -228,6 +219,20 @@ def root_of(path: Path, *tags: str) -> Element:
         )
         raise SystemDefinitionError(f"{path} begins with <{node.tag}>, not with <{tags[0]}>{other}")
     return Element(node, places)
+
+
+def bytes_of(path: Path) -> bytes:
+    """Return the contents of a file, which must be a regular one of at most 32 MiB."""
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):  # a device may have no end
+            raise OSError(errno.EINVAL, "it is no regular file")
+        with path.open("rb") as file:
+            data = file.read(LARGEST_FILE + 1)
+    except (OSError, ValueError) as error:
+        raise SystemDefinitionError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    if len(data) > LARGEST_FILE:
+        raise SystemDefinitionError(f"{path} has more than {LARGEST_FILE} bytes, the most that are read")
+    return data
 
 
 def _parsed(data: bytes, file: str) -> tuple[ElementTree.Element, dict[ElementTree.Element, Place]]:

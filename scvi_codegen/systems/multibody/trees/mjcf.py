@@ -21,6 +21,7 @@ from scvi_codegen.systems.formulas.rotations import matrix_of
 from scvi_codegen.systems.multibody.trees.closures import Closure, Coupling, at_reference
 from scvi_codegen.systems.multibody.trees.document import Element, Unread, root_of
 from scvi_codegen.systems.multibody.trees.macros import Macros
+from scvi_codegen.systems.multibody.trees.meshes import inertia_of
 from scvi_codegen.systems.multibody.trees.schema import MJCF, TURN
 from scvi_codegen.systems.multibody.trees.tendons import Tendon
 from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about, named
@@ -104,6 +105,12 @@ def _document(path: Path, around: tuple[Path, ...] = ()) -> Element:
     settings = _merged(root, "compiler", root.children("compiler"))
     root.places.update({node: root.places[node]._replace(settings=settings) for node in root.node.iter()})
     _apply_defaults(root)
+    folder = path.parent / settings.text("meshdir", settings.text("assetdir", ""))
+    for mesh in (mesh for section in root.children("asset") for mesh in section.children("mesh") if mesh.has("file")):
+        file = Path(mesh.text("file"))
+        named = {"name": file.stem, **mesh.node.attrib}
+        file = folder / (file.name if settings.choice("strippath", "false", "true") == "true" else file)
+        mesh.node.attrib |= named | {"file": str(file)}
 
     def part(model: Element) -> Element:
         file = path.parent / model.text("file")
@@ -133,6 +140,7 @@ class _MujocoModel:
         self.gravity = option.vector("gravity", (0, 0, -9.81)) * ("gravity" not in self.disabled)
         self.links: list[Link] = []
         self.compensating: list[Element] = []
+        self.meshes: dict[str, Inertia] = {}
         self.labels = set[str | None]()
         self.carriers, self.parents = {-1: -1}, dict[int, int]()
         """Of each body, by its link: the moving body that it is fixed to, and the one that this is connected with."""
@@ -422,7 +430,11 @@ class _MujocoModel:
         density, mass = geom.number("density", 1000, 0), geom.number("mass", np.nan, 0)
         if shape in WEIGHTLESS or mass == 0:
             return Inertia()
-        if shape not in SHAPES or geom.has("mesh") or geom.choice("shellinertia", "false", "true") == "true":
+        shell = geom.choice("shellinertia", "false", "true") == "true"
+        if shape == "mesh" and not shell:
+            inertia = self.mesh(geom)
+            return inertia.scaled(density if np.isnan(mass) else mass / inertia.mass).seen_from(self.pose(geom))
+        if shape not in SHAPES or geom.has("mesh") or shell:
             geom.refuse(f"is a {shape} whose inertia is not computed: give its body an <inertial>")
         count, volume_and_inertia = SHAPES[shape]
         size = geom.vector("size", sizes=(1, 2, 3))
@@ -439,6 +451,16 @@ class _MujocoModel:
             geom.refuse(f"has size='{geom.text('size')}', whose volume is {volume:g}: use other units of length")
         mass = density * volume if np.isnan(mass) else mass
         return Inertia(mass, matrix=mass * np.diag(moments)).seen_from(self.pose(geom))
+
+    def mesh(self, geom: Element) -> Inertia:
+        """Return the inertia of the mesh of a geom, of density 1."""
+        meshes, name = {mesh.name: mesh for mesh in self.entries("asset") if mesh.tag == "mesh"}, geom.text("mesh")
+        if name not in meshes:
+            geom.refuse(f"names the mesh '{name}', which is not in <asset>{closest(name, meshes)}")
+        if not is_inside(Path(self.root.file).parent, Path(file := meshes[name].text("file", self.root.file))):
+            meshes[name].refuse(f"names '{file}' {OUTSIDE}")
+        self.meshes[name] = self.meshes.get(name) or inertia_of(meshes[name])
+        return self.meshes[name]
 
     @staticmethod
     def pose(element: Element) -> Pose:

@@ -60,9 +60,9 @@ MJCF = {
         "custom~ extension~ keyframe~ sensor~ size~ statistic~ visual~",
     ),
     "compiler": Kind(
-        "angle eulerseq autolimits inertiafromgeom inertiagrouprange settotalmass",
-        "alignfree assetdir conflict convexhull discardvisual exactmeshinertia fitaabb fusestatic meshdir passthrough "
-        "savecanonical savecompiled saveinertial strippath texturedir usethread",
+        "angle assetdir eulerseq autolimits inertiafromgeom inertiagrouprange meshdir settotalmass strippath",
+        "alignfree conflict convexhull discardvisual exactmeshinertia fitaabb fusestatic passthrough savecanonical "
+        "savecompiled saveinertial texturedir usethread",
         {"balanceinertia": "false", "boundinertia": "0", "boundmass": "0", "coordinate": "local"},
         "lengthrange~",
     ),
@@ -83,10 +83,17 @@ MJCF = {
     ),
     "default": Kind(
         "class",
-        children="default* joint geom site equality=any_equality tendon=spatial mesh~ texture~ material~ "
+        children="default* joint geom site equality=any_equality tendon=spatial mesh texture~ material~ "
         f"camera~ light~ pair~ {' '.join(f'{tag}=actuated' for tag in ACTUATORS.split())}",
     ),
-    "asset": Kind(children="model=asset_model* mesh~ hfield~ skin~ texture~ material~"),
+    "asset": Kind(children="model=asset_model* mesh* hfield~ skin~ texture~ material~"),
+    "mesh": Kind(
+        "name class file vertex face scale refpos refquat inertia maxhullvert builtin",
+        "content_type material normal params smoothnormal texcoord",
+        None,
+        "plugin~",
+        "mesh",
+    ),
     "asset_model": Kind("name file", "content_type"),
     "worldbody": Kind(children=BODIES),
     "body": Kind(f"name childclass pos {TURN} gravcomp mocap", "fuse simple sleep user", None, f"{BODIES} {JOINTS}"),

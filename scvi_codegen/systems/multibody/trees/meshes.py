@@ -1,0 +1,86 @@
+"""Inertias of meshes of triangles, by the four rules of ``inertia=`` of MJCF.
+
+A triangle with the corners a, b, c and a point o (a, b, c from there) span a tetrahedron of the signed volume
+V = a x b . c/6, over which the integral of x x^T is V/20 (a a^T + b b^T + c c^T + s s^T) with s = a + b + c; over the
+triangle it is A/12 times the same sum. F. Tonon, Explicit exact formulas for the 3-D tetrahedron inertia tensor in
+terms of its vertex coordinates, J. Math. Stat. 1 (2005), 8-11. "convex" is the hull, "shell" the surface, and "legacy"
+takes all volumes as positive, first from the centroid of the surface, whence the center of mass, and then from there.
+"""
+
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from scvi_codegen.common.errors import imported
+from scvi_codegen.systems.formulas.rotations import matrix_of
+from scvi_codegen.systems.multibody.trees.document import Element, bytes_of
+from scvi_codegen.systems.multibody.trees.tree import Inertia, Vector
+
+RULES = ("legacy", "convex", "exact", "shell")
+
+
+def inertia_of(mesh: Element) -> Inertia:
+    """Return the inertia of a ``<mesh>`` of density 1."""
+    if mesh.text("builtin", "none") != "none" or mesh.children("plugin"):
+        mesh.refuse("is made by MuJoCo, and its inertia is not computed: give the bodies with it an <inertial>")
+    rule, (corners, faces) = mesh.choice("inertia", *RULES), _read(mesh)
+    if rule == "convex" or not len(faces):
+        if rule == "convex" and mesh.number("maxhullvert", -1) > 0:
+            mesh.refuse("has inertia='convex' and maxhullvert, a hull that is not computed: remove one")
+        try:
+            rule, faces = "shell" if rule == "shell" else "convex", ConvexHull(corners).simplices
+        except (QhullError, ValueError) as error:
+            mesh.refuse(f"has no convex hull: {str(error).strip().splitlines()[0]}")
+    merged = np.unique(corners, axis=0, return_inverse=True)[1].reshape(-1)[faces]
+    sides = np.concatenate([merged[:, [i, (i + 1) % 3]] for i in range(3)])
+    if rule == "exact" and len(np.unique(sides, axis=0)) < len(sides):
+        mesh.refuse("has triangles with opposite orientations: turn them, or use inertia='convex'")
+    scale, turn = mesh.vector("scale", (1, 1, 1)), mesh.vector("refquat", (1, 0, 0, 0), (4,))
+    axes = np.array(matrix_of([*map(float, turn / np.linalg.norm(turn))]), dtype=float)
+    corners = (corners - mesh.vector("refpos", (0, 0, 0))) @ axes * scale
+    with np.errstate(all="ignore"):
+        inertia = _integrals(corners[faces][:, :: int(np.sign(np.prod(scale)))], rule)
+    if not inertia.mass > 0:
+        mesh.refuse(f"has the volume {inertia.mass:g}: turn its triangles, or use inertia='convex' or 'shell'")
+    return inertia
+
+
+def _integrals(triangles: Vector, rule: str) -> Inertia:
+    """Return the inertia of (n, 3, 3) corners of triangles."""
+    across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    areas, middles = np.linalg.norm(across, axis=1) / 2, triangles.mean(axis=1)
+
+    def sizes(point: Vector) -> Vector:
+        volumes: Vector = ((middles - point) * across).sum(axis=1) / 6
+        weights: Vector = {"shell": areas, "exact": volumes}.get(rule, np.abs(volumes))
+        return weights
+
+    center = areas @ middles / areas.sum()
+    if rule != "shell":
+        center = sizes(center) @ (3 * middles + center) / 4 / sizes(center).sum()
+    corners = np.concatenate([triangles - center, 3 * (middles - center)[:, None]], axis=1)
+    moments = np.einsum("n,nik,nil->kl", sizes(center), corners, corners) / (12 if rule == "shell" else 20)
+    return Inertia(float(sizes(center).sum()), center, np.trace(moments) * np.eye(3) - moments)
+
+
+def _read(mesh: Element) -> tuple[Vector, NDArray[np.intp]]:
+    """Return the corners, in single precision as MuJoCo, and the triangles as indices of these."""
+    if not mesh.has("file"):
+        numbers = [mesh.vector(key, (), range(2**31)) for key in ("vertex", "face")]
+        if len(numbers[0]) < 12 or any(len(each) % 3 for each in numbers):
+            mesh.refuse("needs a file, or at least 4 vertices and faces of 3 numbers each")
+        corners, faces = numbers[0].reshape(-1, 3), numbers[1].reshape(-1, 3).astype(int)
+    else:
+        file = Path(mesh.text("file"))
+        try:
+            data, kind = BytesIO(bytes_of(file)), file.suffix[1:].lower()
+            read = imported("trimesh", "meshes").load_scene(data, file_type=kind, process=False).to_geometry()
+        except (NotImplementedError, ValueError, IndexError, KeyError, TypeError) as error:
+            mesh.refuse(f"is in the file {file}, which cannot be read as STL, OBJ or another known format: {error}")
+        corners, faces = read.vertices, np.asarray(getattr(read, "faces", ()))  # without faces it is a point cloud
+    if len(faces) and not (faces.min() >= 0 and faces.max() < len(corners)):
+        mesh.refuse("has faces of vertices that do not exist")
+    return np.asarray(corners, np.float32).astype(float), np.asarray(faces)
