@@ -43,8 +43,8 @@ WRONG = {
     ),
     "part": ('body="thigh"', 'body="thihg"', "names the body 'thihg', which does not exist; did you mean 'thigh'?"),
     "file": ("leg.xml", "none.xml", "none.xml cannot be read"),
-    "outside": ("leg.xml", "../leg.xml", "names '../leg.xml' outside the folder of the main document"),
-    "circle": ("leg.xml", "macros.xml", "names 'macros.xml', which contains this document"),
+    "outside": ("leg.xml", "../leg.xml", "names '../leg.xml' outside the folder of the document"),
+    "circle": ("leg.xml", "macros.xml", "macros.xml', which contains this document"),
     "whole": ('<attach body="own"', "<attach ", "needs a model, a body or a frame, and not both of these"),
     "inside": ('<joint name="o"/>', '<attach body="own" prefix="y"/>', "is attached before it is written out"),
 }
@@ -103,10 +103,10 @@ def test_meshes_are_read_from_files(tmp_path):
 MESHES = {
     "file": ('file="no.stl"', "no.stl cannot be read"),
     "format": ('file="mesh.xml"', "cannot be read as STL, OBJ or another known format"),
-    "outside": ('file="../m.stl"', "outside the folder of the main document"),
+    "outside": ('file="../m.stl"', "outside the folder of the document"),
     "orientation": (BOXES.replace("0 2 1", "0 1 2") + ' inertia="exact"', "has triangles with opposite orientations"),
     "volume": (f'vertex="{BOX}" face="0 1 2" inertia="exact"', "has the volume"),
-    "corner": (BOXES.replace("0 2 1", "0 2 99"), "has faces of vertices that do not exist"),
+    "corner": (BOXES.replace("0 2 1", "0 2 99"), "and faces of 3 of their numbers each"),
     "flat": ('vertex="0 0 0 1 0 0 0 1 0 1 1 0"', "has no convex hull"),
 }
 

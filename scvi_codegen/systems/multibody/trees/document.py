@@ -15,6 +15,7 @@ from xml.parsers import expat
 
 import numpy as np
 
+from scvi_codegen.common.atomic import FOLDERS, is_inside
 from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
 from scvi_codegen.systems.multibody.trees.schema import Kind
 from scvi_codegen.systems.multibody.trees.tree import Vector
@@ -29,12 +30,12 @@ NAMED = 5
 
 
 class Place(NamedTuple):
-    """Path of a document, number of a line, the nearest element around it that has a name, and ``<compiler>``."""
+    """File and line of an element, the nearest one around it that has a name, and the outermost one of its document."""
 
     file: str
     line: int
     around: str
-    settings: Any = None
+    document: Any = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,10 +56,15 @@ class Element:
         return self.places[self.node].file
 
     @property
+    def document(self) -> Element:
+        """Outermost element of a document of MJCF, also of one that is attached to another."""
+        document: Element = self.places[self.node].document
+        return document
+
+    @property
     def settings(self) -> Element:
         """Settings of the compiler of the document."""
-        settings: Element = self.places[self.node].settings
-        return settings
+        return self.document.children("compiler")[0]
 
     @property
     def name(self) -> str:
@@ -113,6 +119,14 @@ class Element:
     def children(self, *tags: str) -> list[Element]:
         """Return the children with one of the tags, in order; all of them without tags."""
         return [Element(child, self.places) for child in self.node if not tags or child.tag in tags]
+
+    def path(self, name: Path) -> Path:
+        """Return the path of a file that is named relative to the folder of the document, which must contain it."""
+        folder = Path(self.document.file).parent
+        if not is_inside(folder, folder / name):
+            where = "outside the folder of the document: copy it there, or name its folder"
+            self.refuse(f"names '{name}' {where} ({FOLDERS})")
+        return folder / name
 
     def child(self, tag: str) -> Element | None:
         """Return the first child with a tag."""
@@ -218,7 +232,9 @@ def root_of(path: Path, *tags: str) -> Element:
             node.tag, ""
         )
         raise SystemDefinitionError(f"{path} begins with <{node.tag}>, not with <{tags[0]}>{other}")
-    return Element(node, places)
+    root = Element(node, places)
+    places.update({node: place._replace(document=root) for node, place in places.items()})
+    return root
 
 
 def bytes_of(path: Path) -> bytes:

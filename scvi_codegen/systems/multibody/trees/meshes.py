@@ -14,22 +14,27 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from scvi_codegen.common.errors import imported
+from scvi_codegen.common.errors import closest, imported
 from scvi_codegen.systems.formulas.rotations import matrix_of
 from scvi_codegen.systems.multibody.trees.document import Element, bytes_of
 from scvi_codegen.systems.multibody.trees.tree import Inertia, Vector
 
-RULES = ("legacy", "convex", "exact", "shell")
+
+def mesh_of(geom: Element) -> Element:
+    """Return the ``<mesh>`` of a geom, whose name is by default that of its file."""
+    meshes = [mesh for assets in geom.document.children("asset") for mesh in assets.children("mesh")]
+    names = {mesh.node.get("name", Path(mesh.node.get("file", "")).stem): mesh for mesh in meshes}
+    if (name := geom.text("mesh")) not in names:
+        geom.refuse(f"names the mesh '{name}', which is not in <asset>{closest(name, names)}")
+    return names[name]
 
 
 def inertia_of(mesh: Element) -> Inertia:
     """Return the inertia of a ``<mesh>`` of density 1."""
-    if mesh.text("builtin", "none") != "none" or mesh.children("plugin"):
-        mesh.refuse("is made by MuJoCo, and its inertia is not computed: give the bodies with it an <inertial>")
-    rule, (corners, faces) = mesh.choice("inertia", *RULES), _read(mesh)
+    rule, (corners, faces) = mesh.choice("inertia", "legacy", "convex", "exact", "shell"), _read(mesh)
+    if rule == "convex" and mesh.number("maxhullvert", -1) > 0:
+        mesh.refuse("has inertia='convex' and maxhullvert, a hull that is not computed: remove one")
     if rule == "convex" or not len(faces):
-        if rule == "convex" and mesh.number("maxhullvert", -1) > 0:
-            mesh.refuse("has inertia='convex' and maxhullvert, a hull that is not computed: remove one")
         try:
             rule, faces = "shell" if rule == "shell" else "convex", ConvexHull(corners).simplices
         except (QhullError, ValueError) as error:
@@ -68,19 +73,19 @@ def _integrals(triangles: Vector, rule: str) -> Inertia:
 
 def _read(mesh: Element) -> tuple[Vector, NDArray[np.intp]]:
     """Return the corners, in single precision as MuJoCo, and the triangles as indices of these."""
-    if not mesh.has("file"):
-        numbers = [mesh.vector(key, (), range(2**31)) for key in ("vertex", "face")]
-        if len(numbers[0]) < 12 or any(len(each) % 3 for each in numbers):
-            mesh.refuse("needs a file, or at least 4 vertices and faces of 3 numbers each")
-        corners, faces = numbers[0].reshape(-1, 3), numbers[1].reshape(-1, 3).astype(int)
-    else:
-        file = Path(mesh.text("file"))
+    if mesh.text("builtin", "none") != "none" or mesh.children("plugin"):
+        mesh.refuse("is made by MuJoCo, and its inertia is not computed: give the bodies with it an <inertial>")
+    corners, faces = (mesh.vector(key, (), range(2**31)) for key in ("vertex", "face"))
+    if mesh.has("file"):
+        file, settings = Path(mesh.text("file")), mesh.settings
+        file = Path(file.name) if settings.choice("strippath", "false", "true") == "true" else file
+        file = mesh.path(settings.text("meshdir", settings.text("assetdir", "")) / file)
+        data, trimesh = BytesIO(bytes_of(file)), imported("trimesh", "meshes")
         try:
-            data, kind = BytesIO(bytes_of(file)), file.suffix[1:].lower()
-            read = imported("trimesh", "meshes").load_scene(data, file_type=kind, process=False).to_geometry()
+            read = trimesh.load_scene(data, file_type=file.suffix[1:].lower(), process=False).to_geometry()
         except (NotImplementedError, ValueError, IndexError, KeyError, TypeError) as error:
             mesh.refuse(f"is in the file {file}, which cannot be read as STL, OBJ or another known format: {error}")
-        corners, faces = read.vertices, np.asarray(getattr(read, "faces", ()))  # without faces it is a point cloud
-    if len(faces) and not (faces.min() >= 0 and faces.max() < len(corners)):
-        mesh.refuse("has faces of vertices that do not exist")
-    return np.asarray(corners, np.float32).astype(float), np.asarray(faces)
+        corners, faces = np.asarray(read.vertices).ravel(), np.ravel(getattr(read, "faces", ()))  # none: a point cloud
+    if len(corners) < 12 or len(corners) % 3 or len(faces) % 3 or not set(faces) <= {*range(len(corners) // 3)}:
+        mesh.refuse("needs at least 4 vertices, and faces of 3 of their numbers each")
+    return corners.astype(np.float32).astype(float).reshape(-1, 3), faces.astype(int).reshape(-1, 3)

@@ -15,13 +15,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from scvi_codegen.common.atomic import FOLDERS, is_inside
 from scvi_codegen.common.errors import closest
 from scvi_codegen.systems.formulas.rotations import matrix_of
 from scvi_codegen.systems.multibody.trees.closures import Closure, Coupling, at_reference
 from scvi_codegen.systems.multibody.trees.document import Element, Unread, root_of
-from scvi_codegen.systems.multibody.trees.macros import Macros
-from scvi_codegen.systems.multibody.trees.meshes import inertia_of
+from scvi_codegen.systems.multibody.trees.macros import write_out
+from scvi_codegen.systems.multibody.trees.meshes import inertia_of, mesh_of
 from scvi_codegen.systems.multibody.trees.schema import MJCF, TURN
 from scvi_codegen.systems.multibody.trees.tendons import Tendon
 from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about, named
@@ -69,7 +68,6 @@ length along z, of a capsule without its caps."""
 
 WEIGHTLESS = ("plane", "hfield")
 ORIENTATIONS = TURN.split()
-OUTSIDE = f"outside the folder of the main document: copy it there, or name its folder ({FOLDERS})"
 AXES = dict(zip("xyz", np.eye(3), strict=True))
 Defaults = dict[str, dict[str, str]]
 """Attributes by kind of element."""
@@ -94,33 +92,20 @@ def links_of_mjcf(
 
 
 def _document(path: Path, around: tuple[Path, ...] = ()) -> Element:
-    """Return a document with the contents of others, explicit attributes, and without macros.
-
-    Args:
-        path: the file.
-        around: files of the documents that it is part of.
-    """
-    root = root_of(path, "mujoco")
+    """Return a document, a part of those ``around``, with included files and explicit attributes, without macros."""
+    root, around = root_of(path, "mujoco"), (*around, path.resolve())
     _include(root)
     settings = _merged(root, "compiler", root.children("compiler"))
-    root.places.update({node: root.places[node]._replace(settings=settings) for node in root.node.iter()})
+    root.node.insert(0, settings.node)
+    root.places.update(settings.places)
     _apply_defaults(root)
-    folder = path.parent / settings.text("meshdir", settings.text("assetdir", ""))
-    for mesh in (mesh for section in root.children("asset") for mesh in section.children("mesh") if mesh.has("file")):
-        file = Path(mesh.text("file"))
-        named = {"name": file.stem, **mesh.node.attrib}
-        file = folder / (file.name if settings.choice("strippath", "false", "true") == "true" else file)
-        mesh.node.attrib |= named | {"file": str(file)}
-
-    def part(model: Element) -> Element:
-        file = path.parent / model.text("file")
-        if not is_inside(path.parent, file):
-            model.refuse(f"names '{model.text('file')}' {OUTSIDE}")
-        if file.resolve() in (inner := (*around, path.resolve())):
-            model.refuse(f"names '{model.text('file')}', which contains this document")
-        return _document(file, inner)
-
-    Macros(root, part, _MujocoModel.pose)
+    models = {}
+    for asset in (asset for section in root.children("asset") for asset in section.children("model")):
+        if (file := asset.path(Path(asset.text("file")))).resolve() in around:
+            asset.refuse(f"names '{file}', which contains this document")
+        model = _document(file, around)
+        models[asset.node.get("name", model.node.get("model", ""))] = model
+    write_out(root, models, _MujocoModel.pose)
     return root
 
 
@@ -129,18 +114,13 @@ class _MujocoModel:
 
     def __init__(self, root: Element, limits: bool) -> None:
         self.root, self.unread, self.limits = root, Unread(), limits
-        option, flags = (
-            _merged(root, tag, parts)
-            for tag, parts in (
-                ("option", root.children("option")),
-                ("flag", [flag for element in root.children("option") for flag in element.children("flag")]),
-            )
-        )
+        option = _merged(root, "option", root.children("option"))
+        flags = _merged(root, "flag", [flag for each in root.children("option") for flag in each.children("flag")])
         self.disabled = {key for key in flags.node.attrib if flags.choice(key, "enable", "disable") == "disable"}
         self.gravity = option.vector("gravity", (0, 0, -9.81)) * ("gravity" not in self.disabled)
         self.links: list[Link] = []
         self.compensating: list[Element] = []
-        self.meshes: dict[str, Inertia] = {}
+        self.meshes: dict[ElementTree.Element, Inertia] = {}
         self.labels = set[str | None]()
         self.carriers, self.parents = {-1: -1}, dict[int, int]()
         """Of each body, by its link: the moving body that it is fixed to, and the one that this is connected with."""
@@ -432,7 +412,9 @@ class _MujocoModel:
             return Inertia()
         shell = geom.choice("shellinertia", "false", "true") == "true"
         if shape == "mesh" and not shell:
-            inertia = self.mesh(geom)
+            if (mesh := mesh_of(geom)).node not in self.meshes:
+                self.meshes[mesh.node] = inertia_of(mesh)
+            inertia = self.meshes[mesh.node]
             return inertia.scaled(density if np.isnan(mass) else mass / inertia.mass).seen_from(self.pose(geom))
         if shape not in SHAPES or geom.has("mesh") or shell:
             geom.refuse(f"is a {shape} whose inertia is not computed: give its body an <inertial>")
@@ -452,21 +434,11 @@ class _MujocoModel:
         mass = density * volume if np.isnan(mass) else mass
         return Inertia(mass, matrix=mass * np.diag(moments)).seen_from(self.pose(geom))
 
-    def mesh(self, geom: Element) -> Inertia:
-        """Return the inertia of the mesh of a geom, of density 1."""
-        meshes, name = {mesh.name: mesh for mesh in self.entries("asset") if mesh.tag == "mesh"}, geom.text("mesh")
-        if name not in meshes:
-            geom.refuse(f"names the mesh '{name}', which is not in <asset>{closest(name, meshes)}")
-        if not is_inside(Path(self.root.file).parent, Path(file := meshes[name].text("file", self.root.file))):
-            meshes[name].refuse(f"names '{file}' {OUTSIDE}")
-        self.meshes[name] = self.meshes.get(name) or inertia_of(meshes[name])
-        return self.meshes[name]
-
     @staticmethod
     def pose(element: Element) -> Pose:
         """Return the pose of an element in its parent, by position and orientation or by ``fromto``."""
         if not element.has("fromto"):
-            return Pose(element.vector("pos", (0, 0, 0)), _orientation(element))
+            return Pose(element.vector("pos", (0, 0, 0)), _MujocoModel.orientation(element))
         if element.vector("pos", (0, 0, 0)).any():
             element.refuse("has pos and fromto: one is needed")
         ends = element.vector("fromto", sizes=(6,))
@@ -475,6 +447,39 @@ class _MujocoModel:
         if length == 0:
             element.refuse("has fromto, which needs two different points")
         return Pose((ends[:3] + ends[3:]) / 2, _shortest_turn(line / length))
+
+    @staticmethod
+    def orientation(element: Element) -> Vector:
+        """Return the rotation matrix of the one attribute of orientation that an element has."""
+        present = [attribute for attribute in ORIENTATIONS if attribute in element.node.attrib]
+        if len(present) > 1:
+            element.refuse(f"has {' and '.join(present)}: one orientation is needed")
+        kind = present[0] if present else ""
+        if kind == "quat":
+            return _of_quaternion(element, element.vector("quat", sizes=(4,)))
+        if kind == "axisangle":
+            *axis, angle = element.vector("axisangle", sizes=(4,))
+            length = float(np.linalg.norm(axis))
+            if length == 0:
+                element.refuse("has an axis of length 0")
+            return about(np.array(axis) / length, angle * _unit(element))
+        if kind == "euler":
+            rotation = np.eye(3)
+            sequence = element.settings.text("eulerseq", "xyz")
+            if not re.fullmatch("[xyzXYZ]{3}", sequence):
+                element.refuse(f"has euler, and eulerseq='{sequence}' is not three of the letters xyzXYZ")
+            for letter, angle in zip(sequence, element.vector("euler"), strict=True):
+                turned = about(AXES[letter.lower()], angle * _unit(element))
+                rotation = rotation @ turned if letter.islower() else turned @ rotation
+            return rotation
+        if kind == "xyaxes":
+            axes = element.vector("xyaxes", sizes=(6,))
+            z = np.cross(axes[:3], axes[3:])
+            if not z.any():
+                element.refuse(f"has xyaxes='{element.text('xyaxes')}', which must be two different directions")
+            x, z = axes[:3] / np.linalg.norm(axes[:3]), z / np.linalg.norm(z)
+            return np.column_stack([x, np.cross(z, x), z])
+        return _shortest_turn(element.unit("zaxis")) if kind else np.eye(3)
 
     def scaled(self) -> list[Link]:
         """Return the links, with inertias scaled to ``settotalmass``."""
@@ -488,39 +493,6 @@ class _MujocoModel:
 def _unit(element: Element) -> float:
     """Return the radians of a unit of angles."""
     return np.pi / 180 if element.settings.choice("angle", "degree", "radian") == "degree" else 1.0
-
-
-def _orientation(element: Element) -> Vector:
-    """Return the rotation matrix of the one attribute of orientation that an element has."""
-    present = [attribute for attribute in ORIENTATIONS if attribute in element.node.attrib]
-    if len(present) > 1:
-        element.refuse(f"has {' and '.join(present)}: one orientation is needed")
-    kind = present[0] if present else ""
-    if kind == "quat":
-        return _of_quaternion(element, element.vector("quat", sizes=(4,)))
-    if kind == "axisangle":
-        *axis, angle = element.vector("axisangle", sizes=(4,))
-        length = float(np.linalg.norm(axis))
-        if length == 0:
-            element.refuse("has an axis of length 0")
-        return about(np.array(axis) / length, angle * _unit(element))
-    if kind == "euler":
-        rotation = np.eye(3)
-        sequence = element.settings.text("eulerseq", "xyz")
-        if not re.fullmatch("[xyzXYZ]{3}", sequence):
-            element.refuse(f"has euler, and eulerseq='{sequence}' is not three of the letters xyzXYZ")
-        for letter, angle in zip(sequence, element.vector("euler"), strict=True):
-            turned = about(AXES[letter.lower()], angle * _unit(element))
-            rotation = rotation @ turned if letter.islower() else turned @ rotation
-        return rotation
-    if kind == "xyaxes":
-        axes = element.vector("xyaxes", sizes=(6,))
-        z = np.cross(axes[:3], axes[3:])
-        if not z.any():
-            element.refuse(f"has xyaxes='{element.text('xyaxes')}', which must be two different directions")
-        x, z = axes[:3] / np.linalg.norm(axes[:3]), z / np.linalg.norm(z)
-        return np.column_stack([x, np.cross(z, x), z])
-    return _shortest_turn(element.unit("zaxis")) if kind else np.eye(3)
 
 
 def _merged(root: Element, tag: str, parts: list[Element]) -> Element:
@@ -549,13 +521,12 @@ def _include(root: Element) -> None:
                 child.refuse(f"must have only file, a path relative to the folder of the document: '{name}'")
             folders = [Path(file).parent for file in (root.file, child.file)]
             path = next((folder / name for folder in folders if (folder / name).exists()), folders[0] / name)
-            if not is_inside(folders[0], path):
-                child.refuse(f"names '{name}' {OUTSIDE}")
+            child.path(path.resolve())
             if path.resolve() in read:
                 child.refuse(f"names '{name}', which is included already")
             read.add(path.resolve())
             included = root_of(path, "mujocoinclude", "mujoco")
-            root.places.update(included.places)
+            root.places.update({node: at._replace(document=root) for node, at in included.places.items()})
             children.extendleft(Element(node, root.places) for node in reversed(included.node))
         if len(nodes) != len(outer.node) or any(a.node is not b for a, b in zip(nodes, outer.node, strict=True)):
             outer.node[:] = [element.node for element in nodes]
