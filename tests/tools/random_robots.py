@@ -351,7 +351,7 @@ def errors_of_motion(system: Any, path: Path) -> list[float]:
     before, (_, *values), after = (np.array(side) for side in sides)
     torques, along, acting = values[:m], ((after - before) / (2 * step))[1 + m : 1 + 2 * m], values[2 * m :]
     size = max(map(abs, torques)) + max(map(abs, acting)) + 1
-    power = np.dot(acting, v) - float(data.qfrc_damper @ data.qvel)
+    power = np.dot(acting, v) - float((data.qfrc_damper + data.qfrc_fluid) @ data.qvel)
     errors = energies[1] - energies[0], power, np.abs(along - torques - acting).max() / size
     return [float(abs(error)) for error in errors]
 

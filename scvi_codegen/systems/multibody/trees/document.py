@@ -120,12 +120,11 @@ class Element:
         """Return the children with one of the tags, in order; all of them without tags."""
         return [Element(child, self.places) for child in self.node if not tags or child.tag in tags]
 
-    def path(self, name: Path) -> Path:
+    def path(self, name: str) -> Path:
         """Return the path of a file that is named relative to the folder of the document, which must contain it."""
-        folder = Path(self.document.file).parent
-        if not is_inside(folder, folder / name):
-            where = "outside the folder of the document: copy it there, or name its folder"
-            self.refuse(f"names '{name}' {where} ({FOLDERS})")
+        if not is_inside(folder := Path(self.document.file).parent, folder / name):
+            where = f"copy it there, or name its folder ({FOLDERS})"
+            self.refuse(f"names '{name}' outside the folder of the document: {where}")
         return folder / name
 
     def child(self, tag: str) -> Element | None:

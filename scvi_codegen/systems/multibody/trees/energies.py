@@ -44,6 +44,7 @@ from sympy import Abs, Add, Expr, Matrix, Rational, S, Symbol, atan2, cos, eye, 
 
 from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
 from scvi_codegen.systems.contact import ContactLike, contact, friction
+from scvi_codegen.systems.formulas.expressions import gradient_tuple
 from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.formulas.rotations import Rotation, RotationNames
 from scvi_codegen.systems.formulas.symbols import DOT, default_momenta, symbol
@@ -153,34 +154,36 @@ class Tree:
                 moments[parent] = as_quantities(moments[parent])
         return moments
 
-    def kinetic_energy(self) -> Expr:
-        """Return T; bases that are free contribute as in the docstring of the module."""
-        terms: list[Expr] = []
-        turning: list[Matrix] = []
-        moving: list[Matrix] = []
-        momenta: list[Matrix] = []
+    def motions(self, *, free: bool) -> list[tuple[Matrix, Matrix]]:
+        """Return angular velocities and velocities of the origins of links; ``free``: with those of free bases."""
+        motions: list[tuple[Matrix, Matrix]] = []
         along = Matrix([0, 0, 1])
         for link in self.links:
             joint = link.joint
-            outer = turning[link.parent] if link.parent >= 0 else zeros(3, 1)
-            speed = moving[link.parent] if link.parent >= 0 else zeros(3, 1)
+            outer, speed = motions[link.parent] if link.parent >= 0 else (zeros(3, 1), zeros(3, 1))
             w = self.turned(joint, outer, back=True)
             v = self.turned(joint, as_quantities(speed + outer.cross(self.origin(joint))), back=True)
-            if joint.kind in SINGLE:
-                rate = self.coordinate(joint)[1]
-                if joint.kind == "hinge":
-                    w += along * rate
-                else:
-                    v += along * rate
+            if joint.kind == "hinge":
+                w += along * self.coordinate(joint)[1]
+            elif joint.kind == "slide":
+                v += along * self.coordinate(joint)[1]
             else:
                 w += Matrix(rotation_of(joint).rates)
-            turning.append(as_quantities(w))
-            moving.append(as_quantities(v))
-            velocity = as_quantities(moving[-1] + turning[-1].cross(exact_vector(link.inertia.center)))
+            if joint.kind == "free" and free:
+                v = self.turned(joint, Matrix([symbol(name + DOT) for name in position_of(joint)]), back=True)
+            motions.append((as_quantities(w), as_quantities(v)))
+        return motions
+
+    def kinetic_energy(self) -> Expr:
+        """Return T; bases that are free contribute as in the docstring of the module."""
+        terms: list[Expr] = []
+        momenta: list[Matrix] = []
+        for link, (w, v) in zip(self.links, self.motions(free=False), strict=True):
+            velocity = as_quantities(v + w.cross(exact_vector(link.inertia.center)))
             momenta.append(exact_number(link.inertia.mass) * velocity)
             terms.append(velocity.dot(momenta[-1]) / 2)
-            terms.append((turning[-1].T * exact_matrix(link.inertia.matrix) * turning[-1])[0] / 2)
-            terms.append(self.of_rates(joint, (joint.armature,)))
+            terms.append((w.T * exact_matrix(link.inertia.matrix) * w)[0] / 2)
+            terms.append(self.of_rates(link.joint, (link.joint.armature,)))
         return Add(*terms, *self.free_bases(momenta))
 
     def free_bases(self, momenta: list[Matrix]) -> Iterator[Expr]:
@@ -238,6 +241,21 @@ class Tree:
         """Return Rayleigh's function of the damping of joints."""
         return Add(*(self.of_rates(joint, joint.damping) for joint in self.joints.values()))
 
+    def forces_of_medium(self, rates: Sequence[Symbol]) -> list[Expr]:
+        """Return generalised forces: the sums of loads times the derivatives of their velocities by the rates."""
+        loads, velocities = list[Expr](), list[Expr]()
+        for link, (w, v) in zip(
+            self.links, self.motions(free=True) if any(link.inertia.wet for link in self.links) else (), strict=False
+        ):
+            for pose, law in link.inertia.wet:
+                axes = exact_matrix(pose.rotation).T
+                spin, speed = (as_quantities(axes * x) for x in (w, v + w.cross(exact_vector(pose.position))))
+                velocities += [*spin, *speed]
+                loads += law(spin, speed)
+        values = {Symbol(f"_load{k}", real=True): intermediate(load) for k, load in enumerate(loads)}
+        power = Add(*(load * velocity for load, velocity in zip(values, velocities, strict=True)))
+        return [slope.xreplace(values) for slope in gradient_tuple(power, rates)]
+
     def contacts(self) -> tuple[ContactLike, ...]:
         """Return the contacts q >= low and q <= high of joints with limits, and the dry friction of joints."""
         contacts: list[ContactLike] = []
@@ -268,12 +286,17 @@ class Tree:
                 raise SystemDefinitionError(f"there is no hinge or slide '{name}' to act on{closest(name, singles)}")
         free = [joint for joint in self.joints.values() if joint.kind == "free"]
         turning = [rotation_of(joint) for joint in self.joints.values() if joint.kind in ("ball", "free")]
+        places = [*chain.from_iterable(map(position_of, free)), *singles]
+        spins = [rate for rotation in turning for rate in rotation.rates]
+        loads = iter(self.forces_of_medium([*(symbol(name + DOT) for name in places), *spins]))
+        forces = {name: next(loads) + (symbol(f"tau_{name}") if name in driven else 0) for name in places}
         return {
-            "coordinates": [symbol(name) for name in (*chain.from_iterable(map(position_of, free)), *singles)],
+            "coordinates": [*map(symbol, places)],
             "rotations": {rotation.name: rotation.rate for rotation in turning},
             "lagrangian": self.kinetic_energy() - self.potential_energy(),
             "dissipation": self.dissipation(),
-            "forces": {name: symbol(f"tau_{name}") for name in driven},
+            "forces": {name: force for name, force in forces.items() if force != 0},
+            "torques": {turn.name: torque for turn in turning if any(torque := [next(loads) for _ in range(3)])},
             "inputs": [f"tau_{name}" for name in driven],
         }
 

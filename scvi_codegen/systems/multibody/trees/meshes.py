@@ -9,6 +9,7 @@ takes all volumes as positive, first from the centroid of the surface, whence th
 
 from io import BytesIO
 from pathlib import Path
+from xml.etree.ElementTree import Element as Node
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,17 +21,18 @@ from scvi_codegen.systems.multibody.trees.document import Element, bytes_of
 from scvi_codegen.systems.multibody.trees.tree import Inertia, Vector
 
 
-def mesh_of(geom: Element) -> Element:
-    """Return the ``<mesh>`` of a geom, whose name is by default that of its file."""
+def inertia_of(geom: Element, computed: dict[Node, Inertia]) -> Inertia:
+    """Return the inertia of the ``<mesh>`` of a geom, of density 1, whose name is by default that of its file."""
     meshes = [mesh for assets in geom.document.children("asset") for mesh in assets.children("mesh")]
     names = {mesh.node.get("name", Path(mesh.node.get("file", "")).stem): mesh for mesh in meshes}
     if (name := geom.text("mesh")) not in names:
         geom.refuse(f"names the mesh '{name}', which is not in <asset>{closest(name, names)}")
-    return names[name]
+    node = names[name].node
+    computed[node] = computed.get(node) or _inertia(names[name])
+    return computed[node]
 
 
-def inertia_of(mesh: Element) -> Inertia:
-    """Return the inertia of a ``<mesh>`` of density 1."""
+def _inertia(mesh: Element) -> Inertia:
     rule, (corners, faces) = mesh.choice("inertia", "legacy", "convex", "exact", "shell"), _read(mesh)
     if rule == "convex" and mesh.number("maxhullvert", -1) > 0:
         mesh.refuse("has inertia='convex' and maxhullvert, a hull that is not computed: remove one")
@@ -79,7 +81,7 @@ def _read(mesh: Element) -> tuple[Vector, NDArray[np.intp]]:
     if mesh.has("file"):
         file, settings = Path(mesh.text("file")), mesh.settings
         file = Path(file.name) if settings.choice("strippath", "false", "true") == "true" else file
-        file = mesh.path(settings.text("meshdir", settings.text("assetdir", "")) / file)
+        file = mesh.path(str(settings.text("meshdir", settings.text("assetdir", "")) / file))
         data, trimesh = BytesIO(bytes_of(file)), imported("trimesh", "meshes")
         try:
             read = trimesh.load_scene(data, file_type=file.suffix[1:].lower(), process=False).to_geometry()

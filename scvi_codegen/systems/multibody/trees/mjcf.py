@@ -8,9 +8,11 @@ import re
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import combinations, zip_longest
 from os import PathLike
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -19,8 +21,9 @@ from scvi_codegen.common.errors import closest
 from scvi_codegen.systems.formulas.rotations import matrix_of
 from scvi_codegen.systems.multibody.trees.closures import Closure, Coupling, at_reference
 from scvi_codegen.systems.multibody.trees.document import Element, Unread, root_of
-from scvi_codegen.systems.multibody.trees.macros import write_out
-from scvi_codegen.systems.multibody.trees.meshes import inertia_of, mesh_of
+from scvi_codegen.systems.multibody.trees.fluid import box, ellipsoid
+from scvi_codegen.systems.multibody.trees.macros import Macros
+from scvi_codegen.systems.multibody.trees.meshes import inertia_of
 from scvi_codegen.systems.multibody.trees.schema import MJCF, TURN
 from scvi_codegen.systems.multibody.trees.tendons import Tendon
 from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about, named
@@ -28,14 +31,8 @@ from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Li
 Sizes = Vector
 
 
-def _ellipsoid(size: Sizes) -> tuple[float, Vector]:
-    squares = size**2
-    return 4 / 3 * np.pi * float(np.prod(size)), (squares.sum() - squares) / 5
-
-
-def _box(size: Sizes) -> tuple[float, Vector]:
-    squares = size**2
-    return 8 * float(np.prod(size)), (squares.sum() - squares) / 3
+def _solid(size: Sizes, volume: float, share: float) -> tuple[float, Vector]:
+    return volume * float(np.prod(size)), (np.sum(size**2) - size**2) / share
 
 
 def _cylinder(size: Sizes) -> tuple[float, Vector]:
@@ -55,9 +52,9 @@ def _capsule(size: Sizes) -> tuple[float, Vector]:
 
 
 SHAPES: dict[str, tuple[int, Callable[[Sizes], tuple[float, Vector]]]] = {
-    "sphere": (1, lambda size: _ellipsoid(np.repeat(size[0], 3))),
-    "ellipsoid": (3, _ellipsoid),
-    "box": (3, _box),
+    "sphere": (1, lambda size: _solid(np.repeat(size[0], 3), 4 / 3 * np.pi, 5)),
+    "ellipsoid": (3, lambda size: _solid(size, 4 / 3 * np.pi, 5)),
+    "box": (3, lambda size: _solid(size, 8.0, 3)),
     "cylinder": (2, _cylinder),
     "capsule": (2, _capsule),
 }
@@ -68,6 +65,8 @@ length along z, of a capsule without its caps."""
 
 WEIGHTLESS = ("plane", "hfield")
 ORIENTATIONS = TURN.split()
+NO_MASS = 1e-15
+"""Bodies with less mass are without forces of a medium, and boxes have no smaller sums of moments of inertia."""
 AXES = dict(zip("xyz", np.eye(3), strict=True))
 Defaults = dict[str, dict[str, str]]
 """Attributes by kind of element."""
@@ -100,12 +99,12 @@ def _document(path: Path, around: tuple[Path, ...] = ()) -> Element:
     root.places.update(settings.places)
     _apply_defaults(root)
     models = {}
-    for asset in (asset for section in root.children("asset") for asset in section.children("model")):
-        if (file := asset.path(Path(asset.text("file")))).resolve() in around:
+    for asset in (model for assets in root.children("asset") for model in assets.children("model")):
+        if (file := asset.path(asset.text("file"))).resolve() in around:
             asset.refuse(f"names '{file}', which contains this document")
         model = _document(file, around)
         models[asset.node.get("name", model.node.get("model", ""))] = model
-    write_out(root, models, _MujocoModel.pose)
+    Macros(root, models, _MujocoModel.pose)
     return root
 
 
@@ -118,6 +117,8 @@ class _MujocoModel:
         flags = _merged(root, "flag", [flag for each in root.children("option") for flag in each.children("flag")])
         self.disabled = {key for key in flags.node.attrib if flags.choice(key, "enable", "disable") == "disable"}
         self.gravity = option.vector("gravity", (0, 0, -9.81)) * ("gravity" not in self.disabled)
+        medium = [option.number(key, 0, 0) for key in ("density", "viscosity")]
+        self.medium = () if not any(medium) or {"spring", "damper"} <= self.disabled else medium
         self.links: list[Link] = []
         self.compensating: list[Element] = []
         self.meshes: dict[ElementTree.Element, Inertia] = {}
@@ -214,7 +215,7 @@ class _MujocoModel:
         lift = body.number("gravcomp", 0) * (not {"spring", "damper"} <= self.disabled)
         inertia = Inertia() if fixed else self.inertia(body)
         lifted = lift * inertia.mass, lift * inertia.mass * inertia.center
-        self.links.append(Link(name, parent, carried, replace(inertia, lift=lifted)))
+        self.links.append(Link(name, parent, carried, replace(inertia, lift=lifted, wet=self.wet(body, inertia))))
         return place
 
     def contents(self, body: Element, *tags: str) -> Iterator[tuple[Element, Pose]]:
@@ -412,14 +413,21 @@ class _MujocoModel:
             return Inertia()
         shell = geom.choice("shellinertia", "false", "true") == "true"
         if shape == "mesh" and not shell:
-            if (mesh := mesh_of(geom)).node not in self.meshes:
-                self.meshes[mesh.node] = inertia_of(mesh)
-            inertia = self.meshes[mesh.node]
+            inertia = inertia_of(geom, self.meshes)
             return inertia.scaled(density if np.isnan(mass) else mass / inertia.mass).seen_from(self.pose(geom))
         if shape not in SHAPES or geom.has("mesh") or shell:
             geom.refuse(f"is a {shape} whose inertia is not computed: give its body an <inertial>")
-        count, volume_and_inertia = SHAPES[shape]
-        size = geom.vector("size", sizes=(1, 2, 3))
+        size = self.size(geom, shape)
+        with np.errstate(all="ignore"):
+            volume, moments = SHAPES[shape][1](size)
+        if not (0 < volume < np.inf and np.isfinite(moments).all()):
+            geom.refuse(f"has size='{geom.text('size')}', whose volume is {volume:g}: use other units of length")
+        mass = density * volume if np.isnan(mass) else mass
+        return Inertia(mass, matrix=mass * np.diag(moments)).seen_from(self.pose(geom))
+
+    def size(self, geom: Element, shape: str) -> Vector:
+        """Return the sizes of a geom, by ``size`` and ``fromto``."""
+        count, size = SHAPES[shape][0], geom.vector("size", sizes=(1, 2, 3))
         if geom.has("fromto"):
             ends = geom.vector("fromto", sizes=(6,))
             if shape == "sphere":
@@ -427,12 +435,28 @@ class _MujocoModel:
             size = np.array([size[0]] * (count - 1) + [float(np.linalg.norm(ends[3:] - ends[:3])) / 2])
         if len(size) < count or (size[:count] <= 0).any():
             geom.refuse(f"is a {shape} and has size='{geom.text('size')}': {count} numbers > 0 are needed")
-        with np.errstate(all="ignore"):
-            volume, moments = volume_and_inertia(size[:count])
-        if not (0 < volume < np.inf and np.isfinite(moments).all()):
-            geom.refuse(f"has size='{geom.text('size')}', whose volume is {volume:g}: use other units of length")
-        mass = density * volume if np.isnan(mass) else mass
-        return Inertia(mass, matrix=mass * np.diag(moments)).seen_from(self.pose(geom))
+        return size[:count]
+
+    def wet(self, body: Element, inertia: Inertia) -> tuple[tuple[Pose, Any], ...]:
+        """Return the ellipsoids of a body in a medium or, if it has none, the box of its mass and inertia."""
+        parts = [(part, frame @ self.pose(part)) for part, frame in self.contents(body, "geom", "inertial")]
+        if not self.medium or inertia.mass < NO_MASS:
+            return ()
+        laws: list[tuple[Pose, Any]] = []
+        for geom, pose in parts:
+            if geom.choice("fluidshape", "none", "ellipsoid") == "ellipsoid":
+                if (shape := geom.text("type", "sphere")) not in SHAPES or geom.has("mesh"):
+                    geom.refuse("has fluidshape='ellipsoid', which is read of shapes with sizes only")
+                size = self.size(geom, shape)
+                axes = size[[0, 0, -1] if len(size) < 3 else [0, 1, 2]] + (shape == "capsule") * size[0] * AXES["z"]
+                coefficients = geom.vector("fluidcoef", (0.5, 0.25, 1.5, 1, 1), (5,))
+                laws.append((pose, partial(ellipsoid, axes, coefficients, *self.medium)))
+        turns = [*(pose.rotation for _, pose in parts), np.eye(3), np.linalg.eigh(inertia.matrix)[1]]
+        inner = [turn.T @ inertia.matrix @ turn for turn in turns]  # of equal moments, the axes are those of a geom
+        off = [np.abs(matrix - np.diag(np.diag(matrix))).max() < 1e-9 * np.abs(matrix).max() for matrix in inner]
+        moments = np.diag(inner[k := (*off[:-1], True).index(True)])
+        edges = np.sqrt(6 * np.maximum(moments.sum() - 2 * moments, NO_MASS) / inertia.mass)
+        return tuple(laws) or ((Pose(inertia.center, turns[k]), partial(box, edges, *self.medium)),)
 
     @staticmethod
     def pose(element: Element) -> Pose:
@@ -521,7 +545,7 @@ def _include(root: Element) -> None:
                 child.refuse(f"must have only file, a path relative to the folder of the document: '{name}'")
             folders = [Path(file).parent for file in (root.file, child.file)]
             path = next((folder / name for folder in folders if (folder / name).exists()), folders[0] / name)
-            child.path(path.resolve())
+            child.path(str(path.resolve()))
             if path.resolve() in read:
                 child.refuse(f"names '{name}', which is included already")
             read.add(path.resolve())

@@ -67,12 +67,11 @@ MJCF = {
         "lengthrange~",
     ),
     "option": Kind(
-        "gravity",
+        "gravity density viscosity",
         "actuatorgroupdisable apirate ccd_iterations ccd_tolerance collision cone impratio integrator iterations "
         "jacobian ls_iterations ls_tolerance magnetic mpr_iterations mpr_tolerance noslip_iterations noslip_tolerance "
-        "o_friction o_margin o_solimp o_solref sdf_initpoints sdf_iterations sleep_tolerance solver timestep tolerance "
-        "wind",
-        {"density": "0", "viscosity": "0"},
+        "o_friction o_margin o_solimp o_solref sdf_initpoints sdf_iterations sleep_tolerance solver timestep tolerance",
+        {"wind": "0"},
         "flag",
     ),
     "flag": Kind(
@@ -88,11 +87,10 @@ MJCF = {
     ),
     "asset": Kind(children="model=asset_model* mesh* hfield~ skin~ texture~ material~"),
     "mesh": Kind(
-        "name class file vertex face scale refpos refquat inertia maxhullvert builtin",
-        "content_type material normal params smoothnormal texcoord",
-        None,
-        "plugin~",
-        "mesh",
+        "name class file vertex face scale refpos refquat inertia maxhullvert builtin content_type material normal "
+        "params smoothnormal texcoord",
+        children="plugin~",
+        defaults="mesh",
     ),
     "asset_model": Kind("name file", "content_type"),
     "worldbody": Kind(children=BODIES),
@@ -109,8 +107,9 @@ MJCF = {
     ),
     "freejoint": Kind("name", "align group"),
     "geom": Kind(
-        f"name class type pos {TURN} fromto size mass density shellinertia mesh group contype conaffinity",
-        "adhesion castshadow condim fitscale fluidcoef fluidshape friction gap hfield margin material priority rgba "
+        f"name class type pos {TURN} fromto size mass density shellinertia mesh group contype conaffinity "
+        "fluidcoef fluidshape",
+        "adhesion castshadow condim fitscale friction gap hfield margin material priority rgba "
         "solimp solmix solref surfacevel user",
         None,
         "plugin!",

@@ -6,6 +6,7 @@ import re
 import unicodedata
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,30 +52,32 @@ class Inertia:
 
     Attributes:
         lift: mass whose weight is compensated, and its first moment.
+        wet: poses of bodies in a medium, and torque and force as functions of their velocities (:mod:`fluid`).
     """
 
     mass: float = 0.0
     center: Vector = field(default_factory=lambda: np.zeros(3))
     matrix: Vector = field(default_factory=lambda: np.zeros((3, 3)))
     lift: tuple[float, Vector] = field(default_factory=lambda: (0.0, np.zeros(3)))
+    wet: tuple[tuple[Pose, Any], ...] = ()
 
     def seen_from(self, pose: Pose) -> Inertia:
         """Return the inertia in the frame in which its own frame has the given pose."""
         turned = pose.rotation @ self.matrix @ pose.rotation.T
         lift = self.lift[0], self.lift[0] * pose.position + pose.rotation @ self.lift[1]
-        return Inertia(self.mass, pose.position + pose.rotation @ self.center, turned, lift)
+        wet = tuple((pose @ at, law) for at, law in self.wet)
+        return Inertia(self.mass, pose.position + pose.rotation @ self.center, turned, lift, wet)
 
     def scaled(self, factor: float) -> Inertia:
         """Return the inertia of a body of another density."""
-        return Inertia(
-            self.mass * factor, self.center, self.matrix * factor, (self.lift[0] * factor, self.lift[1] * factor)
-        )
+        lift = self.lift[0] * factor, self.lift[1] * factor
+        return replace(self, mass=self.mass * factor, matrix=self.matrix * factor, lift=lift)
 
     def __add__(self, other: Inertia) -> Inertia:
         mass = self.mass + other.mass
         center = (self.mass * self.center + other.mass * other.center) / mass if mass else self.center
         lift = self.lift[0] + other.lift[0], self.lift[1] + other.lift[1]
-        return Inertia(mass, center, sum((part.about(center) for part in (self, other)), np.zeros((3, 3))), lift)
+        return Inertia(mass, center, self.about(center) + other.about(center), lift, self.wet + other.wet)
 
     def about(self, point: Vector) -> Vector:
         """Return the inertia matrix about a point (parallel axis theorem)."""
