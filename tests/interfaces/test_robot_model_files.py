@@ -65,6 +65,13 @@ def test_urdf_has_inputs_and_a_floating_base():
     assert "tau_shoulder" in model.system.inputs
 
 
+def test_impossible_inertias_are_integrated_if_the_file_says_so(tmp_path):
+    text = (ROBOTS / "arm.urdf").read_text().replace('izz="0.003"', 'izz="0.3"')
+    (tmp_path / "arm.urdf").write_text(text)
+    with pytest.warns(sc.SystemDefinitionWarning, match="which no body has"):
+        parse_model('[system]\nrobot = "arm.urdf"\ncheck_inertias = false\n', folder=tmp_path)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -76,6 +83,7 @@ def test_urdf_has_inputs_and_a_floating_base():
         ('[system]\nrobot = "arm.urdf"\nfloating = 1\n', "floating must be true or false, not 1"),
         ("[system]\nrobot = 3\n", "robot must be text between quotes"),
         (BALL + "actuated = 3\n", "actuated"),
+        (BALL + "check_inertias = 0\n", "check_inertias must be true or false, not 0"),
     ],
 )
 def test_mistakes_in_the_section_of_a_robot_are_named(text, message):

@@ -33,6 +33,7 @@ def test_warning_points_to_the_calling_line(act):
     ("q", "velocity", "reported"),
     [
         ([1.001, 0.0], [0.0, 1.0], r"x\*\*2 \+ y\*\*2 - 1 is 0.002, not 0"),
+        ([0.6006, 0.8008], [-0.8, 0.6], r"\(relative\): x\*\*2 \+ y\*\*2 - 1 is 0.002, not 0"),  # its rate is 1e-16
         ([1.0, 0.0], [0.001, 1.0], r"the rate of x\*\*2 \+ y\*\*2 - 1 is 0.002, not 0"),
         (
             [1.001, 0.0],

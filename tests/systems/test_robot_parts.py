@@ -1,4 +1,4 @@
-"""Parts of MJCF that are computed from others: macros."""
+"""Parts of MJCF that are computed from others: macros, and inertias of meshes."""
 
 import re
 
@@ -36,11 +36,7 @@ def test_macros_are_written_out(tmp_path):
 
 WRONG = {
     "count": ('count="2"', 'count="2.5"', "count='2.5', which must be a whole number"),
-    "model": (
-        'model="leg" body',
-        'model="lge" body',
-        "<attach> 'attach' names the model 'lge', which is not in <asset>",
-    ),
+    "model": ('model="leg" body', 'model="lge" body', "names the model 'lge', which is not in <asset>"),
     "part": ('body="thigh"', 'body="thihg"', "names the body 'thihg', which does not exist; did you mean 'thigh'?"),
     "file": ("leg.xml", "none.xml", "none.xml cannot be read"),
     "outside": ("leg.xml", "../leg.xml", "names '../leg.xml' outside the folder of the document"),
@@ -48,17 +44,6 @@ WRONG = {
     "whole": ('<attach body="own"', "<attach ", "needs a model, a body or a frame, and not both of these"),
     "inside": ('<joint name="o"/>', '<attach body="own" prefix="y"/>', "is attached before it is written out"),
 }
-
-
-@pytest.mark.parametrize("change", WRONG)
-def test_malformed_macros_are_refused_by_name(change, tmp_path):
-    old, new, message = WRONG[change]
-    (tmp_path / "leg.xml").write_text(LEG)
-    (tmp_path / "macros.xml").write_text(MACROS.replace(old, new))
-    with pytest.raises(SystemDefinitionError, match=re.escape(message)):
-        sc.LagrangianSystem.from_mjcf(tmp_path / "macros.xml")
-
-
 BOX = "-1 -.5 -.25 0 -.5 -.25 -1 .5 -.25 0 .5 -.25 -1 -.5 .25 0 -.5 .25 -1 .5 .25 0 .5 .25"
 FACES = "0 2 1 1 2 3 4 5 6 5 7 6 0 1 4 1 5 4 2 6 3 3 6 7 0 4 2 2 4 6 1 3 5 3 7 5"
 BOXES = f'vertex="{BOX} {BOX.replace("-1", "2").replace(" 0 ", " 3 ")}"'
@@ -101,9 +86,9 @@ def test_meshes_are_read_from_files(tmp_path):
 
 
 MESHES = {
-    "file": ('file="no.stl"', "no.stl cannot be read"),
-    "format": ('file="mesh.xml"', "cannot be read as STL, OBJ or another known format"),
-    "outside": ('file="../m.stl"', "outside the folder of the document"),
+    "mesh file": ('file="no.stl"', "no.stl cannot be read"),
+    "format": ('file="leg.xml"', "cannot be read as STL, OBJ"),
+    "mesh outside": ('file="../m.stl"', "outside the folder of the document"),
     "orientation": (BOXES.replace("0 2 1", "0 1 2") + ' inertia="exact"', "has triangles with opposite orientations"),
     "volume": (f'vertex="{BOX}" face="0 1 2" inertia="exact"', "has the volume"),
     "corner": (BOXES.replace("0 2 1", "0 2 99"), "and faces of 3 of their numbers each"),
@@ -111,11 +96,12 @@ MESHES = {
 }
 
 
-@pytest.mark.parametrize("case", MESHES)
-def test_malformed_meshes_are_refused_by_name(case, tmp_path):
-    if "file=" in MESHES[case][0]:
+@pytest.mark.parametrize("case", [*WRONG, *MESHES])
+def test_malformed_parts_are_refused_by_name(case, tmp_path):
+    file, (old, *new, message) = tmp_path / "macros.xml", (WRONG | MESHES)[case]
+    if "file=" in old:
         pytest.importorskip("trimesh", reason="pip install trimesh")
-    file, (attributes, message) = tmp_path / "mesh.xml", MESHES[case]
-    file.write_text(MESH.format(attributes, '<geom type="mesh" mesh="m"/>'))
-    with pytest.raises(SystemDefinitionError, match=message):
+    (tmp_path / "leg.xml").write_text(LEG)
+    file.write_text(MACROS.replace(old, *new) if new else MESH.format(old, '<geom type="mesh" mesh="m"/>'))
+    with pytest.raises(SystemDefinitionError, match=re.escape(message)):
         links_of_mjcf(file)

@@ -172,7 +172,7 @@ MUJOCO_CHANGES = {
     "large": ('size="0.05"', 'size="1e200"', "magnitude must be less than 1e+40"),
     "negative": ('damping="0.1"', 'damping="-0.1"', "damping -0.1, which must not be < 0"),
     "impossible inertia": ('fullinertia="0.1 0.2 0.15', 'fullinertia="0.1 0.2 1.5', "which no body has"),
-    "medium": ("<option", '<option density="1.2"', "density='1.2', which changes the motion"),
+    "medium": ("<option", '<option wind="1 0 0"', "wind='1 0 0', which changes the motion"),
     "tendon of a class": (
         "</mujoco>",
         '<default><tendon damping="1"/></default><tendon><fixed><joint joint="no" coef="1"/></fixed></tendon></mujoco>',
@@ -249,7 +249,7 @@ def test_nested_includes_flags_and_groups_of_geoms_are_read(tmp_path):
     base = '<body name="base"><geom type="mesh" mesh="m"/>'  # fixed to the world
     file.write_text(text.replace(inside, f"{base}{inside}</body>"))
     assert sc.LagrangianSystem.from_mjcf(file).lagrangian == one.lagrangian
-    file.write_text(text.replace("<worldbody>", '<compiler boundmass="0.1"/><worldbody>'))
+    file.write_text(text.replace("<worldbody>", '<compiler coordinate="global"/><worldbody>'))
     with pytest.raises(SystemDefinitionError, match="which changes the motion"):
         sc.LagrangianSystem.from_mjcf(file)
 
@@ -428,6 +428,14 @@ MOTIONS = {
     "tendon of balls": (*BALLS, SPATIAL.format('stiffness="3" springlength=".2" armature=".4" damping=".2"')),
     "springs of balls": (*BALLS, ""),
     "free body": ('<joint name="α" type="free" stiffness="3 2 1" damping="1 2 3"/>', HINGES[1], ""),
+    "medium": (*HINGES, '<option density="1000" viscosity=".9"/>'),
+    "free in a medium": ('<freejoint name="f"/><geom size=".2"/>', BALLS[1], '<option density="9" viscosity="1"/>'),
+    "bounds of inertias": (*HINGES, '<compiler boundmass="30" boundinertia=".2"/>'),
+    "balanced inertia": (
+        HINGES[0],
+        HINGES[1] + '<inertial pos=".1 0 0" mass="1" diaginertia=".1 .2 .9"/>',
+        '<compiler balanceinertia="true"/>',
+    ),
     "polynomials": (
         '<joint name="1-a" axis="1 2 3" stiffness="1 2 3" damping="3 2 1" springref="10"/>',
         '<joint name="t" type="slide" stiffness="3 -2" damping="1 2"/>',

@@ -120,6 +120,11 @@ def _worst(stepper: Integrator, q: Array, p: Array, t: float, parameters: Parame
     values = constraint_values(stepper, q, p, t, parameters)[:, 0]
     worst = np.abs(values).argmax(axis=1)
     largest = values[np.arange(2), worst]
+    scales = np.full(2, np.abs(largest).max())
+    if stepper.dimension <= MOST_DENSE:  # sums of |G_i x_i| of the positions and of the velocities x
+        rows = _linearised(stepper, t, parameters)(q)[1][worst]
+        places = np.stack([q, stepper._transform("velocity", q, p, t, parameters, "p")])
+        scales = np.fmax(scales, np.abs(rows * places).sum(axis=1))
     names = [stepper.constraints[k] for k in worst]
     from scvi_codegen.systems.formulas.rotations import RotationNames  # imports SymPy
 
@@ -129,8 +134,8 @@ def _worst(stepper: Integrator, q: Array, p: Array, t: float, parameters: Parame
         names[1] = f"the rate of {names[1]}"
     descriptions = [
         f"{name} is {value:.3g}"
-        for name, value in zip(names, largest, strict=True)
-        if abs(value) > ROUNDING_UNITS * np.finfo(float).eps * np.abs(largest).max()
+        for name, value, scale in zip(names, largest, scales, strict=True)
+        if abs(value) > ROUNDING_UNITS * np.finfo(float).eps * scale
     ]
     return f"{' and '.join(descriptions)}, not 0"
 

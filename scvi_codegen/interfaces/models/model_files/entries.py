@@ -19,7 +19,7 @@ from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 from scvi_codegen.systems.system import MechanicalSystem
 
-ROBOT_KEYS = ("robot", "name", "actuated", "time_transformation")
+ROBOT_KEYS = ("robot", "name", "actuated", "check_inertias", "time_transformation")
 URDF_KEYS = ("floating", "gravity")
 URDF = ".urdf"
 ROBOT_FILES = (URDF, ".xml", ".mjcf")
@@ -75,9 +75,10 @@ def _robot(section: Section, folder: Path) -> Entry:
     urdf = path.suffix.lower() == URDF
     keys = (*ROBOT_KEYS, *URDF_KEYS) if urdf else ROBOT_KEYS
     check_keys(section, keys, "key", f"[system] beside robot = {path.name!r}")
-    arguments: dict[str, Any] = {key: section[key] for key in ("name", "actuated", *URDF_KEYS) if key in section}
-    if not isinstance(arguments.get("floating", False), bool):
-        raise ModelFileError(f"[system] floating must be true or false, not {arguments['floating']!r}")
+    arguments: dict[str, Any] = {key: section[key] for key in (*ROBOT_KEYS[1:-1], *URDF_KEYS) if key in section}
+    for key in ("floating", "check_inertias"):
+        if not isinstance(arguments.get(key, False), bool):
+            raise ModelFileError(f"[system] {key} must be true or false, not {arguments[key]!r}")
     if "name" in arguments:
         text_of(section, "name", "[system]")
     read: Any = LagrangianSystem.from_urdf if urdf else LagrangianSystem.from_mjcf

@@ -9,7 +9,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 from xml.etree import ElementTree
 from xml.parsers import expat
 
@@ -29,13 +29,8 @@ NAMED = 5
 """Number of names that a warning lists of each kind of parts."""
 
 
-class Place(NamedTuple):
-    """File and line of an element, the nearest one around it that has a name, and the outermost one of its document."""
-
-    file: str
-    line: int
-    around: str
-    document: Any = None
+Place = tuple[str, int, str, Any]
+"""Path of a document, number of a line, the nearest element around it that has a name, and the outermost element."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,12 +48,12 @@ class Element:
     @property
     def file(self) -> str:
         """Path of the document."""
-        return self.places[self.node].file
+        return self.places[self.node][0]
 
     @property
     def document(self) -> Element:
         """Outermost element of a document of MJCF, also of one that is attached to another."""
-        document: Element = self.places[self.node].document
+        document: Element = self.places[self.node][3]
         return document
 
     @property
@@ -232,7 +227,7 @@ def root_of(path: Path, *tags: str) -> Element:
         )
         raise SystemDefinitionError(f"{path} begins with <{node.tag}>, not with <{tags[0]}>{other}")
     root = Element(node, places)
-    places.update({node: place._replace(document=root) for node, place in places.items()})
+    places.update({node: (*place[:3], root) for node, place in places.items()})
     return root
 
 
@@ -258,7 +253,7 @@ def _parsed(data: bytes, file: str) -> tuple[ElementTree.Element, dict[ElementTr
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         node = builder.start(tag, attributes)
-        places[node] = Place(file, parser.CurrentLineNumber, around[-1])
+        places[node] = file, parser.CurrentLineNumber, around[-1], None
         around.append(f"<{tag}> '{attributes['name']}'" if attributes.get("name") else around[-1])
 
     def end(tag: str) -> None:

@@ -44,7 +44,6 @@ from sympy import Abs, Add, Expr, Matrix, Rational, S, Symbol, atan2, cos, eye, 
 
 from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
 from scvi_codegen.systems.contact import ContactLike, contact, friction
-from scvi_codegen.systems.formulas.expressions import gradient_tuple
 from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.formulas.rotations import Rotation, RotationNames
 from scvi_codegen.systems.formulas.symbols import DOT, default_momenta, symbol
@@ -238,23 +237,15 @@ class Tree:
         yield atan2(sqrt(Add(*(x**2 for x in twice)) / 4 + TINY), (turn.trace() - 1) / 2)
 
     def dissipation(self) -> Expr:
-        """Return Rayleigh's function of the damping of joints."""
-        return Add(*(self.of_rates(joint, joint.damping) for joint in self.joints.values()))
-
-    def forces_of_medium(self, rates: Sequence[Symbol]) -> list[Expr]:
-        """Return generalised forces: the sums of loads times the derivatives of their velocities by the rates."""
-        loads, velocities = list[Expr](), list[Expr]()
-        for link, (w, v) in zip(
-            self.links, self.motions(free=True) if any(link.inertia.wet for link in self.links) else (), strict=False
-        ):
-            for pose, law in link.inertia.wet:
-                axes = exact_matrix(pose.rotation).T
-                spin, speed = (as_quantities(axes * x) for x in (w, v + w.cross(exact_vector(pose.position))))
-                velocities += [*spin, *speed]
-                loads += law(spin, speed)
-        values = {Symbol(f"_load{k}", real=True): intermediate(load) for k, load in enumerate(loads)}
-        power = Add(*(load * velocity for load, velocity in zip(values, velocities, strict=True)))
-        return [slope.xreplace(values) for slope in gradient_tuple(power, rates)]
+        """Return Rayleigh's function of the damping of joints and of the medium."""
+        terms = [self.of_rates(joint, joint.damping) for joint in self.joints.values()]
+        motions = self.motions(free=True) if any(link.inertia.drag for link in self.links) else []
+        for link, (w, v) in zip(self.links, motions, strict=False):
+            for pose, coefficients in link.inertia.drag:
+                velocities = w, v + w.cross(exact_vector(pose.position))
+                rates = [x for vector in velocities for x in as_quantities(exact_matrix(pose.rotation).T * vector)]
+                terms += [integral(pair, Abs(x)) for pair, x in zip(coefficients, rates, strict=True)]
+        return Add(*terms)
 
     def contacts(self) -> tuple[ContactLike, ...]:
         """Return the contacts q >= low and q <= high of joints with limits, and the dry friction of joints."""
@@ -286,17 +277,12 @@ class Tree:
                 raise SystemDefinitionError(f"there is no hinge or slide '{name}' to act on{closest(name, singles)}")
         free = [joint for joint in self.joints.values() if joint.kind == "free"]
         turning = [rotation_of(joint) for joint in self.joints.values() if joint.kind in ("ball", "free")]
-        places = [*chain.from_iterable(map(position_of, free)), *singles]
-        spins = [rate for rotation in turning for rate in rotation.rates]
-        loads = iter(self.forces_of_medium([*(symbol(name + DOT) for name in places), *spins]))
-        forces = {name: next(loads) + (symbol(f"tau_{name}") if name in driven else 0) for name in places}
         return {
-            "coordinates": [*map(symbol, places)],
+            "coordinates": [symbol(name) for name in (*chain.from_iterable(map(position_of, free)), *singles)],
             "rotations": {rotation.name: rotation.rate for rotation in turning},
             "lagrangian": self.kinetic_energy() - self.potential_energy(),
             "dissipation": self.dissipation(),
-            "forces": {name: force for name, force in forces.items() if force != 0},
-            "torques": {turn.name: torque for turn in turning if any(torque := [next(loads) for _ in range(3)])},
+            "forces": {name: symbol(f"tau_{name}") for name in driven},
             "inputs": [f"tau_{name}" for name in driven],
         }
 

@@ -8,7 +8,6 @@ import re
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
 from itertools import combinations, zip_longest
 from os import PathLike
 from pathlib import Path
@@ -21,7 +20,6 @@ from scvi_codegen.common.errors import closest
 from scvi_codegen.systems.formulas.rotations import matrix_of
 from scvi_codegen.systems.multibody.trees.closures import Closure, Coupling, at_reference
 from scvi_codegen.systems.multibody.trees.document import Element, Unread, root_of
-from scvi_codegen.systems.multibody.trees.fluid import box, ellipsoid
 from scvi_codegen.systems.multibody.trees.macros import Macros
 from scvi_codegen.systems.multibody.trees.meshes import inertia_of
 from scvi_codegen.systems.multibody.trees.schema import MJCF, TURN
@@ -117,8 +115,8 @@ class _MujocoModel:
         flags = _merged(root, "flag", [flag for each in root.children("option") for flag in each.children("flag")])
         self.disabled = {key for key in flags.node.attrib if flags.choice(key, "enable", "disable") == "disable"}
         self.gravity = option.vector("gravity", (0, 0, -9.81)) * ("gravity" not in self.disabled)
-        medium = [option.number(key, 0, 0) for key in ("density", "viscosity")]
-        self.medium = () if not any(medium) or {"spring", "damper"} <= self.disabled else medium
+        passive = not {"spring", "damper"} <= self.disabled
+        self.medium = [option.number(key, 0, 0) * passive for key in ("density", "viscosity")]
         self.links: list[Link] = []
         self.compensating: list[Element] = []
         self.meshes: dict[ElementTree.Element, Inertia] = {}
@@ -213,9 +211,9 @@ class _MujocoModel:
         carried = Joint(name=name, kind="fixed", pose=pose @ Pose(-anchor))
         fixed = self.carriers[place] < 0 and not self.root.settings.has("settotalmass")  # to the world
         lift = body.number("gravcomp", 0) * (not {"spring", "damper"} <= self.disabled)
-        inertia = Inertia() if fixed else self.inertia(body)
+        inertia = Inertia() if fixed else self.bounded(body, self.inertia(body))
         lifted = lift * inertia.mass, lift * inertia.mass * inertia.center
-        self.links.append(Link(name, parent, carried, replace(inertia, lift=lifted, wet=self.wet(body, inertia))))
+        self.links.append(Link(name, parent, carried, replace(inertia, lift=lifted, drag=self.drag(body, inertia))))
         return place
 
     def contents(self, body: Element, *tags: str) -> Iterator[tuple[Element, Pose]]:
@@ -394,6 +392,18 @@ class _MujocoModel:
                 total += self.geom(geom).seen_from(frame)
         return total
 
+    @staticmethod
+    def bounded(body: Element, inertia: Inertia) -> Inertia:
+        """Return an inertia with the smallest mass and moments of the compiler, and balanced if no body has it."""
+        low, least = (body.settings.number(key, 0, 0) for key in ("boundmass", "boundinertia"))
+        balanced = body.settings.choice("balanceinertia", "false", "true") == "true"
+        moments, axes = np.linalg.eigh(inertia.matrix)
+        bounds = np.maximum(moments, least)
+        if balanced and bounds[2] > bounds[0] + bounds[1]:
+            bounds[:] = bounds.mean()
+        same = (bounds == moments).all()
+        return replace(inertia, mass=max(inertia.mass, low), matrix=inertia.matrix if same else axes * bounds @ axes.T)
+
     def inertial(self, inertial: Element) -> Inertia:
         inertial.vector("pos")
         if inertial.has("fullinertia"):
@@ -417,17 +427,8 @@ class _MujocoModel:
             return inertia.scaled(density if np.isnan(mass) else mass / inertia.mass).seen_from(self.pose(geom))
         if shape not in SHAPES or geom.has("mesh") or shell:
             geom.refuse(f"is a {shape} whose inertia is not computed: give its body an <inertial>")
-        size = self.size(geom, shape)
-        with np.errstate(all="ignore"):
-            volume, moments = SHAPES[shape][1](size)
-        if not (0 < volume < np.inf and np.isfinite(moments).all()):
-            geom.refuse(f"has size='{geom.text('size')}', whose volume is {volume:g}: use other units of length")
-        mass = density * volume if np.isnan(mass) else mass
-        return Inertia(mass, matrix=mass * np.diag(moments)).seen_from(self.pose(geom))
-
-    def size(self, geom: Element, shape: str) -> Vector:
-        """Return the sizes of a geom, by ``size`` and ``fromto``."""
-        count, size = SHAPES[shape][0], geom.vector("size", sizes=(1, 2, 3))
+        count, volume_and_inertia = SHAPES[shape]
+        size = geom.vector("size", sizes=(1, 2, 3))
         if geom.has("fromto"):
             ends = geom.vector("fromto", sizes=(6,))
             if shape == "sphere":
@@ -435,28 +436,34 @@ class _MujocoModel:
             size = np.array([size[0]] * (count - 1) + [float(np.linalg.norm(ends[3:] - ends[:3])) / 2])
         if len(size) < count or (size[:count] <= 0).any():
             geom.refuse(f"is a {shape} and has size='{geom.text('size')}': {count} numbers > 0 are needed")
-        return size[:count]
+        with np.errstate(all="ignore"):
+            volume, moments = volume_and_inertia(size[:count])
+        if not (0 < volume < np.inf and np.isfinite(moments).all()):
+            geom.refuse(f"has size='{geom.text('size')}', whose volume is {volume:g}: use other units of length")
+        mass = density * volume if np.isnan(mass) else mass
+        return Inertia(mass, matrix=mass * np.diag(moments)).seen_from(self.pose(geom))
 
-    def wet(self, body: Element, inertia: Inertia) -> tuple[tuple[Pose, Any], ...]:
-        """Return the ellipsoids of a body in a medium or, if it has none, the box of its mass and inertia."""
-        parts = [(part, frame @ self.pose(part)) for part, frame in self.contents(body, "geom", "inertial")]
-        if not self.medium or inertia.mass < NO_MASS:
+    def drag(self, body: Element, inertia: Inertia) -> tuple[tuple[Pose, Any], ...]:
+        """Return the drag on a body in a medium, of the box with the edges b of the same mass and inertia.
+
+        In its axes the torque is -pi beta m^3 w_i - rho/64 b_i (b_j^4 + b_k^4) |w_i| w_i, the force -3 pi beta m v_i
+        - rho/2 b_j b_k |v_i| v_i, with the mean m of b. https://mujoco.readthedocs.io/en/stable/computation/fluid.html
+        """
+        if not any(self.medium) or inertia.mass < NO_MASS:
             return ()
-        laws: list[tuple[Pose, Any]] = []
-        for geom, pose in parts:
-            if geom.choice("fluidshape", "none", "ellipsoid") == "ellipsoid":
-                if (shape := geom.text("type", "sphere")) not in SHAPES or geom.has("mesh"):
-                    geom.refuse("has fluidshape='ellipsoid', which is read of shapes with sizes only")
-                size = self.size(geom, shape)
-                axes = size[[0, 0, -1] if len(size) < 3 else [0, 1, 2]] + (shape == "capsule") * size[0] * AXES["z"]
-                coefficients = geom.vector("fluidcoef", (0.5, 0.25, 1.5, 1, 1), (5,))
-                laws.append((pose, partial(ellipsoid, axes, coefficients, *self.medium)))
+        parts = [(part, frame @ self.pose(part)) for part, frame in self.contents(body, "geom", "inertial")]
+        for part, _ in parts:
+            if part.text("fluidshape", "none") != "none":
+                part.refuse("has fluidshape='ellipsoid' in a medium, whose forces are not computed: remove it")
         turns = [*(pose.rotation for _, pose in parts), np.eye(3), np.linalg.eigh(inertia.matrix)[1]]
         inner = [turn.T @ inertia.matrix @ turn for turn in turns]  # of equal moments, the axes are those of a geom
         off = [np.abs(matrix - np.diag(np.diag(matrix))).max() < 1e-9 * np.abs(matrix).max() for matrix in inner]
         moments = np.diag(inner[k := (*off[:-1], True).index(True)])
-        edges = np.sqrt(6 * np.maximum(moments.sum() - 2 * moments, NO_MASS) / inertia.mass)
-        return tuple(laws) or ((Pose(inertia.center, turns[k]), partial(box, edges, *self.medium)),)
+        b = np.sqrt(6 * np.maximum(moments.sum() - 2 * moments, NO_MASS) / inertia.mass)
+        (rho, beta), m, (c, d) = self.medium, b.mean(), (np.roll(b, -1), np.roll(b, -2))
+        linear = np.repeat([np.pi * beta * m**3, 3 * np.pi * beta * m], 3)
+        square = [*(rho / 64 * b * (c**4 + d**4)), *(rho / 2 * c * d)]
+        return ((Pose(inertia.center, turns[k]), [*zip(linear, square, strict=True)]),)
 
     @staticmethod
     def pose(element: Element) -> Pose:
@@ -550,7 +557,7 @@ def _include(root: Element) -> None:
                 child.refuse(f"names '{name}', which is included already")
             read.add(path.resolve())
             included = root_of(path, "mujocoinclude", "mujoco")
-            root.places.update({node: at._replace(document=root) for node, at in included.places.items()})
+            root.places.update({node: (*place[:3], root) for node, place in included.places.items()})
             children.extendleft(Element(node, root.places) for node in reversed(included.node))
         if len(nodes) != len(outer.node) or any(a.node is not b for a, b in zip(nodes, outer.node, strict=True)):
             outer.node[:] = [element.node for element in nodes]

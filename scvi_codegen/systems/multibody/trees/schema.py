@@ -60,10 +60,11 @@ MJCF = {
         "custom~ extension~ keyframe~ sensor~ size~ statistic~ visual~",
     ),
     "compiler": Kind(
-        "angle assetdir eulerseq autolimits inertiafromgeom inertiagrouprange meshdir settotalmass strippath",
+        "angle assetdir autolimits balanceinertia boundinertia boundmass eulerseq inertiafromgeom inertiagrouprange "
+        "meshdir settotalmass strippath",
         "alignfree conflict convexhull discardvisual exactmeshinertia fitaabb fusestatic passthrough savecanonical "
         "savecompiled saveinertial texturedir usethread",
-        {"balanceinertia": "false", "boundinertia": "0", "boundmass": "0", "coordinate": "local"},
+        {"coordinate": "local"},
         "lengthrange~",
     ),
     "option": Kind(

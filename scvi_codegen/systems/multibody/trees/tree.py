@@ -6,7 +6,6 @@ import re
 import unicodedata
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,21 +51,22 @@ class Inertia:
 
     Attributes:
         lift: mass whose weight is compensated, and its first moment.
-        wet: poses of bodies in a medium, and torque and force as functions of their velocities (:mod:`fluid`).
+        drag: poses of bodies in a medium, and the coefficients b1 and b2 of the loads -b1 x - b2 |x| x for each
+            component x of their angular velocity and of their velocity.
     """
 
     mass: float = 0.0
     center: Vector = field(default_factory=lambda: np.zeros(3))
     matrix: Vector = field(default_factory=lambda: np.zeros((3, 3)))
     lift: tuple[float, Vector] = field(default_factory=lambda: (0.0, np.zeros(3)))
-    wet: tuple[tuple[Pose, Any], ...] = ()
+    drag: tuple[tuple[Pose, Sequence[tuple[float, float]]], ...] = ()
 
     def seen_from(self, pose: Pose) -> Inertia:
         """Return the inertia in the frame in which its own frame has the given pose."""
         turned = pose.rotation @ self.matrix @ pose.rotation.T
         lift = self.lift[0], self.lift[0] * pose.position + pose.rotation @ self.lift[1]
-        wet = tuple((pose @ at, law) for at, law in self.wet)
-        return Inertia(self.mass, pose.position + pose.rotation @ self.center, turned, lift, wet)
+        drag = tuple((pose @ at, coefficients) for at, coefficients in self.drag)
+        return Inertia(self.mass, pose.position + pose.rotation @ self.center, turned, lift, drag)
 
     def scaled(self, factor: float) -> Inertia:
         """Return the inertia of a body of another density."""
@@ -77,7 +77,7 @@ class Inertia:
         mass = self.mass + other.mass
         center = (self.mass * self.center + other.mass * other.center) / mass if mass else self.center
         lift = self.lift[0] + other.lift[0], self.lift[1] + other.lift[1]
-        return Inertia(mass, center, self.about(center) + other.about(center), lift, self.wet + other.wet)
+        return Inertia(mass, center, self.about(center) + other.about(center), lift, self.drag + other.drag)
 
     def about(self, point: Vector) -> Vector:
         """Return the inertia matrix about a point (parallel axis theorem)."""
