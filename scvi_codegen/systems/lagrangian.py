@@ -386,7 +386,7 @@ class LagrangianSystem(MechanicalSystem):
 
         Raises:
             SystemDefinitionError: naming file and element, if something is malformed or unknown, or changes the motion
-                and is not read: equalities of tendons, tendons around geoms, inertias of meshes.
+                and is not read: equalities of tendons, tendons around geoms, drag of ellipsoids.
         """
         from scvi_codegen.systems.multibody.trees.mjcf import links_of_mjcf
 

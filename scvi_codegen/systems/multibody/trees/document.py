@@ -58,8 +58,8 @@ class Element:
 
     @property
     def settings(self) -> Element:
-        """Settings of the compiler of the document."""
-        return self.document.children("compiler")[0]
+        """Settings of the compiler, the first element of the document."""
+        return Element(self.document.node[0], self.document.places)
 
     @property
     def name(self) -> str:

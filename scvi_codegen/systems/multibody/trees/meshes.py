@@ -46,10 +46,10 @@ def _inertia(mesh: Element) -> Inertia:
     if rule == "exact" and len(np.unique(sides, axis=0)) < len(sides):
         mesh.refuse("has triangles with opposite orientations: turn them, or use inertia='convex'")
     scale, turn = mesh.vector("scale", (1, 1, 1)), mesh.vector("refquat", (1, 0, 0, 0), (4,))
-    axes = np.array(matrix_of([*map(float, turn / np.linalg.norm(turn))]), dtype=float)
-    corners = (corners - mesh.vector("refpos", (0, 0, 0))) @ axes * scale
     with np.errstate(all="ignore"):
-        inertia = _integrals(corners[faces][:, :: int(np.sign(np.prod(scale)))], rule)
+        axes = np.array(matrix_of([*map(float, turn / np.linalg.norm(turn))]), dtype=float)
+        corners = (corners - mesh.vector("refpos", (0, 0, 0))) @ axes * scale
+        inertia = _integrals(corners[faces][:, :: -1 if np.prod(scale) < 0 else 1], rule)
     if not inertia.mass > 0:
         mesh.refuse(f"has the volume {inertia.mass:g}: turn its triangles, or use inertia='convex' or 'shell'")
     return inertia
@@ -85,7 +85,7 @@ def _read(mesh: Element) -> tuple[Vector, NDArray[np.intp]]:
         data, trimesh = BytesIO(bytes_of(file)), imported("trimesh", "meshes")
         try:
             read = trimesh.load_scene(data, file_type=file.suffix[1:].lower(), process=False).to_geometry()
-        except (NotImplementedError, ValueError, IndexError, KeyError, TypeError) as error:
+        except Exception as error:  # noqa: BLE001 - of the readers of many formats
             mesh.refuse(f"is in the file {file}, which cannot be read as STL, OBJ or another known format: {error}")
         corners, faces = np.asarray(read.vertices).ravel(), np.ravel(getattr(read, "faces", ()))  # none: a point cloud
     if len(corners) < 12 or len(corners) % 3 or len(faces) % 3 or not set(faces) <= {*range(len(corners) // 3)}:

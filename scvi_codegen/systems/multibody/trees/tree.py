@@ -6,6 +6,7 @@ import re
 import unicodedata
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain, count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -267,7 +268,7 @@ def named(links: Sequence[Link]) -> list[Link]:
     for link in links:
         joint = link.joint
         plain = identifier(joint.name)
-        numbered = (plain, *(f"{plain}_{k}" for k in range(2, len(links) + 2)))
+        numbered = chain([plain], (f"{plain}_{k}" for k in count(2)))
         name = next(name for name in numbered if taken.isdisjoint(_symbols(joint.kind, name)))
         if joint.kind != "fixed":
             taken |= _symbols(joint.kind, name)
