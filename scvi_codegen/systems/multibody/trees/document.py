@@ -119,7 +119,7 @@ class Element:
         """Return the path of a file that is named relative to the folder of the document, which must contain it."""
         if not is_inside(folder := Path(self.document.file).parent, folder / name):
             where = f"copy it there, or name its folder ({FOLDERS})"
-            self.refuse(f"names '{name}' outside the folder of the document: {where}")
+            self.refuse(f"names '{self.text('file')}' outside the folder of the document: {where}")
         return folder / name
 
     def child(self, tag: str) -> Element | None:
