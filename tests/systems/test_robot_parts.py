@@ -23,6 +23,7 @@ MACROS = """<mujoco><asset><model name="leg" file="leg.xml"/></asset><option><fl
 </mujoco>"""
 
 
+@pytest.mark.second
 def test_macros_are_written_out(tmp_path):
     file = tmp_path / "macros.xml"
     (tmp_path / "leg.xml").write_text(LEG)
@@ -58,6 +59,7 @@ RULES = {
 }
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("rule", RULES)
 def test_inertias_of_meshes_are_integrals(rule, tmp_path):
     file, geom, one = tmp_path / "mesh.xml", '<geom type="mesh" mesh="m" mass="2" pos=".1 0 0"/>', []
