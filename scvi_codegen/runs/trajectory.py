@@ -48,7 +48,7 @@ from scvi_codegen.runs.states.words import TwoWords, Words, check_keeps_words, l
 from scvi_codegen.runs.stepping.features import refusal, require
 from scvi_codegen.runs.stepping.projection import constraint_values, multipliers
 from scvi_codegen.runs.stepping.step_plan import FixedSteps
-from scvi_codegen.systems.event import Crossings, Event, EventLike, Switches, as_events
+from scvi_codegen.systems.event import Crossings, Event, EventLike, Kink, Switches, as_events
 
 if TYPE_CHECKING:
     import pandas
@@ -77,7 +77,8 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         stepper: the compiled integrator.
         options: convergence criterion of the solver, ``None`` for the defaults.
         events: zero crossings found, parallel to ``stepper.events``.
-        switches: transitions of contacts, then changes of the side of each kink, in the order of ``stepper.searched``.
+        transitions: ends of modes, of contacts, then of kinks, in the order of ``stepper.searched``; see
+            :attr:`switches` and :attr:`contact_modes`.
         modes: values of ``stepper.modes`` along the run, ``None`` without them.
         plan: step sizes and target time of the run.
         steps, rejected_steps: numbers of completed and of rejected steps since the start of the run.
@@ -97,7 +98,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
 
     iterations: NDArray[np.int32]
     events: tuple[Crossings, ...] = ()
-    switches: tuple[Switches, ...] = ()
+    transitions: tuple[Switches, ...] = field(default=(), repr=False)
     modes: ModeHistory | None = None
     rejected_steps: int = 0
     fallback_steps: int = 0
@@ -155,7 +156,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
             actions=None if self.actions is None else self.actions[rows],
             step_sizes=lengths,
             events=tuple(crossings.chosen((crossings.t >= low) & (crossings.t <= high)) for crossings in self.events),
-            switches=tuple(kink.chosen((kink.t >= low) & (kink.t <= high)) for kink in self.switches),
+            transitions=tuple(of.chosen((of.t >= low) & (of.t <= high)) for of in self.transitions),
             modes=None if self.modes is None else self.modes.between(low, high),
         )
 
@@ -326,6 +327,11 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
             MethodError: if the system has no constraints.
         """
         return self._joined(lambda piece: in_modes(piece, partial(multipliers, piece.stepper)))
+
+    @property
+    def switches(self) -> tuple[Switches, ...]:
+        """Crossings of each kink, with the side after them; those of contacts are :attr:`contact_modes`."""
+        return tuple(of for of in self.transitions if isinstance(of.event, Kink))
 
     @property
     def contact_modes(self) -> list[tuple[float, tuple[str, ...]]]:

@@ -17,7 +17,7 @@ measured (:mod:`scvi_codegen.methods.constraints`).
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
@@ -184,9 +184,9 @@ def contacts_of(tables: Sequence[Mapping[str, Any]]) -> tuple[ContactLike, ...]:
     return tuple(contacts)
 
 
-def names_in(item: ContactLike) -> set[str]:
-    """Return the names in the formulas of a contact."""
-    return set(re.findall(r"[A-Za-z_]\w*", " ".join(map(str, item.table.values()))))
+def names_in(tables: Iterable[Mapping[str, Any]]) -> set[str]:
+    """Return the names in the formulas of contacts, by the tables of these."""
+    return set(re.findall(r"[A-Za-z_]\w*", " ".join(str([*table.values()]) for table in tables)))
 
 
 def contact(

@@ -136,8 +136,7 @@ def _system(
         defaults=tuple(number(parameter, value) for parameter, value in values.items()),
         **others,
     )
-    used = (symbol(name) for item in others.get("contacts", ()) for name in names_in(item))
-    return system, warn_of_mistakes(system, used)
+    return system, warn_of_mistakes(system, map(symbol, names_in(item.table for item in others.get("contacts", ()))))
 
 
 def system_from_sympy(

@@ -192,7 +192,8 @@ def test_modes_have_names_in_messages_only() -> None:
     assert stepper.parameters == ("k", "d")
     assert run.sensitivity().parameters.shape[1:] == (2, 2)
     assert run.pullback(np.ones((len(run), 2))).parameters.shape == (2,)
-    assert run.switches[0].event.title == "contact 1 (slip 'x_dot') stops"
+    assert run.transitions[0].event.title == "contact 1 (slip 'x_dot') stops"
+    assert (run.switches, run.contact_modes) == ((), [(0.0, ("slip",))])
     with pytest.raises(sc.StateError, match=r"no parameter 'f' among k, d$"):
         stepper.integrate([1.0], velocity=[0.0], h=0.1, steps=1, parameters={"f": 1.0})
     with pytest.raises(sc.EventError, match="An event can set: x, x_dot, p_x, k, d"):

@@ -607,4 +607,4 @@ def test_kinks_of_friction_coefficients_are_located() -> None:
     first = (1 - np.sqrt(1 - 0.6)) / 3
     later = 0.7 - first
     assert run.q[-1, 0] == pytest.approx(0.1 + (1 - 3 * first) * later - later**2 / 4, abs=1e-14)
-    assert [round(float(t), 12) for t in run.switches[-1].t] == [round(first, 12)]
+    assert [round(float(t), 12) for t in run.switches[0].t] == [round(first, 12)]

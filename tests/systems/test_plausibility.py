@@ -9,8 +9,8 @@ import scvi_codegen as sc
 from scvi_codegen.interfaces.models.model_files.model_file import parse_model
 
 UNUSED = (
-    "does not occur in the {}, the forces and the constraints of 'system': remove it, unless events, contacts or a "
-    "time transformation, which are not known here, contain it."
+    "does not occur in the {}, the forces and the constraints of 'system': remove it, unless events or a time "
+    "transformation contain it; pass contacts that do to the system."
 )
 x, v, k, m, z = sympy.symbols("x x_dot k m z")
 
@@ -154,3 +154,12 @@ span = 1.0
 def test_a_parameter_that_any_formula_of_a_file_contains_is_used(changed, count):
     text = BY_FILE.format(**{"system": "", "parameters": "", "q": '"0"', "more": "", **changed})
     assert [each[:29] for each in messages(parse_model, text)] == ["parameter 'k' does not occur "] * count
+
+
+@pytest.mark.parametrize("coordinates", [["x", "y"], ["x[1]", "y[1]"]])
+def test_parameters_of_contacts_are_used(coordinates):
+    x, y = (name.replace("[1]", "[0]") for name in coordinates)
+    floor = sc.contact(y, slip=x.replace("x", "x_dot"), friction="mu", restitution="e")
+    formula = f"({x.replace('x', 'x_dot')}**2 + {y.replace('y', 'y_dot')}**2)/2 - {y}"
+    named = {"parameters": {"mu": 0.3, "e": 0.5}, "contacts": [floor]}
+    assert not messages(sc.LagrangianSystem.from_text, "system", coordinates, formula, **named)

@@ -77,7 +77,7 @@ class StepSequence:
                 check_growth=False,
             )
             times, counts = np.unique(np.asarray(run.t), return_counts=True)
-            at_kinks = np.isin(times, [time for switches in run.switches for time in switches.t])
+            at_kinks = np.isin(times, [time for ends in run.transitions for time in ends.t])
             ends = np.abs(times - t)[((counts == 1) & ~at_kinks) | (times == t)] / period
             return np.sort(ends)
 

@@ -373,7 +373,7 @@ class Observation:
         (t, q, p, iterations), sizes, numbers, failure = self.search.advance(run, size)
         self.arrived = self.end is not None and t[-1] == self.end
         part = trajectory_of(run, (t, run.stepper.named(q), run.stepper.named(p), iterations), sizes)
-        part.switches = self.search.switches(self.search.recorded[-1:])
+        part.transitions = self.search.transitions(self.search.recorded[-1:])
         part.modes = self.search.modes(self.search.recorded[-1:])
         return part, numbers, failure
 
@@ -475,6 +475,6 @@ class Observation:
         steps = self.run.steps + (self.partial_steps if self.arrived else 0)
         made = trajectory_of(self.run, (t, q, p, iterations), lengths, steps=steps, events=crossings, tau=tau)
         if self.search is not None:
-            made.switches = self.search.switches(self.search.recorded)
+            made.transitions = self.search.transitions(self.search.recorded)
             made.modes = self.search.modes(self.search.recorded)
         return made

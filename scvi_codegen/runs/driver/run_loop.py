@@ -353,7 +353,7 @@ def plain_trajectory(
     else:
         trajectory.step_error = trajectory.worst_step_time = math.nan
     trajectory.parameters = memory._parameters.copy()
-    trajectory.events = trajectory.switches = trajectory.pieces = ()
+    trajectory.events = trajectory.transitions = trajectory.pieces = ()
     trajectory.modes = trajectory.tau = trajectory.confirmation = trajectory.observed = trajectory.conserved = None
     return trajectory
 

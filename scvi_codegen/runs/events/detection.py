@@ -192,7 +192,7 @@ class CrossingSearch:
         """Return the crossings by event."""
         return self._by_event(self.stepper.events, self._joined(self.recorded))
 
-    def switches(self, recorded: Sequence[NDArray[Any]]) -> tuple[Switches, ...]:
+    def transitions(self, recorded: Sequence[NDArray[Any]]) -> tuple[Switches, ...]:
         """Return the transitions of contacts, and the changes of the side of each kink, among some of the records."""
         kinks = len(self.stepper.searched) - len(self.stepper.events)
         if not kinks:

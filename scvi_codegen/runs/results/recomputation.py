@@ -54,10 +54,10 @@ def work_and_impulses_until(states: SavedStates) -> Array:
 
 def changes_by_events(states: SavedStates) -> Iterator[tuple[Crossings, NDArray[np.intp]]]:
     """Yield the crossings of each event that changes the state, and the rows of the states after them."""
-    t, switches = states.forward * states.t, getattr(states, "switches", ())
-    if states.stepper.interface.contacts and not switches:
+    t, transitions = states.forward * states.t, getattr(states, "transitions", ())
+    if states.stepper.interface.contacts and not transitions:
         raise StateError("this requires the transitions of contacts, which only integrate(..) stores")
-    for crossings in (*getattr(states, "events", ()), *switches):
+    for crossings in (*getattr(states, "events", ()), *transitions):
         times = states.forward * crossings.t
         here = (t[0] <= times) & (times <= t[-1])
         rows = np.searchsorted(t, times[here])

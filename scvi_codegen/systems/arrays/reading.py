@@ -17,6 +17,7 @@ from scvi_codegen.systems.arrays.system import (
     table_of,
 )
 from scvi_codegen.systems.constraints import constraint_sides
+from scvi_codegen.systems.contact import names_in
 from scvi_codegen.systems.forces import damping_rate
 from scvi_codegen.systems.formulas.array_statements import ArrayForce, array_text, parse_constraint, parse_force
 from scvi_codegen.systems.formulas.arrays import parse_array, parse_coordinate, parse_sums
@@ -117,7 +118,7 @@ def arrays_from_text(arguments: Mapping[str, Any]) -> ArraySystem:
         definition=definition_of(arguments),
         data={parse_array(key).name: value for key, value in data.items()},
     )
-    system.warn_of_mistakes()
+    system.warn_of_mistakes(map(symbol, names_in(arguments.get("contacts", ()))))
     return system
 
 

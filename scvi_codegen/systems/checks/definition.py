@@ -76,7 +76,7 @@ def warn_of_unused(
     kinds += [f"parameter '{parameter}'" for parameter in parameters if parameter not in used | occurring]
     for kind in kinds:
         where = f"the {function}, the forces and the constraints of '{name}'"
-        remedy = "remove it, unless events, contacts or a time transformation, which are not known here, contain it"
+        remedy = "remove it, unless events or a time transformation contain it; pass contacts that do to the system"
         warn(f"{kind} does not occur in {where}: {remedy}.", SystemDefinitionWarning)
     return bool(kinds)
 
