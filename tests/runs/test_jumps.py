@@ -115,6 +115,16 @@ def test_corners_starts_and_grazes():
     assert [len(run.switches[0]) for run in runs] == [0, 0, 6]
 
 
+@pytest.mark.filterwarnings("error::scvi_codegen.common.errors.AccuracyWarning")
+def test_starts_on_a_jump_have_the_energy_of_their_side():
+    fall = compiled("x_dot**2/2 - x/4 - V*unit_step(x)", "x", V=0.3)
+    for v in (-1.0, 0.0):
+        run = fall.integrate([0.0], [v], t_end=2.0)
+        assert (run.switches[0].side.tolist(), run.energy_error() < 1e-15) == ([], True)
+        assert run.q[-1, 0] == pytest.approx(2 * v - 0.5, abs=1e-15)
+    assert fall.integrate_ensemble([[0.0]], [[-1.0]], t_end=2.0).energy()[-1] == pytest.approx(0.5, abs=1e-15)
+
+
 MODES, WARNS, REFUSED = "modes", "as formulas, with a warning once", "refused"
 METHODS = ("svi:2", "gauss:2", "sc:3", "stoermer-verlet", "composition:4", "scvi:2")
 ROWS = dict.fromkeys(METHODS, (MODES, MODES)) | dict.fromkeys(

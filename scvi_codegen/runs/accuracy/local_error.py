@@ -10,9 +10,8 @@ from scvi_codegen.runs.accuracy.resolution import warn_of_unresolved_fields
 from scvi_codegen.runs.accuracy.size import RESOLVED, roundoff
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runs.results.energy import energy_reason
-from scvi_codegen.runs.results.saved_states import SavedStates
+from scvi_codegen.runs.results.saved_states import SavedStates, parameters_on_sides
 from scvi_codegen.runs.states.validation import Array
-from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.memory import Memory
 from scvi_codegen.runs.stepping.step_plan import Adaptive, FixedSteps
 
@@ -75,11 +74,10 @@ def warn_of_energy_error(trajectory: SavedStates, run: Memory) -> None:
             return
     if not stepper.interface.conserves_energy or energy_reason(stepper) or not warnings_wanted():
         return
-    t, q, p = trajectory.t, trajectory.q, trajectory.p
-    ends = run._end_energies(t, q, p)
+    ends = run._end_energies(trajectory.t, trajectory.q, trajectory.p)
     if ends is None or not abs(ends[1] - ends[0]) > 0.5 * TOLERABLE_ERROR * max(abs(ends[0]), abs(ends[1])):
         return
-    if energies := _changed_energies(stepper, t, q, p, trajectory.parameters):
+    if energies := _changed_energies(trajectory):
         if is_adaptive:
             warn_of_energies(*energies)
         else:
@@ -100,8 +98,7 @@ def warn_of_energy_errors(ensemble: Any, ends: Array | None = None) -> None:
         first, last = np.abs(ends[checked]).T, np.abs(np.diff(ends[checked])[:, 0])
         checked = checked[~(last <= 0.5 * TOLERABLE_ERROR * np.maximum(first[0], first[1]))]
     for j in checked.tolist():
-        t, q, p, _, _ = ensemble._one(j)
-        if len(t) and (energies := _changed_energies(stepper, t, q, p, ensemble.parameters[j])):
+        if ensemble._reached(j).any() and (energies := _changed_energies(ensemble[j])):
             by_trajectory[j] = energies
     worst = max(by_trajectory, key=lambda j: relative_energy_change(*by_trajectory[j]), default=None)
     if worst is not None:
@@ -136,24 +133,21 @@ def relative_energy_change(first: float, last: float, size: float) -> float:
     return part if part == part else 0.0
 
 
-def _changed_energies(
-    stepper: Integrator, t: Array, q: Array, p: Array, parameters: Array
-) -> tuple[float, float, float] | None:
+def _changed_energies(states: SavedStates) -> tuple[float, float, float] | None:
     """Return the first and the last energy and the largest |p.v| if the energy changed; ``None`` otherwise.
 
     ``None`` is also returned outside the domain of L, and at rest up to rounding, where the energy is that of rounding
     errors. Velocities are computed only if the energies differ.
     """
-    resolution = RESOLVED * roundoff(stepper.interface.words)
-    if (np.ptp(np.asarray(q), axis=0) <= resolution * np.abs(np.asarray(q)).max(axis=0)).all():
+    stepper, q = states.stepper, np.asarray(states.q)
+    if (np.ptp(q, axis=0) <= RESOLVED * roundoff(stepper.interface.words) * np.abs(q).max(axis=0)).all():
         return None
-    t, q, p = (column[:: max(1, len(column) - 1)].copy() for column in (t, q, p))
+    ends = [(states.t[[k]], states.q[[k]], states.p[[k]], parameters_on_sides(states, states.t[k])) for k in (0, -1)]
     try:
-        energies = stepper._energies_of(t, q, p, parameters)
-        first, last = float(energies[0]), float(energies[-1])
+        first, last = (float(stepper._energies_of(*end)[0]) for end in ends)
         if not relative_energy_change(first, last, 0.0) > TOLERABLE_ERROR:
             return None
-        sizes = np.sum(p * stepper.velocity(q, p, t, parameters), axis=1)
+        sizes = [np.sum(p * stepper.velocity(q, p, t, parameters)) for t, q, p, parameters in ends]
     except StateError:
         return None
     return first, last, float(np.abs(sizes).max())
