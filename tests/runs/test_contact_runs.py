@@ -200,3 +200,19 @@ def test_modes_have_names_in_messages_only() -> None:
         stepper.integrate([1.0], velocity=[0.0], h=0.1, steps=1, events=sc.Event("x", then={"f": 1}))
     with pytest.raises(sc.EventError, match="parameter 'k' after the event 'x' is not finite"):
         stepper.integrate([1.0], velocity=[0.0], h=0.1, steps=80, events=sc.Event("x", then={"k": "sqrt(x - 1)"}))
+
+
+def test_first_modes_do_not_depend_on_units() -> None:
+    text = "m*(x_dot**2 + y_dot**2)/2 + m*r**2*a_dot**2/5 - m*g*y"
+    table = sc.contact("y - r", slip="x_dot - r*a_dot", friction=0.3, restitution=0.5)
+    stepper = of(text, "x y a", [table], "svi:2", m=2.0, r=0.5, g=G)
+    expected = {(0.0, 4.0, 0.0): "slip", (0.0, 0.0, 0.0): "stick", (1e-8, 4.0, 0.0): "open", (0.0, 4.0, -1.0): "open"}
+    for (gap, v, w), name in expected.items():
+        for length, time, mass in np.array(np.meshgrid(*[[1e-9, 1e9]] * 3)).reshape(3, -1).T:
+            run = stepper.integrate(
+                [0.0, length * (0.5 + gap), 0.0],
+                velocity=[v * length / time, w * length / time, 0.0],
+                **({"t_end": 1e3 * time} if mass > 1.0 else {"h": 0.05 * time, "steps": 1}),
+                parameters={"m": 2 * mass, "r": length / 2, "g": G * length / time**2},
+            )
+            assert run.contact_modes[0][1] == (name,)

@@ -13,8 +13,6 @@ from scvi_codegen.runs.states.validation import Parameters, States
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.systems.contacts.modes import ContactRows
 
-STEPS = 1000
-"""Parts of the time since 0, at least of 1, by whose motion gaps are measured at a start."""
 REFUSALS = {
     1: "the run starts at t = {t:.17g} with the gap of contact {k} at {value:.6g}, which must not be negative: correct "
     "the initial positions, or the sign of the gap",
@@ -66,14 +64,11 @@ def warn_of_choices(watch: Any) -> None:
         warn(f"the restitution of an impact would have created kinetic energy with friction: {used}", EventWarning)
 
 
-def in_first_modes(
-    stepper: Integrator, q: States, p: States, t: float, parameters: Parameters, duration: float = 1.0 / STEPS
-) -> tuple[Array, Array]:
+def in_first_modes(stepper: Integrator, q: States, p: States, t: float, parameters: Parameters) -> tuple[Array, Array]:
     """Return a state after the impacts of contacts that are closed, on the constraints of their first modes.
 
     Args:
         stepper, q, p, t, parameters: of the start.
-        duration: time by whose motion gaps are measured.
 
     Raises:
         ContactError: if a gap is negative, or no mode is consistent.
@@ -82,7 +77,7 @@ def in_first_modes(
     q1, p1 = (np.array(part, float) for part in stepper._states.pair(q, p))
     values = stepper._parameters(parameters)
     watch, numbers = binding.new("watch *"), [binding.pointer(part) for part in (q1, p1, values)]
-    status = binding.function("begin_contacts")(watch, t, duration, *numbers, binding.workspace())
+    status = binding.function("begin_contacts")(watch, t, *numbers, binding.workspace())
     if status:
         reason = f"the contacts are undefined at t = {t:.17g}, q = {q!r}: {REASONS[status]}"
         raise refusal_of(watch, t) or ContactError(reason)

@@ -16,7 +16,6 @@ enum {
   CHANGE_GAPS = 8 /* intervals between hits from which their accumulation is estimated */
 };
 
-#define CONTACT_STEPS 1000.0 /* parts of a run of adaptive steps by which gaps are measured at its start */
 #define CHANGE_WHOLE 1e-9 /* relative to a step: a difference of its end from t_end that is rounding */
 #define CHANGE_RATIO 1e-3 /* relative spread of the ratios of intervals that accumulate */
 #define CHANGE_REST 1e-8 /* relative to the time since the first of them: remaining time at which a contact closes */
@@ -433,8 +432,27 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
   return status;
 }
 
+#ifdef EVENT_CONTACTS
+/* First modes of contacts at a state. Gaps are measured by the least time T > 0 in which a row r changes by its size or
+ * its rate, |r| = |r''| T^2 and |r'| = |r''| T, in any units; by a duration if all rows are 0. */
+static int begin_at(event_step *step, event_sample *at, real duration)
+{
+  contact_terms of;
+  real least = INFINITY;
+  int status;
+  step->whole = 0.0;
+  status = terms_at(step, at, &of);
+  for (int r = 0; status == OK && r < CONTACT_ROWS; r++) {
+    const real second = fabs(of.second[r]), time = sqrt(of.size[r] / second) + of.speed[r] / second;
+    least = time > 0.0 ? fmin(least, time) : least;
+  }
+  step->whole = step->h = isinf(least) ? duration : copysign(least, duration);
+  return status == OK ? begin_contacts(step, at) : status;
+}
+#endif
+
 #ifdef EVENT_MODES
-/* First modes of a run, those of contacts by its state, whose gaps are measured by their change in a duration. */
+/* First modes of a run, those of contacts by its state. */
 static int begin_run(event_run *run, event_step *step, real duration)
 {
   int status = OK;
@@ -443,8 +461,7 @@ static int begin_run(event_run *run, event_step *step, real duration)
 #ifdef EVENT_CONTACTS
   event_sample at = {.t = run->t, .q = step->memory + 9 * M, .p = step->memory + 10 * M};
   copy_state(at.q, at.p, run->q, run->p);
-  step->whole = step->h = duration;
-  status = begin_contacts(step, &at);
+  status = begin_at(step, &at, duration);
   if (status == OK && (memcmp(at.q, run->q, BYTES(M)) != 0 || memcmp(at.p, run->p, BYTES(M)) != 0))
     set_run(run, run->t, &at);
 #endif
@@ -455,19 +472,18 @@ static int begin_run(event_run *run, event_step *step, real duration)
 #endif
 #ifdef EVENT_CONTACTS
 
-int NAME(begin_contacts)(event_watch *watch, real t, real duration, real *q, real *p, const real *parameters,
-    real *workspace)
+int NAME(begin_contacts)(event_watch *watch, real t, real *q, real *p, const real *parameters, real *workspace)
 {
   EVENT_MEMORY(watch, memory, 15 * M + CHANGE_VALUES)
   real own[PARAMETERS];
   event_sample at = {.t = t, .q = q, .p = p}, horizon = {.q = memory + 7 * M, .p = memory + 8 * M};
   solver_report report = {0};
-  const event_step step = {t, duration, duration, q, p, own, NULL, watch, NULL, 0, NULL, &report, workspace, memory,
-      memory + 15 * M, 0, &horizon, own};
+  event_step step = {t, 0.0, 0.0, q, p, own, NULL, watch, NULL, 0, NULL, &report, workspace, memory, memory + 15 * M, 0,
+      &horizon, own};
   memcpy(own, parameters, BYTES(PARAMETERS));
   for (int k = 0; k < EVENT_MODES; k++)
     watch->mode[k] = own[MODE_PLACE[k]];
-  return begin_contacts(&step, &at);
+  return begin_at(&step, &at, 0.0);
 }
 #endif
 
@@ -550,7 +566,7 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
     int count = 0;
 #ifdef EVENT_MODES
     if (!watch->begun)
-      status = begin_run(run, &step, control ? (t_end - run->t) / CONTACT_STEPS : run->h);
+      status = begin_run(run, &step, control ? t_end - run->t : run->h);
     put_modes(watch->mode, own);
 #endif
 #ifdef CONTACTS_IN_SPACE
