@@ -18,6 +18,7 @@ from scvi_codegen.runs.stepping.step_plan import Fixed
 from scvi_codegen.systems.event import (
     ACCUMULATED,
     BEHIND,
+    CHATTERS,
     JAMMED,
     PASSED,
     SLIDING,
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 
 INITIAL_CAPACITY, LEAST_CAPACITY, CROSSING_NUMBERS = 256, 16, 2**24
 """Initial number of crossings that one call can return, doubled when exceeded; fewer of over 65,536 coordinates."""
+MOST_NAMED = 3
+"""Events that a message names."""
 MOST_BYTES = 2**30
 """Largest memory for the states of crossings of a run; if they exceed it, none is kept."""
 
@@ -165,7 +168,7 @@ class CrossingSearch:
         through = BEHIND if behind < 0.0 else THROUGH
         undefined = UNDEFINED_CHANGE if getattr(self.watch, "undefined", 0) < 0 else UNDEFINED
         messages = {"undefined": undefined, "accumulated": ACCUMULATED, "through": through, "jammed": JAMMED}
-        messages["sliding"] = SLIDING
+        messages |= {"sliding": SLIDING, "chatters": CHATTERS}
         for name, message in messages.items():
             number = getattr(self.watch, name, 0)
             if number and not (name == "accumulated" and self.ended):
@@ -173,8 +176,11 @@ class CrossingSearch:
                 message = PASSED if message is THROUGH and isinstance(event, Kink | Transition) else message
                 modes = zip(self.stepper.modes, getattr(self.watch, "mode", ()), strict=False)
                 changed = next((f"parameter '{mode}'" for mode, value in modes if not math.isfinite(value)), "state")
-                texts = {"function": event.title, "changed": changed}
-                return EventError(message.format(**texts, t=report.t, g=behind))
+                recent = self.watch.recent if name == "chatters" else [of is event for of in self.stepper.searched]
+                titles = [of.title for of, count in zip(self.stepper.searched, recent, strict=True) if count]
+                texts = {"function": " and ".join(titles[:MOST_NAMED]), "changed": changed}
+                t = self.watch.end if name == "chatters" else report.t
+                return EventError(message.format(**texts, t=t, g=behind))
         return step_failure(status, report, step=step, h=h, failures=self.binding.failures)
 
     def warn_of_accumulation(self) -> None:

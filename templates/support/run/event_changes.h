@@ -13,11 +13,13 @@
 enum {
   CHANGE_ROUNDS = 20, /* largest number of passes over the walls of a corner */
   CHANGES_IN_STEP = 100000, /* largest number of changes of the state in a step */
+  CHANGES_IN_WINDOW = 1000, /* number of changes whose time is compared with the mean time between changes */
   CHANGE_GAPS = 8 /* intervals between hits from which their accumulation is estimated */
 };
 
 #define CHANGE_WHOLE 1e-9 /* relative to a step: a difference of its end from t_end that is rounding */
 #define CHANGE_RATIO 1e-3 /* relative spread of the ratios of intervals that accumulate */
+#define CHANGE_PACE 1e-3 /* least time of so many changes, relative to that mean */
 #define CHANGE_REST 1e-8 /* relative to the time since the first of them: remaining time at which a contact closes */
 #define CHANGE_END 1e-6 /* relative to a step: remaining time at which an accumulation ends the run */
 
@@ -46,6 +48,8 @@ static void note_hit(const event_step *step, event_crossing *crossing, real t)
   if (history->hits <= CHANGE_GAPS || high >= 1.0 ||
       high - low > CHANGE_RATIO * ratio + 50.0 * DBL_EPSILON * fabs(t) / last + history->rounding / last)
     return;
+  watch->changes -= watch->changes % CHANGES_IN_WINDOW; /* a geometric series ends */
+  watch->window = watch->time;
 #ifdef EVENT_CONTACTS
   if (is_transition(crossing->function) && TRANSITION[crossing->function - FIRST_TRANSITION][1] == CONTACT_CLOSES) {
     const int rests = last * ratio / (1.0 - ratio) < CHANGE_REST * fabs(watch->time - history->since);
@@ -58,6 +62,23 @@ static void note_hit(const event_step *step, event_crossing *crossing, real t)
     watch->accumulated = crossing->function + 1;
     watch->ended = 1;
   }
+}
+
+/* Fails if the last changes of the state are much faster than those since the start, and than the step. */
+static int check_pace(const event_step *step, int event)
+{
+  event_watch *watch = step->watch;
+  const real elapsed = fmax(fabs(watch->time), fabs(step->whole)), window = fabs(watch->time - watch->window);
+  watch->recent[event]++;
+  if (++watch->changes % CHANGES_IN_WINDOW)
+    return OK;
+  if (window * (real)watch->changes < CHANGE_PACE * elapsed) {
+    watch->chatters = event + 1;
+    return NOT_CONVERGED;
+  }
+  watch->window = watch->time;
+  memset(watch->recent, 0, sizeof watch->recent);
+  return OK;
 }
 
 /* Rate of change of function e along the step at a state, in the direction of the run. */
@@ -159,6 +180,8 @@ static int change_at_crossings(const event_step *step, long long first, event_sa
       else
         status = change_state(step, FUNCTION_OF(step->found + i), at);
       note_hit(step, step->found + i, at->t);
+      if (status == OK)
+        status = check_pace(step, step->found[i].function);
     }
   for (int round = 0; status == OK && met; round++) {
     met = 0;
