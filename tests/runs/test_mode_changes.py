@@ -24,3 +24,10 @@ def test_bounces_that_accumulate_slowly_end_in_rest():
     end = np.sqrt(2) * 1.998 / 0.002
     closes = stepper.integrate([1.0], [0.0], h=end / 50, t_end=1.01 * end).contact_modes[-1]
     assert closes == (pytest.approx(end, rel=1e-7), ("slip",))
+
+
+def test_kinks_that_runs_do_not_locate_are_shown_in_short():
+    apart = " + ".join(f"(r[i, {k}] - r[j, {k}] - 10*rint((r[i, {k}] - r[j, {k}])/10))**2" for k in (0, 1))
+    pairs = f"sum(i in N, (r_dot[i, 0]**2 + r_dot[i, 1]**2)/2) - sum(i < j in N, positive_part(1 - sqrt({apart}))**2)"
+    with pytest.warns(sc.MethodWarning, match=r"such as .{60} = 0 for i < j in N: .*sizes= with at most 256 switching"):
+        sc.compile_stepper(lagrange("gas", ["r[N, 2]"], pairs), "svi:2", flags=QUICK_FLAGS)

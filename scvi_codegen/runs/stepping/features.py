@@ -6,6 +6,7 @@ from typing import Any
 
 from scvi_codegen.codegen.variants import Derivatives
 from scvi_codegen.common.errors import MethodError, MethodWarning, ScviCodegenError, StateError, closest, warn
+from scvi_codegen.common.representation import clipped
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
 
 OPERATIONS = {
@@ -274,9 +275,11 @@ def warn_of_formulas(of: Any, subject: str) -> None:
     """Warn that steps do not end at kinks of a system or an interface, other than rint and cutoffs of lists."""
     kinks = [u for u in of.kinks if not (u.startswith("cos(pi*") or of.lengths)]
     if kinks:
+        u, loop, indices = kinks[0].partition(" for ")
         warn(
-            f"{subject} does not locate the kinks of this system, such as {kinks[0]} = 0: steps across them use the "
-            'formulas as they are and lose order. Use short steps; steppers with kinks="as formulas" do not warn',
+            f"{subject} does not locate the kinks of this system, such as {clipped(u, 60)} = 0{loop}{indices}: steps "
+            "across them use the formulas as they are and lose order. Use short steps (h=, max_step=), or sizes= with "
+            'at most 256 switching functions; steppers with kinks="as formulas" do not warn',
             MethodWarning,
         )
 
