@@ -52,6 +52,10 @@ JAMMED = (
 
 Formula: TypeAlias = "str | Expr | float"
 """Formula as text or a SymPy expression, or a number."""
+INSEPARABLE = (
+    "the zeros of {function}, a function of time, cannot be separated in the step from t = {t:.17g}: no bound excludes "
+    "them, as beside a pole. Change the formula, or limit the steps by max_step= (or h=)"
+)
 CHATTERS = (
     "1000 changes of the state by {function} before t = {t:.17g} take less than 1e-3 of the mean time between changes: "
     "the motion chatters. Use a smooth formula such as tanh(u/width), sc.friction(..) for dry friction, or end the run"

@@ -37,6 +37,7 @@ from scvi_codegen.codegen.ir.kernel import Kernel, RolledKernel, lower_matrix, l
 from scvi_codegen.codegen.ir.program import Layout
 from scvi_codegen.codegen.rendering.kernels.loop_nests import Nest, count_text, size_text
 from scvi_codegen.codegen.rendering.program_source import ArrayEventSearch, EventSearch, render_events
+from scvi_codegen.codegen.rendering.reaches import reaches
 from scvi_codegen.codegen.rendering.source import Interface, Source
 from scvi_codegen.common.errors import EventError, ScviCodegenError, SystemDefinitionError, closest
 from scvi_codegen.common.precision import mp
@@ -344,12 +345,15 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controll
     refracts = [isinstance(event, Refraction) for event in events]
     timed = [0 if interface.in_tau else _kind_in_time(g, formulas.arguments) for g in formulas.functions]
     turning = tuple(len(member.coordinates) for member in RotationNames.members_of(interface.rotations))
-    rates = [turn_rate(g) if kind else sympy.Integer(0) for g, kind in zip(formulas.functions, timed, strict=True)]
+    bounds = [
+        reaches(g, symbol(TIME), formulas.q[0]) if kind else (sympy.S.Zero,) * 3
+        for g, kind in zip(formulas.functions, timed, strict=True)
+    ]
     formulas_of_kernel = {
         "event_functions": formulas.functions,
         "event_guards": [guard for _, guard in formulas.guards],
         "event_changes": [value for _, values in formulas.changes for value in values],
-        "event_rates": rates if any(timed) else [],
+        "event_reaches": [bound for pair in bounds for bound in pair] if any(timed) else [],
     }
     variables = {symbol for values in formulas_of_kernel.values() for value in values for symbol in value.free_symbols}
     return EventSearch(
@@ -387,27 +391,11 @@ def _places(modes: Sequence[str], contact: ContactRows) -> tuple[int, ...]:
 
 
 def _kind_in_time(g: Expr, moving: Iterable[Symbol]) -> int:
-    """Return 1 for a function of time alone, 2 for one that is affine in time, else 0.
-
-    Polynomials that are not affine are searched along each step, which misses few pairs of close roots.
-    """
+    """Return 1 for a function of time alone, 2 for one that is affine in time, else 0."""
     time = symbol(TIME)
     if time not in g.free_symbols or not g.free_symbols.isdisjoint(moving):
         return 0
-    if g.is_polynomial(time) and sympy.degree(g, time) > 1:
-        return 0
     return 1 if g.has(rint, unit_step) or time in sympy.diff(g, time).free_symbols else 2
-
-
-TURNS = {sympy.sin: 2 * sympy.pi, sympy.cos: 2 * sympy.pi, sympy.tan: sympy.pi, rint: sympy.Integer(1)}
-"""Periods of functions, of rint of its jumps."""
-
-
-def turn_rate(g: Expr) -> Expr:
-    """Return the sum of the squares of the turns per time of the sines, cosines, tangents and rint in a function."""
-    time = symbol(TIME)
-    turning = sorted(g.atoms(*TURNS), key=str)
-    return sympy.Add(*((sympy.diff(f.args[0], time) / TURNS[f.func]) ** 2 for f in turning))
 
 
 Slots: TypeAlias = Sequence[tuple[Any, Access]]
@@ -448,8 +436,8 @@ class ArrayEvents:
         events: C of each: ``functions``, ``conditions`` and ``changes``, statements; ``ranges``, the first index, end,
             and whether it is the greater index of a pair, of each loop; ``count`` of functions; ``entries``, the
             largest number of variables that one changes; ``accesses`` of arrays, with the loops around them; ``timed``,
-            1 for a function of time alone, 2 if it is affine, else 0; ``rates``, statements that compute its
-            :func:`turn_rate`, none if it does not turn.
+            1 for a function of time alone, 2 if it is affine, else 0; ``reaches``, statements that compute its
+            :func:`~scvi_codegen.codegen.rendering.reaches.reaches`.
         timed: the same ``timed`` of each event.
         layout: the arrays, tables, sizes and parameters of the stepper.
         moving: by the name of an array of coordinates, momenta or velocities: 0, 1 or 2 for q, p or v, and the name of
@@ -562,7 +550,7 @@ class ArrayEvents:
         for j, condition in enumerate(event.conditions):
             conditions += self._value(f"condition_{k}_{j}", condition, event)
         changes, entries = self._wall(k, event, terms) if event.restitution is not None else self._map(k, event)
-        timed, rates = self._in_time(k, event, terms)
+        timed, bounds = self._in_time(k, event, terms)
         ranges = [(size_text(loop.first), size_text(loop.end), int(bool(loop.behind))) for loop in loops]
         code: dict[str, Any] = {
             "accesses": tuple(self._accesses),
@@ -570,21 +558,20 @@ class ArrayEvents:
             "conditions": conditions,
             "changes": changes,
         }
-        code |= {"timed": timed, "rates": rates}
+        code |= {"timed": timed, "reaches": bounds}
         return {"ranges": ranges, "count": count_text(loops), "entries": entries, **code}
 
     def _in_time(self, k: int, event: SearchedEvent, terms: Sequence[ArrayTerm]) -> tuple[int, list[str]]:
-        """Return 1 for a function of time alone, 2 if it is affine, else 0, and statements that compute its turns."""
-        if event.loops or any(term.loops or term.slots for term in terms):
-            return 0, []
+        """Return 1 for a function of time alone, 2 if it is affine, else 0, and statements that compute its reaches."""
         whole = sympy.Add(*(term.formula for term in terms))
-        kind, squares = _kind_in_time(whole, ()), turn_rate(whole)
-        if not kind or squares == 0:
-            return kind, []
-        call = self._function(
-            f"rate_{k}", replace(terms[0], formula=squares), [squares], [f"{NEXT} = value[0];"], within=False
-        )
-        return kind, [call]
+        if event.loops or any(term.loops or term.slots for term in terms) or not (kind := _kind_in_time(whole, ())):
+            return 0, []
+        array = self.layout.coordinates[0]
+        place = f"[{', '.join('0' for _ in array.axes)}]" if array.axes else ""
+        (radius,) = parse_sums(f"{array.name}{place}", self.positions, self.symbols, self.layout.tables)
+        bounds = reaches(whole, symbol(TIME), radius.formula)
+        lines = [f"to->value[to->count++] = value[{j}];" for j in range(3)]
+        return kind, [self._function(f"reaches_{k}", radius, bounds, lines, within=False)]
 
     def _wall(self, k: int, event: SearchedEvent, terms: Sequence[ArrayTerm]) -> tuple[list[str], str]:
         """Return statements that compute the gradient of a wall and its restitution, and the number of entries."""

@@ -19,6 +19,7 @@ from scvi_codegen.systems.event import (
     ACCUMULATED,
     BEHIND,
     CHATTERS,
+    INSEPARABLE,
     JAMMED,
     PASSED,
     SLIDING,
@@ -168,7 +169,7 @@ class CrossingSearch:
         through = BEHIND if behind < 0.0 else THROUGH
         undefined = UNDEFINED_CHANGE if getattr(self.watch, "undefined", 0) < 0 else UNDEFINED
         messages = {"undefined": undefined, "accumulated": ACCUMULATED, "through": through, "jammed": JAMMED}
-        messages |= {"sliding": SLIDING, "chatters": CHATTERS}
+        messages |= {"sliding": SLIDING, "chatters": CHATTERS, "inseparable": INSEPARABLE}
         for name, message in messages.items():
             number = getattr(self.watch, name, 0)
             if number and not (name == "accumulated" and self.ended):

@@ -66,7 +66,7 @@ RANGES = {
 """Smallest and largest values of whole numbers in the memory of a run, which C uses as counts and indices."""
 STEPS_NEAR_REST = 16
 """Number of steps in which a force moves a state away from rest."""
-EVENT_NUMBERS = ("undefined", "accumulated", "through", "jammed", "sliding", "chatters")
+EVENT_NUMBERS = ("undefined", "inseparable", "accumulated", "through", "jammed", "sliding", "chatters")
 """Numbers of events, from 1 on, in the state of the search for events; 0 for none, < 0 for an undefined change."""
 NO_OUTPUT, NO_PLAN = LARGEST_COUNT, Fixed(math.nan)
 """Output stride that saves no state; plan of a run that was not started."""

@@ -1,35 +1,16 @@
 /* Zero crossings of functions of time alone, independently of the states and of the sizes of steps.
  *
- * Such a function is sampled a sixteenth of a turn of its sines, cosines and rint apart, so that no two zeros of one of
- * these with an affine argument are between two samples, and 64 times a step at least unless it is affine; a change of
- * its sign is bisected to neighbouring times. At the ends of a step the sign is that of eight roundings later: a zero
- * at the end of a step belongs to that step, also if its function has the former sign there by rounding. Requires:
- * numbers.h, IS_TIMED, turn_rate and time_value of parts/event_functions.c.jinja. */
+ * Intervals are excluded by a bound of the change of the function from their middles, or halved until it is monotone
+ * (R. E. Moore, Interval Analysis, 1966); a change of its sign is bisected to neighbouring times. Zeros closer than
+ * EVENT_SAME_TIME are one. At the ends of a step the sign is that of eight roundings later: a zero at the end of a step
+ * belongs to that step, also if its function has the former sign there by rounding. Requires: numbers.h, IS_TIMED,
+ * time_reach and time_value of parts/event_functions.c.jinja. */
 enum {
-  EVENT_TIMES = 64, /* samples of a step at least */
-  EVENT_MOST_TIMES = 1 << 20, /* and at most */
-  EVENT_AFFINE = 2 /* value of IS_TIMED */
+  EVENT_INTERVALS = 1 << 20 /* largest number of intervals without a zero */
 };
 
-#define EVENT_TURN 0.0625 /* between two samples */
+#define EVENT_TIME_NOISE (8.0 * DBL_EPSILON) /* of a function, for each ulp of its terms */
 #define EVENT_SAME_TIME (8.0 * DBL_EPSILON) /* relative to the time: rounding of a zero */
-
-/* Time of the sample after t. */
-static int next_time(const event_step *step, int e, real t, real end, real span, real *next)
-{
-  const real least = fmax(fabs(span) / EVENT_MOST_TIMES, 2.0 * EVENT_SAME_TIME * fabs(t));
-  real size = fabs(IS_TIMED[EVENT_OF(e)] == EVENT_AFFINE ? span : span / EVENT_TIMES), rate;
-  int status = turn_rate(e, t, step->parameters, &rate, step->workspace);
-  size = size * rate > EVENT_TURN ? EVENT_TURN / rate : size;
-  for (; status == OK; size *= 0.5) {
-    status = turn_rate(e, t + copysign(size, span), step->parameters, &rate, step->workspace);
-    if (!(size > least && size * rate > EVENT_TURN))
-      break;
-  }
-  *next = t + copysign(fmax(size, least), span);
-  *next = fabs(*next - t) < fabs(end - t) ? *next : end;
-  return status;
-}
 
 /* Value of function e at the end t of a step in the direction of `span`. */
 static int end_value(const event_step *step, int e, real t, real span, real *g)
@@ -74,23 +55,56 @@ static int add_time(const event_step *step, int e, event_sample from, const even
   return status;
 }
 
+/* Adds a crossing if the sign changes between the last state with a sign and a later one. */
+static int note_sign(const event_step *step, int e, event_sample *last, const event_sample *to,
+    const event_sample *left, const event_sample *right)
+{
+  const int status = changes_sign(last->g, to->g) ? add_time(step, e, *last, to, left, right) : OK;
+  *last = *to;
+  return status;
+}
+
+/* Finds the crossings from a time to a later state. A function has no sign where it may be that of rounding. */
+static int search_until(const event_step *step, int e, real t, const event_sample *to, event_sample *last,
+    const event_sample *left, const event_sample *right, int *intervals)
+{
+  const long long before = *step->filled;
+  const real half = 0.5 * (to->t - t);
+  event_sample middle = {.t = t + half};
+  real reach[3];
+  int status;
+  if ((t - step->t) / step->h >= step->horizon->fraction)
+    return OK;
+  status = time_value(e, middle.t, step->parameters, &middle.g, step->workspace);
+  if (status == OK)
+    status = time_reach(e, middle.t, fabs(half), step->parameters, reach, step->workspace);
+  const real noise = EVENT_TIME_NOISE * reach[2];
+  if (status == OK && fabs(middle.g) > reach[0])
+    return fabs(middle.g) > noise ? note_sign(step, e, last, &middle, left, right) : OK;
+  if (reach[1] > 0.0 || 2.0 * fabs(half) <= EVENT_SAME_TIME * fmax(fabs(middle.t), DBL_EPSILON * fabs(step->h)))
+    return status == OK && (to->t == right->t || fabs(to->g) > noise) ? note_sign(step, e, last, to, left, right)
+                                                                      : status;
+  if (fabs(middle.g) + reach[0] <= noise)
+    return status;
+  if (--*intervals < 0) {
+    step->watch->inseparable = EVENT_OF(e) + 1;
+    return NOT_CONVERGED;
+  }
+  if (status == OK)
+    status = search_until(step, e, t, &middle, last, left, right, intervals);
+  *intervals = *step->filled > before ? EVENT_INTERVALS : *intervals;
+  return status == OK ? search_until(step, e, middle.t, to, last, left, right, intervals) : status;
+}
+
 /* Finds the crossings of a function of time alone on a step. */
 static int search_times(const event_step *step, int e, const event_sample *left, const event_sample *right)
 {
   const real span = right->t - left->t;
   event_sample from = *left, to = *right;
-  int status = end_value(step, e, left->t, span, &from.g);
+  int intervals = EVENT_INTERVALS, status = end_value(step, e, left->t, span, &from.g);
   if (JUST_CHANGED(step->watch, e) && side_at_start(step->watch, e) != 0.0) /* whose sign may be that of rounding */
     from.g = copysign(fmax(fabs(from.g), DBL_MIN), side_at_start(step->watch, e));
-  while (status == OK && from.t != right->t && (from.t - step->t) / step->h < step->horizon->fraction) {
-    status = next_time(step, e, from.t, right->t, span, &to.t);
-    if (status == OK && to.t == right->t)
-      status = end_value(step, e, to.t, span, &to.g);
-    else if (status == OK)
-      status = time_value(e, to.t, step->parameters, &to.g, step->workspace);
-    if (status == OK && changes_sign(from.g, to.g))
-      status = add_time(step, e, from, &to, left, right);
-    from.t = to.t, from.g = to.g;
-  }
-  return status;
+  if (status == OK)
+    status = end_value(step, e, right->t, span, &to.g);
+  return status == OK ? search_until(step, e, left->t, &to, &from, left, right, &intervals) : status;
 }

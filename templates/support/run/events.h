@@ -321,6 +321,14 @@ static int rounding_of(const event_step *step, const event_sample *at)
     for (int e = 0; status == OK && e < EVENTS; e++)
       noise[e] = each ? noise[e] + fabs(now[e] - before[e]) : fmax(noise[e], fabs(now[e] - before[e]));
   }
+#ifdef EVENTS_OF_TIME
+  for (int e = 0; status == OK && e < EVENTS; e++)
+    if (IS_TIMED[EVENT_OF(e)]) {
+      real reach[3];
+      status = time_reach(e, at->t, 0.0, step->parameters, reach, step->workspace);
+      noise[e] = DBL_EPSILON * reach[2];
+    }
+#endif
   return status;
 }
 

@@ -72,7 +72,7 @@ static int values_of_kinks(const event_step *step, const event_sample *at, real 
 static real rounding_at(const event_step *step, int kink)
 {
   const int e = EVENT_FIRST[FIRST_KINK + kink];
-  return is_of_time(kink) ? 0.0 : 8.0 * values_at(step, EVENT_DEGREE + 2)[e] + RESIDUAL(step->watch, e);
+  return 8.0 * values_at(step, EVENT_DEGREE + 2)[e] + RESIDUAL(step->watch, e);
 }
 
 /* The side of u at a state, 0 within the effect of rounding; values: of all functions there. */
