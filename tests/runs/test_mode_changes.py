@@ -57,6 +57,6 @@ def test_all_zeros_of_functions_of_time_are_found(u, plan):
         if exact is None:
             t = np.linspace(0.0, 20.0, 10**6)
             names = {name: getattr(np, name) for name in ("sin", "cos", "exp", "tanh", "sqrt")}
-            g = eval(u, {**names, "log": np.log, "atan": np.arctan, "min": np.minimum, "t": t, "w": w})  # noqa: S307
+            g = eval(u, {**names, "log": np.log, "atan": np.arctan, "min": np.minimum, "t": t, "w": w})
             exact = t[:-1][np.sign(g[1:]) != np.sign(g[:-1])]
         assert run.switches[0].t == pytest.approx(exact, abs=1e-16 / w**0.5 if PULSES[u] else 1e-4)

@@ -20,7 +20,7 @@ LIPSCHITZ = (sympy.sin, sympy.cos, sympy.atan, sympy.tanh, sympy.asinh)
 
 
 def reaches(g: Expr, time: Symbol, r: Expr) -> tuple[Expr, Expr, Expr]:
-    """Return the reach of a function in t +- r, the least of its slope, > 0 if it is monotone, and its rounding at t."""
+    """Return the reach of a function in t +- r, its least slope, > 0 if it is monotone, and its rounding at t."""
     slope = sympy.diff(g, time)
     jumps = sympy.Add(*(_reach(step, time, r) for step in parts_of_type(unit_step, g) | parts_of_type(rint, g)))
     bend = _reach(slope, time, r) + STEEP * jumps
