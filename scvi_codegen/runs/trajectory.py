@@ -77,8 +77,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         stepper: the compiled integrator.
         options: convergence criterion of the solver, ``None`` for the defaults.
         events: zero crossings found, parallel to ``stepper.events``.
-        transitions: ends of modes, of contacts, then of kinks, in the order of ``stepper.searched``; see
-            :attr:`switches` and :attr:`contact_modes`.
+        transitions: ends of the modes of contacts, then of kinks, in the order of ``stepper.searched``.
         modes: values of ``stepper.modes`` along the run, ``None`` without them.
         plan: step sizes and target time of the run.
         steps, rejected_steps: numbers of completed and of rejected steps since the start of the run.

@@ -5,6 +5,8 @@ balls; R. E. Moore, *Interval Analysis*, 1966). A smooth g changes by r (|g'| + 
 where |g'| > R of g'. Where no bound exists, as of 1/f near f = 0, the formula is not finite.
 """
 
+from typing import Any
+
 import sympy
 from sympy import Expr, Symbol
 
@@ -13,10 +15,6 @@ from scvi_codegen.systems.formulas.kinks import absolute, minimum, rint, unit_st
 
 STEEP = sympy.Integer(10) ** 30
 """Slope of a jump."""
-CONVEX = (sympy.asin, sympy.acos, sympy.sinh, sympy.cosh, sympy.atanh)
-"""Functions whose size of change is largest away from 0."""
-LIPSCHITZ = (sympy.sin, sympy.cos, sympy.atan, sympy.tanh, sympy.asinh)
-"""Functions whose slope is at most 1."""
 
 
 def reaches(g: Expr, time: Symbol, r: Expr) -> tuple[Expr, Expr, Expr]:
@@ -39,35 +37,32 @@ def _rounding(f: Expr) -> Expr:
 
 def _reach(f: Expr, time: Symbol, r: Expr) -> Expr:
     """Return the largest change of a function in an interval."""
-    if time not in f.free_symbols:
-        return sympy.S.Zero
-    if f == time:
-        return r
+    if time not in f.free_symbols or f == time:
+        return r if f == time else sympy.S.Zero
     if f.is_Add:
         return sympy.Add(*(_reach(term, time, r) for term in f.args))
     if f.is_Mul:
         first, rest = f.as_two_terms()
         a, b = _reach(first, time, r), _reach(rest, time, r)
         return absolute(first) * b + absolute(rest) * a + a * b
+    if f.is_Pow and f.exp.free_symbols:
+        return _reach(sympy.exp(f.exp * sympy.log(f.base)), time, r)
+    if isinstance(f, sympy.tan):
+        return _reach(sympy.sin(f.args[0]) / sympy.cos(f.args[0]), time, r)
     x, change = f.args[0], _reach(f.args[0], time, r)
     size = absolute(x)
-    if isinstance(f, (sympy.tan, sympy.atan2)):
-        return _reach(sympy.sin(x) / sympy.cos(x), time, r) if isinstance(f, sympy.tan) else 1 / unit_step(-1 - r**2)
-    if f.is_Pow and not f.exp.free_symbols:
+    if f.is_Pow:
         n = absolute(f.exp)
         whole = (size + change) ** n - size**n if n.is_Integer or n > 1 else x**n - (x - change) ** n
-        near = x**n
-        inverse = whole / (absolute(near) * absolute(absolute(near) - whole) * unit_step(absolute(near) - whole))
-        return inverse if f.exp.is_negative else whole
-    if f.is_Pow:
-        return _reach(sympy.exp(f.exp * sympy.log(f.base)), time, r)
-    rules = {
-        unit_step: lambda: unit_step(change - size),
-        rint: lambda: rint(absolute(x - f) + change),
-        sympy.exp: lambda: sympy.exp(x + change) - f,
-        sympy.log: lambda: -sympy.log(1 - change / size),
-        sympy.acosh: lambda: f - sympy.acosh(x - change),
-        **{kind: lambda: absolute(f.func(size + change) - f.func(size)) for kind in CONVEX},
-        **{kind: lambda: minimum(change, sympy.Integer(4)) for kind in LIPSCHITZ},
+        near = absolute(x**n)
+        return whole / (near * absolute(near - whole) * unit_step(near - whole)) if f.exp.is_negative else whole
+    convex = absolute(f.func(size + change) - f.func(size)) if f.func != sympy.atan2 else 1 / unit_step(-1 - r**2)
+    rules: dict[Any, Expr] = {
+        unit_step: unit_step(change - size),
+        rint: rint(absolute(x - f) + change),
+        sympy.exp: sympy.exp(x + change) - f,
+        sympy.log: -sympy.log(1 - change / size),
+        sympy.acosh: f - sympy.acosh(x - change),
     }
-    return rules[f.func]()
+    rules |= dict.fromkeys((sympy.sin, sympy.cos, sympy.atan, sympy.tanh, sympy.asinh), minimum(change, sympy.S(4)))
+    return rules.get(f.func, convex)

@@ -38,8 +38,6 @@ if TYPE_CHECKING:
 
 INITIAL_CAPACITY, LEAST_CAPACITY, CROSSING_NUMBERS = 256, 16, 2**24
 """Initial number of crossings that one call can return, doubled when exceeded; fewer of over 65,536 coordinates."""
-MOST_NAMED = 3
-"""Events that a message names."""
 MOST_BYTES = 2**30
 """Largest memory for the states of crossings of a run; if they exceed it, none is kept."""
 
@@ -179,7 +177,7 @@ class CrossingSearch:
                 changed = next((f"parameter '{mode}'" for mode, value in modes if not math.isfinite(value)), "state")
                 recent = self.watch.recent if name == "chatters" else [of is event for of in self.stepper.searched]
                 titles = [of.title for of, count in zip(self.stepper.searched, recent, strict=True) if count]
-                texts = {"function": " and ".join(titles[:MOST_NAMED]), "changed": changed}
+                texts = {"function": " and ".join(titles[:3]), "changed": changed}
                 t = self.watch.end if name == "chatters" else report.t
                 return EventError(message.format(**texts, t=t, g=behind))
         return step_failure(status, report, step=step, h=h, failures=self.binding.failures)

@@ -5,10 +5,7 @@
  * EVENT_SAME_TIME are one. At the ends of a step the sign is that of eight roundings later: a zero at the end of a step
  * belongs to that step, also if its function has the former sign there by rounding. Requires: numbers.h, IS_TIMED,
  * time_reach and time_value of parts/event_functions.c.jinja. */
-enum {
-  EVENT_INTERVALS = 1 << 20 /* largest number of intervals without a zero */
-};
-
+#define EVENT_INTERVALS (1 << 20) /* largest number of a step */
 #define EVENT_TIME_NOISE (8.0 * DBL_EPSILON) /* of a function, for each ulp of its terms */
 #define EVENT_SAME_TIME (8.0 * DBL_EPSILON) /* relative to the time: rounding of a zero */
 
@@ -68,7 +65,6 @@ static int note_sign(const event_step *step, int e, event_sample *last, const ev
 static int search_until(const event_step *step, int e, real t, const event_sample *to, event_sample *last,
     const event_sample *left, const event_sample *right, int *intervals)
 {
-  const long long before = *step->filled;
   const real half = 0.5 * (to->t - t);
   event_sample middle = {.t = t + half};
   real reach[3];
@@ -92,7 +88,6 @@ static int search_until(const event_step *step, int e, real t, const event_sampl
   }
   if (status == OK)
     status = search_until(step, e, t, &middle, last, left, right, intervals);
-  *intervals = *step->filled > before ? EVENT_INTERVALS : *intervals;
   return status == OK ? search_until(step, e, middle.t, to, last, left, right, intervals) : status;
 }
 

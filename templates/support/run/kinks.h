@@ -43,16 +43,11 @@ static void set_side(const event_step *step, int kink, int side)
   SIDE_OF(step->watch, kink) = step->own[MODE_PLACE[FIRST_SIDE + kink]] = side * KINK_SIDE;
 }
 
-/* Whether the function of a kink is one of time alone, whose zeros do not depend on the state. */
-static int is_of_time(int kink)
-{
-#ifdef EVENTS_OF_TIME
-  return IS_TIMED[FIRST_KINK + kink] != 0;
+#ifdef EVENTS_OF_TIME /* whether the zeros of a kink do not depend on the state */
+#define IS_OF_TIME(kink) (IS_TIMED[FIRST_KINK + (kink)] != 0)
 #else
-  (void)kink;
-  return 0;
+#define IS_OF_TIME(kink) 0
 #endif
-}
 
 /* Values of all functions at a state; those of time alone eight roundings later, as at the ends of steps. */
 static int values_of_kinks(const event_step *step, const event_sample *at, real *value)
@@ -60,7 +55,7 @@ static int values_of_kinks(const event_step *step, const event_sample *at, real 
   int status = evaluate_functions(step, at, value);
 #ifdef EVENTS_OF_TIME
   for (int k = 0; status == OK && k < EVENT_KINKS; k++)
-    if (is_of_time(k)) {
+    if (IS_OF_TIME(k)) {
       const int e = EVENT_FIRST[FIRST_KINK + k];
       status = end_value(step, e, at->t, step->h, value + e);
     }
@@ -229,7 +224,7 @@ static int change_sides(const event_step *step, long long first, event_sample *a
   for (long long i = first; status == OK && i < *step->filled; i++) {
     event_crossing *crossing = step->found + i;
     const int kink = crossing->function - FIRST_KINK;
-    if (kink >= 0 && !is_of_time(kink) && !IS_WALL(crossing->function) && sign[kink] == -crossing->direction) {
+    if (kink >= 0 && !IS_OF_TIME(kink) && !IS_WALL(crossing->function) && sign[kink] == -crossing->direction) {
       set_side(step, kink, -crossing->direction);
       crossing->direction = 0; /* a touch: many in what remains of a step do not accumulate */
       step->watch->history[FUNCTION_OF(crossing)].hits = 1;
