@@ -62,6 +62,7 @@ class Contact:
         where: condition, or several of them, of places and times where the contact exists; elsewhere, and where a
             state is behind its surface, it is open.
         of: coordinates by whose gradient the gap is divided, so that it is a distance to first order.
+        name: name in messages; by default the formula of the gap.
 
     Raises:
         SystemDefinitionError: for friction without slip or slip without friction, and invalid coefficients.
@@ -74,6 +75,7 @@ class Contact:
     restitution: Formula = 0.0
     where: str | Basic | tuple[str | Basic, ...] | None = None
     of: tuple[str | Symbol, ...] = ()
+    name: str = ""
 
     @property
     def conditions(self) -> tuple[Formula, ...]:
@@ -115,11 +117,13 @@ class Friction:
         slip: slip velocity w, linear in the velocities, or its two components in space.
         limit: friction force F of sliding, a formula of (q, v, t) and parameters.
         static_limit: force up to which it sticks; ``None``: F.
+        name: name in messages; by default the formula of the slip.
     """
 
     slip: Formula | tuple[Formula, ...]
     limit: Formula
     static_limit: Formula | None = None
+    name: str = ""
 
     @property
     def table(self) -> dict[str, Any]:
@@ -161,7 +165,8 @@ def _table(item: Any) -> dict[str, Any]:
         if value is not None
     }
     named = {"surface" if name == "gap" and plain.get("of") else name: value for name, value in plain.items()}
-    return {name: value for name, value in named.items() if (name, value) not in (("restitution", 0.0), ("of", []))}
+    defaults: dict[str, Any] = {"restitution": 0.0, "of": [], "name": ""}
+    return {name: value for name, value in named.items() if name not in defaults or value != defaults[name]}
 
 
 ContactLike: TypeAlias = "Contact | Friction"
@@ -186,7 +191,8 @@ def contacts_of(tables: Sequence[Mapping[str, Any]]) -> tuple[ContactLike, ...]:
 
 def names_in(tables: Iterable[Mapping[str, Any]]) -> set[str]:
     """Return the names in the formulas of contacts, by the tables of these."""
-    return set(re.findall(r"[A-Za-z_]\w*", " ".join(str([*table.values()]) for table in tables)))
+    formulas = (str(value) for table in tables for key, value in table.items() if key != "name")
+    return set(re.findall(r"[A-Za-z_]\w*", " ".join(formulas)))
 
 
 def contact(
@@ -199,6 +205,7 @@ def contact(
     static_friction: Formula | None = None,
     restitution: Formula = 0.0,
     where: str | Basic | Sequence[str | Basic] | None = None,
+    name: str = "",
 ) -> Contact:
     """Return a unilateral contact of a system: gap >= 0 with normal force and Coulomb friction.
 
@@ -216,6 +223,7 @@ def contact(
         restitution: coefficient of impacts, 0 to 1; with 0 the contact closes at once.
         where: condition of the places and times where the contact exists, ``"x < 1"`` of a table with an edge, or a
             list of them. It opens where one fails; what is behind its surface passes freely.
+        name: name in messages; by default the formula of the gap.
 
     >>> contact("y - r", slip="x_dot - r*a_dot", friction=0.3).friction
     0.3
@@ -223,16 +231,18 @@ def contact(
     if (gap is None) == (surface is None) or (surface is None) == bool(of):
         raise SystemDefinitionError("give a contact either its gap=, a distance, or surface= and the coordinates of=")
     distance = cast("Formula", surface if gap is None else gap)
-    return Contact(distance, cast(Any, slip), friction, static_friction, restitution, cast(Any, where), tuple(of))
+    return Contact(distance, cast(Any, slip), friction, static_friction, restitution, cast(Any, where), tuple(of), name)
 
 
-def friction(slip: Formula | Sequence[Formula], *, limit: Formula, static_limit: Formula | None = None) -> Friction:
+def friction(
+    slip: Formula | Sequence[Formula], *, limit: Formula, static_limit: Formula | None = None, name: str = ""
+) -> Friction:
     """Return dry friction without a gap, of joints and belts: sticking up to ``static_limit``, sliding with ``limit``.
 
     >>> friction("x_dot - 0.3", limit="0.25", static_limit="0.4").limit
     '0.25'
     """
-    return Friction(cast(Any, slip), limit, static_limit)
+    return Friction(cast(Any, slip), limit, static_limit, name)
 
 
 def static_limit(item: Any) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.representation import summary
@@ -28,6 +28,8 @@ KANES_METHOD = ArgumentType("a KanesMethod of sympy.physics.mechanics", lambda v
 JOINTS = ArgumentType(
     "a list of names of joints, or True for all", lambda value: value in (True, False) or NAMES.accepts(value)
 )
+PART = ArgumentType("'contact' or 'ignore'", lambda value: value in ("contact", "ignore"))
+PLANES = ArgumentType("'planes' or 'ignore'", lambda value: value in ("planes", "ignore"))
 BODIES = ArgumentType("a System of sympy.physics.mechanics", lambda value: hasattr(value, "actuators"))
 
 
@@ -321,7 +323,7 @@ class LagrangianSystem(MechanicalSystem):
         return cls.from_sympy(name=name, parameters=parameters, inputs=inputs, **of_system(system).formulas())
 
     @classmethod
-    @checks_arguments(SystemDefinitionError, gravity=NUMBERS, actuated=JOINTS)
+    @checks_arguments(SystemDefinitionError, gravity=NUMBERS, actuated=JOINTS, limits=PART, friction=PART)
     def from_urdf(
         cls,
         path: str | PathLike[str],
@@ -329,7 +331,9 @@ class LagrangianSystem(MechanicalSystem):
         floating: bool = False,
         gravity: Sequence[float] = (0.0, 0.0, -9.81),
         actuated: Sequence[str] | bool = False,
-        limits: bool = False,
+        limits: Literal["contact", "ignore"] = "ignore",
+        friction: Literal["contact", "ignore"] = "ignore",
+        restitution: float = 0.0,
         check_inertias: bool = True,
         name: str | None = None,
     ) -> LagrangianSystem:
@@ -347,8 +351,10 @@ class LagrangianSystem(MechanicalSystem):
             floating: whether the base moves freely; otherwise it is fixed to the world.
             gravity: acceleration of gravity in the world frame, in the units of the file (m/s^2).
             actuated: names of the joints on which an input ``tau_JOINT``, a torque or force, acts; ``True`` for all.
-            limits: whether limits and dry friction of hinges and slides are part of the motion, as its ``contacts``,
-                with the restrictions of contacts (:func:`~scvi_codegen.contact`); otherwise the warning lists them.
+            limits, friction: ``"contact"`` for limits and dry friction of joints that are part of the motion, as
+                ``contacts`` of the system, with the restrictions of these (:func:`~scvi_codegen.contact`);
+                ``"ignore"``: the warning lists them.
+            restitution: coefficient of impacts at limits, 0 to 1.
             check_inertias: whether moments of inertia that no body has are an error; otherwise they are integrated as
                 they are written, with a warning.
             name: name of the system; by default that of the robot.
@@ -358,17 +364,20 @@ class LagrangianSystem(MechanicalSystem):
         """
         from scvi_codegen.systems.multibody.trees.urdf import links_of_urdf
 
-        robot, links = links_of_urdf(path, floating=floating, limits=limits)
-        return cls._of_tree(path, name or robot, links, gravity, actuated, check_inertias)
+        robot, links = links_of_urdf(path, floating=floating, parts=_read_parts(limits=limits, friction=friction))
+        return cls._of_tree(path, name or robot, links, gravity, actuated, check_inertias, restitution)
 
     @classmethod
-    @checks_arguments(SystemDefinitionError, actuated=JOINTS)
+    @checks_arguments(SystemDefinitionError, actuated=JOINTS, limits=PART, friction=PART, contacts=PLANES)
     def from_mjcf(
         cls,
         path: str | PathLike[str],
         *,
         actuated: Sequence[str] | bool = False,
-        limits: bool = False,
+        limits: Literal["contact", "ignore"] = "ignore",
+        friction: Literal["contact", "ignore"] = "ignore",
+        contacts: Literal["planes", "ignore"] = "ignore",
+        restitution: float = 0.0,
         check_inertias: bool = True,
         name: str | None = None,
     ) -> LagrangianSystem:
@@ -381,7 +390,10 @@ class LagrangianSystem(MechanicalSystem):
         what is not part of the motion: limits, dry friction, contacts, actuators.
 
         Args:
-            path, actuated, limits, check_inertias: see :meth:`from_urdf`; limits are rigid.
+            path, actuated, limits, friction, check_inertias: see :meth:`from_urdf`; limits are rigid.
+            contacts: ``"planes"`` for contacts of spheres, capsules and boxes with planes, rigid and with sliding
+                friction; the warning has the number of other pairs of geoms that may touch. ``"ignore"``: none.
+            restitution: coefficient of impacts of limits and geoms, 0 to 1.
             name: name of the system; by default that of the model.
 
         Raises:
@@ -390,20 +402,23 @@ class LagrangianSystem(MechanicalSystem):
         """
         from scvi_codegen.systems.multibody.trees.mjcf import links_of_mjcf
 
-        model, links, gravity, *others = links_of_mjcf(path, limits=limits)
-        return cls._of_tree(path, name or model, links, gravity, actuated, check_inertias, *others)
+        parts = _read_parts(limits=limits, friction=friction, contacts=contacts)
+        model, links, gravity, *others = links_of_mjcf(path, parts)
+        return cls._of_tree(path, name or model, links, gravity, actuated, check_inertias, restitution, *others)
 
     @classmethod
     def _of_tree(
-        cls, path: Any, name: str, links: Any, gravity: Any, actuated: Any, checked: bool, *others: Any
+        cls, path: Any, name: str, links: Any, gravity: Any, actuated: Any, checked: bool, e: float, *others: Any
     ) -> LagrangianSystem:
         from scvi_codegen.systems.multibody.trees.closures import conditions_of
+        from scvi_codegen.systems.multibody.trees.contacts import contacts_of
         from scvi_codegen.systems.multibody.trees.energies import system_of_tree
         from scvi_codegen.systems.multibody.trees.tendons import energies_of
 
         try:
-            closures, tendons = others or ((), ())
-            added = conditions_of(links, closures), checked, energies_of(links, tendons)
+            closures, tendons, touches = others or ((), (), ())
+            touching = contacts_of(links, touches, e)
+            added = conditions_of(links, closures), checked, energies_of(links, tendons), touching, e
             system: LagrangianSystem = system_of_tree(cls, name, links, gravity, actuated, *added)
         except SystemDefinitionError as error:
             raise SystemDefinitionError(f"{path}: {error}") from error
@@ -425,3 +440,8 @@ class LagrangianSystem(MechanicalSystem):
             for coordinate, velocity in zip(self.coordinates, self.velocities, strict=True)
         }
         return rf"$\displaystyle L = {latex(self._shown_formula, symbol_names=dotted)}$"
+
+
+def _read_parts(**parts: str) -> list[str]:
+    """Return the names of the parts of a robot that are not ignored."""
+    return [part for part, how in parts.items() if how != "ignore"]

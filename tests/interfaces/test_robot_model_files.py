@@ -84,6 +84,7 @@ def test_impossible_inertias_are_integrated_if_the_file_says_so(tmp_path):
         ("[system]\nrobot = 3\n", "robot must be text between quotes"),
         (BALL + "actuated = 3\n", "actuated"),
         (BALL + "check_inertias = 0\n", "check_inertias must be true or false, not 0"),
+        (BALL + 'contacts = "contact"\n', "contacts must be 'planes' or 'ignore', not 'contact'"),
     ],
 )
 def test_mistakes_in_the_section_of_a_robot_are_named(text, message):

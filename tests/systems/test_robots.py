@@ -11,7 +11,7 @@ from random_robots import errors_of_motion, motion_by_mujoco
 from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
-from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning
+from scvi_codegen.common.errors import ContactError, SystemDefinitionError, SystemDefinitionWarning
 from scvi_codegen.systems.formulas.expressions import evaluate
 from scvi_codegen.systems.multibody.trees.mjcf import SHAPES
 
@@ -287,7 +287,7 @@ def test_limits_and_dry_friction_of_joints_are_contacts(kind, tmp_path):
     file.write_text(LIFT[kind])
     with pytest.warns(SystemDefinitionWarning, match="limits of joints lift; dry friction of joints wheel$"):
         assert not getattr(sc.LagrangianSystem, f"from_{kind}")(file).has_contacts
-    system = getattr(sc.LagrangianSystem, f"from_{kind}")(file, limits=True)
+    system = getattr(sc.LagrangianSystem, f"from_{kind}")(file, limits="contact", friction="contact")
     stepper = sc.compile_stepper(system, "svi:2")
     run = stepper.integrate({"lift": 0.0, "wheel": 0.0}, velocity={"lift": 0.0, "wheel": 1.0}, h=0.05, t_end=1.5)
     (_, falls), (lands, rests), (stops, sticks) = run.contact_modes
@@ -295,6 +295,8 @@ def test_limits_and_dry_friction_of_joints_are_contacts(kind, tmp_path):
     assert (lands, stops) == pytest.approx((np.sqrt(1 / 9.81), 1.0), rel=1e-13)
     assert run.q[-1] == pytest.approx([-0.5, 0.5], rel=1e-13)
     assert run.contact_forces()[-1, 0, 0] == pytest.approx(9.81, rel=1e-12)
+    with pytest.raises(ContactError, match=r"contact 1 \(lower limit of joint 'lift' of the range -0.5 to 1\) at -0.2"):
+        stepper.integrate({"lift": -0.7, "wheel": 0.0}, velocity={"lift": 0.0, "wheel": 1.0}, h=0.05, t_end=1.5)
 
 
 @pytest.mark.rotated

@@ -35,13 +35,14 @@ REDUNDANT = (
 )
 
 
-def refusal_of(watch: Any, t: float) -> ContactError | None:
+def refusal_of(stepper: Integrator, watch: Any, t: float) -> ContactError | None:
     """Return why contacts allow no motion at time t, ``None`` if they do."""
     reason, contact = getattr(watch, "refusal", 0), getattr(watch, "refused", 0)
     if not reason:
         return None
     message = REFUSALS.get(reason, PARADOX if contact else REDUNDANT)
-    return ContactError(message.format(t=t, k=contact, value=watch.behind))
+    named = contact and f"{contact} ({stepper.interface.contacts[contact - 1].title})"
+    return ContactError(message.format(t=t, k=named, value=watch.behind))
 
 
 def check_forward(run: Any) -> None:
@@ -80,7 +81,7 @@ def in_first_modes(stepper: Integrator, q: States, p: States, t: float, paramete
     status = binding.function("begin_contacts")(watch, t, *numbers, binding.workspace())
     if status:
         reason = f"the contacts are undefined at t = {t:.17g}, q = {q!r}: {REASONS[status]}"
-        raise refusal_of(watch, t) or ContactError(reason)
+        raise refusal_of(stepper, watch, t) or ContactError(reason)
     warn_of_choices(watch)
     return q1, p1
 

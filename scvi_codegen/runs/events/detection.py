@@ -161,7 +161,7 @@ class CrossingSearch:
             )
 
     def _failure(self, status: int, report: Any, step: int, h: float) -> Exception:
-        if refusal := refusal_of(self.watch, report.t):
+        if refusal := refusal_of(self.stepper, self.watch, report.t):
             return refusal
         behind = getattr(self.watch, "behind", 0.0)
         through = BEHIND if behind < 0.0 else THROUGH

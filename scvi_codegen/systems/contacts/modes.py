@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.systems.contact import Contact, ContactLike, Friction, slips_of, static_limit
 from scvi_codegen.systems.event import LOOPS, Formula
+from scvi_codegen.systems.formulas.expressions import gradient_tuple
 from scvi_codegen.systems.formulas.indices import Array, Size
 from scvi_codegen.systems.formulas.symbols import DOT
 
@@ -39,7 +40,7 @@ class ContactRows(NamedTuple):
         closed, sticks: names of the masks of its mode, of each slip.
         directions: of slip: d in a plane; in space whether it slips, and vectors of two components each (contacts.h).
         held: name of the mask that is 1 where the gap or slip stays 0 by other contacts, and has no transitions.
-        title: its formula, for messages.
+        title: its name or formula, for messages.
         transitions: kinds, functions and conditions of its transitions
             (:class:`~scvi_codegen.systems.event.Transition`).
     """
@@ -194,7 +195,7 @@ class _Binding:
             term = parse_constraint(value if value == first else value + loops, known, self.names | self.functions)
             return [term.formula.xreplace(rule) for _, rule in rules.rules(term)]
 
-        fields = {name: getattr(item, name) for name in item.__dataclass_fields__}
+        fields = {name: getattr(item, name) for name in item.__dataclass_fields__ if name != "name"}
         if fields.get("where") is not None:
             fields["where"] = tuple(map(str, cast("Contact", item).conditions))  # formulas that are >= 0
         elements = [
@@ -240,7 +241,7 @@ class _Binding:
     def _gradient(self, item: ContactLike, formula: Expr, variables: Sequence[Symbol], role: str) -> list[Expr]:
         """Return the derivatives of a gap or a slip; raise unless they contain no velocities and do not vanish."""
         in_coordinates = self.turning.in_coordinates(formula)
-        gradient = [in_coordinates.diff(x) for x in variables]
+        gradient = [*gradient_tuple(in_coordinates, variables)]
         moving = formula.free_symbols & self.moving
         if role == "slip":
             moving &= {x for rate in moving for x in formula.diff(rate).free_symbols}
@@ -301,8 +302,8 @@ class _Binding:
             (kind, self.system.text_of(function), *(where if kind == "closes" else ()))
             for kind, function in (*transitions.items(), *leaves)
         )
-        named, shown = ("gap", item.gap) if of_gap else ("slip", " and ".join(map(self.system.text_of, slips)))
-        title = f"{named} '{shown if isinstance(shown, str) else self.system.text_of(shown)}'"
+        shown = " and ".join(map(self.system.text_of, (item.gap,) if of_gap else slips))
+        title = item.name or f"{'gap' if of_gap else 'slip'} '{shown}'"
         return ContactRows(normal, tangential, len(slips), *names, title, functions)
 
     def _slipping(self, number: int, slips: Sequence[Expr]) -> Slipping:
@@ -330,5 +331,5 @@ def _mapped(item: ContactLike, function: Callable[[Any, str], Any]) -> Any:
             else function(formulas, role)
         )
 
-    fields = {name: getattr(item, name) for name in item.__dataclass_fields__ if name != "where"}
+    fields = {name: getattr(item, name) for name in item.__dataclass_fields__ if name not in ("where", "name")}
     return replace(cast("Any", item), **{name: of(value, name) for name, value in fields.items() if value is not None})

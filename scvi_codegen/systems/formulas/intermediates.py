@@ -51,8 +51,8 @@ class Intermediate(Expr):  # type: ignore[misc]  # SymPy is untyped
             quantity = Expr.__new__(cls, definition)
             quantity.number = next(_NUMBERS)
             quantity.inner = inner_of(definition)
-            quantity._free = frozenset(definition.free_symbols)
-            quantity.varies_with = _varies_with(definition)
+            quantity._free = _symbols_in(definition, "_free")
+            quantity.varies_with = _symbols_in(definition, "varies_with", unit_step, rint)
             _KNOWN[definition] = quantity
         return quantity
 
@@ -101,16 +101,19 @@ class Intermediate(Expr):  # type: ignore[misc]  # SymPy is untyped
         return replaced[self]
 
 
-def _varies_with(definition: Expr) -> frozenset[Symbol]:
-    """Return the symbols of an expression without those that occur in piecewise constant functions alone."""
+def _symbols_in(definition: Expr, of_quantity: str, *without: type) -> frozenset[Symbol]:
+    """Return the symbols of an expression and of the quantities in it, without those in some functions alone.
+
+    Each subexpression is visited once, unlike by SymPy's ``free_symbols``.
+    """
     seen, symbols, pending = {definition}, set[Symbol](), [definition]
     while pending:
         node = pending.pop()
         if isinstance(node, Intermediate):
-            symbols |= node.varies_with
+            symbols |= getattr(node, of_quantity)
         elif node.is_Symbol:
             symbols.add(node)
-        elif not isinstance(node, unit_step | rint):
+        elif not isinstance(node, without):
             new = [argument for argument in node.args if argument not in seen]
             seen.update(new)
             pending += new

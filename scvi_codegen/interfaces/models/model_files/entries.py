@@ -19,8 +19,10 @@ from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 from scvi_codegen.systems.system import MechanicalSystem
 
-ROBOT_KEYS = ("robot", "name", "actuated", "check_inertias", "time_transformation")
-URDF_KEYS = ("floating", "gravity")
+ARGUMENTS = ("name", "actuated", "limits", "friction", "restitution", "check_inertias")
+ROBOT_KEYS = ("robot", "time_transformation", *ARGUMENTS)
+FORMAT_KEYS = {True: ("floating", "gravity"), False: ("contacts",)}
+"""Those of URDF files (true) and of MJCF files."""
 URDF = ".urdf"
 ROBOT_FILES = (URDF, ".xml", ".mjcf")
 """Suffixes of robots' files, which are models by themselves."""
@@ -73,9 +75,9 @@ def _robot(section: Section, folder: Path) -> Entry:
     except OSError as error:
         raise ModelFileError(f"[system] robot = '{name}' cannot be read: {error.strerror}") from error
     urdf = path.suffix.lower() == URDF
-    keys = (*ROBOT_KEYS, *URDF_KEYS) if urdf else ROBOT_KEYS
-    check_keys(section, keys, "key", f"[system] beside robot = {path.name!r}")
-    arguments: dict[str, Any] = {key: section[key] for key in (*ROBOT_KEYS[1:-1], *URDF_KEYS) if key in section}
+    own = FORMAT_KEYS[urdf]
+    check_keys(section, (*ROBOT_KEYS, *own), "key", f"[system] beside robot = {path.name!r}")
+    arguments: dict[str, Any] = {key: section[key] for key in (*ARGUMENTS, *own) if key in section}
     for key in ("floating", "check_inertias"):
         if not isinstance(arguments.get(key, False), bool):
             raise ModelFileError(f"[system] {key} must be true or false, not {arguments[key]!r}")

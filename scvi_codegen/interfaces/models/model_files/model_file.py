@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from scvi_codegen.common.validation import ExactNumber, checks_arguments, of
 from scvi_codegen.interfaces.models.input_tables import InputTable
 from scvi_codegen.interfaces.models.model import Model
 from scvi_codegen.interfaces.models.model_files.document import document_of, with_files
-from scvi_codegen.interfaces.models.model_files.entries import ROBOT_KEYS, URDF_KEYS, Entry, is_robot, read_entry
+from scvi_codegen.interfaces.models.model_files.entries import FORMAT_KEYS, ROBOT_KEYS, Entry, is_robot, read_entry
 from scvi_codegen.interfaces.models.model_files.page_section import PAGE_KEYS, PICTURE_KEYS, check_page, check_picture
 from scvi_codegen.interfaces.models.model_files.sections import (
     FORMULAS,
@@ -55,7 +56,7 @@ from scvi_codegen.systems.time_transformation import time_rescaling_function
 
 SYSTEM_KEYS = (
     *("name", "coordinates", *TURNING, "momenta", *FORMULAS, "inputs", "neighbours", "point_forces"),
-    *("catalogue", *ROBOT_KEYS, *URDF_KEYS),
+    *("catalogue", *ROBOT_KEYS, *chain(*FORMAT_KEYS.values())),
 )
 FIELD_KEYS = (
     *("name", "fields", "momenta", "space", "boundary", "density", "hamiltonian", "dissipation"),

@@ -210,6 +210,15 @@ class Unread:
             warn(f"{file}: the motion is computed without {'; '.join(parts)}", SystemDefinitionWarning)
 
 
+def checked_limits(joint: Element, low: float, high: float) -> tuple[float, float]:
+    """Return the limits of a joint, of which the second must be the larger one."""
+    if not low < high:
+        joint.refuse(
+            f"has the limits {low:g} and {high:g}: the second must be larger; fix the joint, or limits='ignore'"
+        )
+    return low, high
+
+
 def root_of(path: Path, *tags: str) -> Element:
     """Read a document whose outermost element must have one of the tags.
 

@@ -199,14 +199,16 @@ class Tree:
             elif parent >= 0:
                 momenta[parent] = as_quantities(momenta[parent] + self.turned(joint, momenta[i]))
 
+    def rates(self, joint: Joint) -> list[Expr]:
+        """Return the rate of a hinge or slide, and the angular velocity and the velocity of others."""
+        if joint.kind in SINGLE:
+            return [self.coordinate(joint)[1]]
+        moved = position_of(joint) if joint.kind == "free" else ()
+        return [*rotation_of(joint).rates, *(symbol(name + DOT) for name in moved)]
+
     def of_rates(self, joint: Joint, coefficients: Sequence[float]) -> Expr:
         """Return the sum of :func:`integral` over the magnitudes of the rates of a joint."""
-        if joint.kind in SINGLE:
-            rates: list[Expr] = [self.coordinate(joint)[1]]
-        else:
-            rates = [*rotation_of(joint).rates]
-            rates += [symbol(name + DOT) for name in position_of(joint)] if joint.kind == "free" else []
-        return Add(*(integral(coefficients, Abs(rate)) for rate in rates))
+        return Add(*(integral(coefficients, Abs(rate)) for rate in self.rates(joint)))
 
     def potential_energy(self) -> Expr:
         """Return V of gravity and springs."""
@@ -247,16 +249,26 @@ class Tree:
                 terms += [integral(pair, Abs(x)) for pair, x in zip(coefficients, rates, strict=True)]
         return Add(*terms)
 
-    def contacts(self) -> tuple[ContactLike, ...]:
-        """Return the contacts q >= low and q <= high of joints with limits, and the dry friction of joints."""
-        contacts: list[ContactLike] = []
+    def contacts(self, restitution: float) -> Iterator[ContactLike]:
+        """Yield the contacts of joints with limits, and the dry friction of joints.
+
+        A hinge or slide has the gaps q - low and high - q. A rotation R by an angle a <= high, with cos a = (tr R -
+        1)/2, has the gap (cos a - cos high)/sin high, which is smooth at a = 0.
+        """
+        e = exact_number(restitution)
         for joint in self.joints.values():
-            if joint.limits is not None:
-                q, (low, high) = self.coordinate(joint)[0], map(exact_number, joint.limits)
-                contacts += [contact(q - low), contact(high - q)]
-            if joint.dry_friction:
-                contacts.append(friction(self.coordinate(joint)[1], limit=exact_number(joint.dry_friction)))
-        return tuple(contacts)
+            low, high = joint.limits or (0.0, 0.0)
+            of = f"limit of joint '{joint.label}' of the range {low:g} to {high:g}"
+            if joint.limits is not None and joint.kind in SINGLE:
+                q = self.coordinate(joint)[0]
+                yield contact(q - exact_number(low), restitution=e, name=f"lower {of}")
+                yield contact(exact_number(high) - q, restitution=e, name=f"upper {of}")
+            elif high and high < np.pi:
+                cosine, edge = Matrix(3, 3, rotation_of(joint).entries).trace() / 2 - S.Half, exact_number(high)
+                yield contact((cosine - cos(edge)) / sin(edge), restitution=e, name=of)
+            for rate in self.rates(joint) if joint.dry_friction else ():
+                limit = exact_number(joint.dry_friction)
+                yield friction(rate, limit=limit, name=f"dry friction of joint '{joint.label}'")
 
     def arguments(self, actuated: Collection[str] | bool) -> dict[str, Any]:
         """Return arguments of :meth:`LagrangianSystem.from_sympy`: coordinates, rotations, lagrangian, forces.
@@ -336,14 +348,16 @@ def system_of_tree(
     constraints: Sequence[Expr] = (),
     check_inertias: bool = True,
     tendons: tuple[Expr, Expr, Expr] = (S.Zero, S.Zero, S.Zero),
+    touching: Sequence[ContactLike] = (),
+    restitution: float = 0.0,
 ) -> Any:
-    """Return the system of a tree, of class ``kind``, and of the energies of tendons; see :class:`Tree`."""
+    """Return the system of a tree, of class ``kind``, energies of tendons, and contacts; see :class:`Tree`."""
     tree = Tree(links, gravity)
     for problem in impossible_inertias(tree.links):
         if check_inertias:
             raise SystemDefinitionError(f"{problem}, or integrate it as it is written by check_inertias=False")
         warn(problem, SystemDefinitionWarning)
-    contacts = tree.contacts()
+    contacts = *tree.contacts(restitution), *touching
 
     def made(**fields: Any) -> Any:
         members, drawn = fields.get("rotations", ()), tuple(map(DrawnLink.of, tree.links))

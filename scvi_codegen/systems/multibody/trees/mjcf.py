@@ -6,7 +6,7 @@ Attributes and defaults are those of https://mujoco.readthedocs.io/en/stable/XML
 
 import re
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from itertools import combinations, zip_longest
 from os import PathLike
@@ -19,7 +19,9 @@ import numpy as np
 from scvi_codegen.common.errors import closest
 from scvi_codegen.systems.formulas.rotations import matrix_of
 from scvi_codegen.systems.multibody.trees.closures import Closure, Coupling, at_reference
-from scvi_codegen.systems.multibody.trees.document import Element, Unread, root_of
+from scvi_codegen.systems.multibody.trees.contacts import Touch
+from scvi_codegen.systems.multibody.trees.document import Element, Unread, checked_limits, root_of
+from scvi_codegen.systems.multibody.trees.geoms import Geom, Pair
 from scvi_codegen.systems.multibody.trees.macros import Macros
 from scvi_codegen.systems.multibody.trees.meshes import inertia_of
 from scvi_codegen.systems.multibody.trees.schema import MJCF, TURN
@@ -62,6 +64,9 @@ length along z, of a capsule without its caps."""
 
 
 WEIGHTLESS = ("plane", "hfield")
+PARTS = {"limits": "limits", "friction": "dry friction"}
+SLIDING = 3
+"""Dimension of contacts with sliding friction; of higher ones friction opposes rotations, too."""
 ORIENTATIONS = TURN.split()
 NO_MASS = 1e-15
 """Bodies with less mass are without forces of a medium, and boxes have no smaller sums of moments of inertia."""
@@ -71,21 +76,21 @@ Defaults = dict[str, dict[str, str]]
 
 
 def links_of_mjcf(
-    path: str | PathLike[str], *, limits: bool = False
-) -> tuple[str, list[Link], Vector, list[Closure | Coupling], list[Tendon]]:
-    """Return the name of the model, its links with parents first, the gravity, its equalities, and its tendons.
+    path: str | PathLike[str], parts: Collection[str] = ()
+) -> tuple[str, list[Link], Vector, list[Closure | Coupling], list[Tendon], list[Touch]]:
+    """Return the name of the model, its links with parents first, the gravity, equalities, tendons, and touching geoms.
 
-    ``limits``: whether those of hinges and slides and their dry friction are read; otherwise the warning names them.
+    ``parts``: among ``"limits"``, ``"friction"`` of joints and ``"contacts"``; a warning names others.
 
     Raises:
         SystemDefinitionError: naming file and element, if something is malformed or unknown, or changes the motion and
             is not read.
     """
     root = _document(Path(path))
-    model = _MujocoModel(root, limits)
-    closures, tendons = [*model.closures()], [*model.tendons()]
+    model = _MujocoModel(root, parts)
+    others = [*model.closures()], [*model.tendons()], [*model.touches()]
     model.unread.warn(root.file)
-    return root.node.get("model") or Path(path).stem, model.scaled(), model.gravity, closures, tendons
+    return root.node.get("model") or Path(path).stem, model.scaled(), model.gravity, *others
 
 
 def _document(path: Path, around: tuple[Path, ...] = ()) -> Element:
@@ -109,8 +114,8 @@ def _document(path: Path, around: tuple[Path, ...] = ()) -> Element:
 class _MujocoModel:
     """Links of a document whose attributes are explicit."""
 
-    def __init__(self, root: Element, limits: bool) -> None:
-        self.root, self.unread, self.limits = root, Unread(), limits
+    def __init__(self, root: Element, parts: Collection[str]) -> None:
+        self.root, self.unread, self.parts = root, Unread(), parts
         option = _merged(root, "option", root.children("option"))
         flags = _merged(root, "flag", [flag for each in root.children("option") for flag in each.children("flag")])
         self.disabled = {key for key in flags.node.attrib if flags.choice(key, "enable", "disable") == "disable"}
@@ -123,8 +128,7 @@ class _MujocoModel:
         self.labels = set[str | None]()
         self.carriers, self.parents = {-1: -1}, dict[int, int]()
         """Of each body, by its link: the moving body that it is fixed to, and the one that this is connected with."""
-        self.shapes: dict[tuple[int, int, int], None] = {}
-        """Of geoms: the link, contype and conaffinity."""
+        self.geoms: list[Geom] = []
         self.places: dict[tuple[str, str], tuple[int, Pose]] = {("body", "world"): (-1, Pose())}
         """Link and pose in it of bodies and sites, by tag and name."""
         for world in root.children("worldbody"):
@@ -132,8 +136,6 @@ class _MujocoModel:
         self.links = named(self.links)
         self.singles = {link.joint.label: link.joint for link in self.links if link.joint.kind in SINGLE}
         self.read_actuators()
-        if self.contacts():
-            self.unread.add("contacts")
         if self.compensating and any(link.inertia.lift[0] for link in self.links):
             self.compensating[0].refuse("has actuatorgravcomp, which is not read where bodies have gravcomp")
 
@@ -172,8 +174,8 @@ class _MujocoModel:
             elif element.tag == "frame":
                 at = at @ self.pose(element)
             if element.tag != "frame":
-                for geom, _ in self.contents(element, "geom"):
-                    self.shapes[link, int(geom.number("contype", 1)), int(geom.number("conaffinity", 1))] = None
+                for geom, frame in self.contents(element, "geom"):
+                    self.geoms.append(Geom(geom, link, at @ frame @ self.pose(geom)))
             for site in element.children("site"):
                 self.put(site, link, at @ self.pose(site))
             inner = (*element.children("frame"), *element.children("body"))
@@ -227,26 +229,47 @@ class _MujocoModel:
                 inner = at @ self.pose(element) if element.tag == "frame" else at
                 pending += [(child, inner) for child in reversed(element.children("frame", *tags))]
 
-    def contacts(self) -> bool:
-        """Return whether geoms of different bodies may touch, in MuJoCo's rules.
-
-        https://mujoco.readthedocs.io/en/stable/computation/index.html#selection
-        """
+    def pairs(self) -> Iterator[Pair]:
+        """Yield the pairs of geoms of different bodies that may touch, in MuJoCo's rules."""
         if self.disabled & {"contact", "constraint"}:
-            return False
+            return
         sections = self.root.children("contact")
+        named = {geom.element.node.get("name"): k for k, geom in enumerate(self.geoms)}
+        written = set[tuple[int, ...]]()
+        for pair in (pair for section in sections for pair in section.children("pair")):
+            for name in (names := [pair.text(key) for key in ("geom1", "geom2")]):
+                if name not in named:
+                    pair.refuse(f"names the geom '{name}', which does not exist{closest(name, [*filter(None, named)])}")
+            first, second = sorted(named[name] for name in names)
+            written.add((first, second))
+            yield Pair.of_element(pair, self.geoms[first], self.geoms[second])
         excluded = {
             frozenset(self.place(exclusion, key)[0] for key in ("body1", "body2"))
             for section in sections
             for exclusion in section.children("exclude")
         }
         near = set() if "filterparent" in self.disabled else {*self.parents.items()}
-        for (first, *types), (second, *others) in combinations(self.shapes, 2):
-            a, b = self.carriers[first], self.carriers[second]
-            filtered = a == b or (min(a, b) >= 0 and not near.isdisjoint({(a, b), (b, a)}))
+        shapes = [(k, geom.link, self.carriers[geom.link], *geom.types) for k, geom in enumerate(self.geoms)]
+        for (i, first, a, *types), (j, second, b, *others) in combinations(shapes, 2):
+            filtered = a == b or (min(a, b) >= 0 and not near.isdisjoint({(a, b), (b, a)})) or (i, j) in written
             if not filtered and (types[0] & others[1] or others[0] & types[1]) and {first, second} not in excluded:
-                return True
-        return any(section.children("pair") for section in sections)
+                yield Pair.of(self.geoms[i], self.geoms[j])
+
+    def touches(self) -> Iterator[Touch]:
+        """Yield the contacts of spheres with planes; other pairs of geoms are listed as unread."""
+        pairs, unread = self.pairs(), 0
+        if "contacts" not in self.parts:
+            if next(pairs, None):
+                self.unread.add("contacts")
+            return
+        for pair in pairs:
+            touches = [*pair.touches(self.links)]
+            unread += not touches
+            if touches and pair.dimensions > SLIDING:
+                self.unread.add("torsional and rolling friction of", touches[0].name)
+            yield from touches
+        if unread:
+            self.unread.add(f"contacts of {unread} pairs of geoms")
 
     def read_actuators(self) -> None:
         """Add the inertias of rotors and the damping of actuators, which are those of lengths gear q, to joints."""
@@ -273,11 +296,12 @@ class _MujocoModel:
             limited = "true"
         limits = (low, high) if limited == "true" and not self.disabled & {"limit", "constraint"} else None
         friction = element.number("frictionloss", 0, 0) * (not self.disabled & {"frictionloss", "constraint"})
-        if not (self.limits and element.tag == "joint" and element.text("type", "hinge") in SINGLE):
-            for what in ("limits of",) * (limits is not None) + ("dry friction of",) * (friction > 0):
-                self.unread.add(f"{what} {part}", name)
-            return None, 0.0
-        return limits, friction
+        present = {"limits": limits is not None, "friction": friction > 0}
+        for what in (what for what in present if present[what] and what not in self.parts):
+            self.unread.add(f"{PARTS[what]} of {part}", name)
+        if part == "tendons" and (both := [what for what in present if present[what] and what in self.parts]):
+            element.refuse(f"has {PARTS[both[0]]}, which is read of joints only: write {both[0]}='ignore'")
+        return limits if "limits" in self.parts else None, friction if "friction" in self.parts else 0.0
 
     def closures(self) -> Iterator[Closure | Coupling]:
         """Yield the equalities that are active; their softness is not read.
@@ -350,7 +374,7 @@ class _MujocoModel:
         kind = "free" if bare else joint.choice("type", "hinge", "slide", "ball", "free")
         if kind == "free" and parent >= 0:
             joint.refuse("is free, but its body is inside another body")
-        turn = _unit(joint) if kind == "hinge" else 1.0
+        turn = _unit(joint) if kind in ("hinge", "ball") else 1.0
         rest, zero = (joint.number(key, 0) for key in ("springref", "ref"))
         if joint.choice("actuatorgravcomp", "false", "true") == "true":
             self.compensating.append(joint)
@@ -365,7 +389,7 @@ class _MujocoModel:
             rest=rest * turn,
             armature=joint.number("armature", 0, 0),
             zero=zero * turn if kind in SINGLE else 0.0,
-            limits=limits and (limits[0] * turn, limits[1] * turn),
+            limits=limits and checked_limits(joint, limits[0] * turn, limits[1] * turn),
             dry_friction=friction,
         )
 

@@ -84,7 +84,7 @@ MJCF = {
     "default": Kind(
         "class",
         children="default* joint geom site equality=any_equality tendon=spatial mesh texture~ material~ "
-        f"camera~ light~ pair~ {' '.join(f'{tag}=actuated' for tag in ACTUATORS.split())}",
+        f"camera~ light~ pair {' '.join(f'{tag}=actuated' for tag in ACTUATORS.split())}",
     ),
     "asset": Kind(children="model=asset_model* mesh* hfield~ skin~ texture~ material~"),
     "mesh": Kind(
@@ -109,9 +109,8 @@ MJCF = {
     "freejoint": Kind("name", "align group"),
     "geom": Kind(
         f"name class type pos {TURN} fromto size mass density shellinertia mesh group contype conaffinity "
-        "fluidcoef fluidshape",
-        "adhesion castshadow condim fitscale friction gap hfield margin material priority rgba "
-        "solimp solmix solref surfacevel user",
+        "fluidcoef fluidshape condim friction priority",
+        "adhesion castshadow fitscale gap hfield margin material rgba solimp solmix solref surfacevel user",
         None,
         "plugin!",
         "geom",
@@ -143,7 +142,8 @@ MJCF = {
         "config~",
         "actuator",
     ),
-    "contact": Kind(children="pair~ exclude~"),
+    "contact": Kind(children="pair* exclude~"),
+    "pair": Kind("name class geom1 geom2 condim friction", f"{SOFTNESS} solreffriction margin gap", defaults="pair"),
 }
 """Kinds of elements of MJCF, by tag or by the name that their parent calls them."""
 

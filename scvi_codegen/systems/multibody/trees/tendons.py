@@ -36,7 +36,7 @@ def energies_of(links: Sequence[Link], tendons: Iterable[Tendon]) -> tuple[Expr,
         for ends in pairwise(tendon.points):
             (start, _), (end, _) = frames_in_common(links, ends)
             length += sqrt(intermediate((end - start).dot(end - start)))
-        rate = _rate(links, length) if tendon.armature or tendon.damping else S.Zero
+        rate = rate_of(links, length) if tendon.armature or tendon.damping else S.Zero
         kinetic += exact_number(tendon.armature) * rate**2 / 2
         dissipated += integral(tendon.damping, Abs(rate))
         if any(tendon.stiffness):
@@ -46,7 +46,7 @@ def energies_of(links: Sequence[Link], tendons: Iterable[Tendon]) -> tuple[Expr,
     return kinetic, potential, dissipated
 
 
-def _rate(links: Sequence[Link], length: Expr) -> Expr:
+def rate_of(links: Sequence[Link], length: Expr) -> Expr:
     """Return the derivative in time of a function of coordinates and rotations."""
     rate = S.Zero
     for joint in (link.joint for link in links if link.joint.kind != "fixed"):

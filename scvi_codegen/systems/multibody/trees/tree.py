@@ -99,8 +99,8 @@ class Joint:
             and the displacement x from ``rest``, of a rotation the angle, of a free body from its pose as well.
         armature: inertia of the rotor, which adds armature q_dot^2/2 to the kinetic energy.
         zero: value of the coordinate at ``pose``.
-        limits: smallest and largest value of the coordinate, or none.
-        dry_friction: torque or force of dry friction.
+        limits: smallest and largest value of the coordinate, or none; of the angle of a ball joint only the second.
+        dry_friction: torque or force of dry friction of each rate.
         follows: name of another joint, factor and offset: q = factor q_other + offset, without a coordinate of its own.
     """
 

@@ -5,7 +5,7 @@ z, in this order. :mod:`scvi_codegen.systems.multibody.trees.schema` lists the a
 """
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from itertools import product
 from os import PathLike
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from scvi_codegen.common.errors import SystemDefinitionError, closest
-from scvi_codegen.systems.multibody.trees.document import Element, Unread, root_of
+from scvi_codegen.systems.multibody.trees.document import Element, Unread, checked_limits, root_of
 from scvi_codegen.systems.multibody.trees.schema import URDF
 from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about, axes_of, named
 
@@ -27,13 +27,13 @@ PRINTED = 5e-6
 """Angles that differ less from a multiple of pi/2 are this multiple: files print 1.5708 or 1.57079632."""
 
 
-def links_of_urdf(path: str | PathLike[str], *, floating: bool, limits: bool = False) -> tuple[str, list[Link]]:
+def links_of_urdf(path: str | PathLike[str], *, floating: bool, parts: Collection[str] = ()) -> tuple[str, list[Link]]:
     """Return the name of the robot and its links, parents first.
 
     Args:
         path: the file.
         floating: whether the base moves freely; otherwise it is fixed to the world.
-        limits: whether those of joints and dry friction are read; otherwise a warning names them.
+        parts: among ``"limits"`` and ``"friction"`` of joints; a warning names others.
 
     Raises:
         SystemDefinitionError: naming file and element, if a link or joint is missing, named twice or malformed, the
@@ -61,7 +61,7 @@ def links_of_urdf(path: str | PathLike[str], *, floating: bool, limits: bool = F
     for parent in (order := [roots[0]]):
         for child in outgoing[parent]:
             place = places[parent]
-            for moved in _joints(joints[child], limits, rotors.get(joints[child].name, 0.0)):
+            for moved in _joints(joints[child], parts, rotors.get(joints[child].name, 0.0)):
                 tree.append(Link(child, place, moved, Inertia()))
                 place = len(tree) - 1
             tree[-1] = replace(tree[-1], inertia=_inertia(links[child]))
@@ -69,7 +69,7 @@ def links_of_urdf(path: str | PathLike[str], *, floating: bool, limits: bool = F
             order.append(child)
     if len(order) < len(links):
         raise SystemDefinitionError(f"{path}: the links {sorted(set(links) - set(order))} form a circle")
-    _list_unread(robot, limits, unread)
+    _list_unread(robot, parts, unread)
     unread.warn(str(path))
     return robot.node.get("name") or Path(path).stem, named(tree)
 
@@ -101,13 +101,13 @@ def _rotors(robot: Element) -> dict[str, float]:
     return rotors
 
 
-def _list_unread(robot: Element, limits: bool, unread: Unread) -> None:
+def _list_unread(robot: Element, parts: Collection[str], unread: Unread) -> None:
     """Add the parts of a document that matter and are not read."""
-    for joint in robot.children("joint") if not limits else ():
+    for joint in robot.children("joint"):
         bounds, friction = _limits(joint)
-        if bounds:
+        if bounds and "limits" not in parts:
             unread.add("limits of joints", joint.name)
-        if friction:
+        if friction and "friction" not in parts:
             unread.add("dry friction of joints", joint.name)
     if any(link.child("collision") for link in robot.children("link")):
         unread.add("contacts")
@@ -140,7 +140,7 @@ def _linked(joint: Element, end: str) -> str:
     return element.text("link")
 
 
-def _joints(joint: Element, limits: bool, armature: float) -> list[Joint]:
+def _joints(joint: Element, parts: Collection[str], armature: float) -> list[Joint]:
     """Return a joint, or those that a planar one consists of, from the parent to the child."""
     kind = joint.text("type")
     if kind not in KINDS:
@@ -154,7 +154,7 @@ def _joints(joint: Element, limits: bool, armature: float) -> list[Joint]:
         if not single:
             joint.refuse(f"is of type '{kind}', which cannot mimic another joint")
         follows = (mimic.text("joint"), mimic.number("multiplier", 1), mimic.number("offset", 0))
-    bounds, friction = _limits(joint) if limits and single else (None, 0.0)
+    bounds, friction = _limits(joint)
     along = axis.unit("xyz", (1, 0, 0)) if axis and (single or kind == "planar") else np.array([1.0, 0.0, 0.0])
     spring = dynamics.number("spring_stiffness", 0, 0) if dynamics else 0.0
     if spring and not single:
@@ -168,16 +168,16 @@ def _joints(joint: Element, limits: bool, armature: float) -> list[Joint]:
         stiffness=(spring,),
         rest=dynamics.number("spring_reference", 0) if dynamics else 0.0,
         armature=armature,
-        limits=bounds,
-        dry_friction=friction,
+        limits=checked_limits(joint, *bounds) if bounds and "limits" in parts else None,
+        dry_friction=friction if "friction" in parts else 0.0,
         follows=follows,
     )
     if kind != "planar":
         return [read]
-    parts = zip(
+    moved = zip(
         ("x", "y", "angle"), (*["slide"] * 2, "hinge"), axes_of(along).T, (read.pose, Pose(), Pose()), strict=True
     )
-    return [replace(read, name=f"{part}_{joint.name}", kind=kind, axis=e, pose=at) for part, kind, e, at in parts]
+    return [replace(read, name=f"{part}_{joint.name}", kind=kind, axis=e, pose=at) for part, kind, e, at in moved]
 
 
 def _inertia(link: Element) -> Inertia:

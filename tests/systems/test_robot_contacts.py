@@ -1,0 +1,127 @@
+"""Contacts of robots from MJCF and URDF: limits and dry friction of joints, spheres on planes; motions to rest."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import scvi_codegen as sc
+from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning
+from scvi_codegen.interfaces.models.model_files.model_file import parse_model
+from scvi_codegen.systems.formulas.expressions import evaluate
+
+FLOOR = '<geom name="floor" type="plane" size="1 1 1" pos=".1 .2 .3" euler="10 20 30" friction=".3"/>'
+ALL = {"limits": "contact", "friction": "contact", "contacts": "planes"}
+
+
+def robot(folder, bodies, rest="", **arguments):
+    (folder / "robot.xml").write_text(f"<mujoco><worldbody>{bodies}</worldbody>{rest}</mujoco>")
+    return sc.LagrangianSystem.from_mjcf(folder / "robot.xml", **(arguments or ALL))
+
+
+@pytest.mark.second
+def test_a_slide_with_dry_friction_on_an_incline_does_not_creep_and_stops(tmp_path):
+    slide = '<joint name="s" type="slide" axis="1 0 -.36397023426620234" frictionloss="4"/><geom size=".1" mass="1"/>'
+    stepper = sc.compile_stepper(robot(tmp_path, f"<body>{slide}</body>"), "svi:2")
+    assert stepper.integrate([0.2], velocity=[0.0], h=0.1, t_end=10.0).q[-1, 0] == 0.2
+    run, braking = stepper.integrate([0.0], velocity=[1.0], h=0.1, t_end=2.0), 4 - 9.81 * np.sin(np.deg2rad(20))
+    assert (run.contact_modes[1][0], run.q[-1, 0]) == pytest.approx((1 / braking, 1 / (2 * braking)), rel=1e-12)
+
+
+@pytest.mark.rotated
+def test_a_pendulum_on_a_ball_joint_stops_at_its_limit(tmp_path):
+    box = '<body><joint name="j" type="ball" range="0 40"/><geom size=".1" pos="0 0 -.5" mass="2"/></body>'
+    stepper = sc.compile_stepper(robot(tmp_path, box), "svi:2")
+    run = stepper.integrate({"R_j": [1, 0, 0, 0]}, velocity={"omega_j": [2.4, 3.2, 0.0]}, h=0.01, t_end=0.5)
+    assert run.energy()[-1] == pytest.approx(-2 * 9.81 * 0.5 * np.cos(np.deg2rad(40)), rel=1e-7)
+
+
+LEG = """<body><freejoint name="f"/><geom size=".2" contype="0" conaffinity="0"/><body pos=".3 .1 0"><joint name="j"
+axis="0 2 0" pos="0 .1 .2"/><geom type="capsule" size=".05 .4" pos=".1 0 -.5"/></body></body>"""
+
+
+def test_gaps_and_slips_are_those_of_points_of_bodies(tmp_path):
+    _, contact = robot(tmp_path, FLOOR + LEG).contacts
+    x, v, omega = np.array([1.0, 2.0, 5.0]), np.array([0.3, -0.2, 0.5]), np.array([0.4, 1.1, -0.6])
+    rotation, floor = Rotation.from_rotvec, Rotation.from_euler("XYZ", [10, 20, 30], degrees=True).as_matrix()
+    turn, place = rotation([0.1, 0.5, -0.3]), [0.1, 0, -0.1] - np.array([0, 0.1, 0.2])  # of the end from the joint
+
+    def at(point, t):
+        inner = np.add([0.3, 0.2, 0.2], rotation([0, 0.7 + 1.3 * t, 0]).apply(point))
+        return x + v * t + (turn * rotation(omega * t)).apply(inner)
+
+    values = {"j": 0.7, "j_dot": 1.3}
+    values |= {f"R_f_{i + 1}{k + 1}": turn.as_matrix()[i, k] for i in range(3) for k in range(3)}
+    for k, axis in enumerate("xyz"):
+        values |= {f"{axis}_f": x[k], f"{axis}_f_dot": v[k], f"omega_f_{k + 1}": omega[k]}
+    gap, *slips = (evaluate(f, {a: values[a.name] for a in f.free_symbols}) for f in (contact.gap, *contact.slip))
+    assert gap == pytest.approx(floor[:, 2] @ (at(place, 0.0) - [0.1, 0.2, 0.3]) - 0.05, abs=1e-12)
+    touching = place - 0.05 * (turn * rotation([0, 0.7, 0])).inv().apply(floor[:, 2])
+    assert slips == pytest.approx((at(touching, 1e-5) - at(touching, -1e-5)) @ floor[:, :2] / 2e-5, abs=1e-8)
+
+
+BALL = '<body name="b"><freejoint/><geom name="ball" size=".1" {}/></body>'
+PAIR = '<contact><pair geom1="ball" geom2="floor" {}/></contact>'
+
+
+@pytest.mark.parametrize(
+    ("ball", "rest", "friction"),
+    [
+        ('friction=".2"', "", "3/10"),
+        ('friction=".2" priority="1"', "", "1/5"),
+        ('condim="1" priority="1"', "", None),
+        ('contype="2" conaffinity="2"', "", ()),
+        ("", '<contact><exclude body1="world" body2="b"/></contact>', ()),
+        ("", PAIR.format('condim="1"'), None),
+        ('contype="0" conaffinity="0"', PAIR.format('friction=".7 .7"'), "7/10"),
+    ],
+)
+def test_pairs_of_geoms_are_selected_as_by_mujoco(ball, rest, friction, tmp_path):
+    contacts = robot(tmp_path, FLOOR + BALL.format(ball), rest).contacts
+    assert [c.friction and str(c.friction) for c in contacts] == ([] if friction == () else [friction])
+    assert all(c.name == "geom 'ball' on geom 'floor'" for c in contacts)
+
+
+def test_what_is_not_read_of_geoms_is_named_in_one_warning(tmp_path):
+    more = BALL.format('condim="6"') + '<body pos="1 0 0"><freejoint/><geom type="cylinder" size=".1 .1"/></body>'
+    with pytest.warns(SystemDefinitionWarning, match="friction of geom 'ball' on geom 'floor'; contacts of 2 pairs"):
+        assert len(robot(tmp_path, FLOOR + more).contacts) == 1
+    with pytest.warns(SystemDefinitionWarning, match="without contacts$"):
+        robot(tmp_path, FLOOR + more, contacts="ignore")
+
+
+@pytest.mark.parametrize(
+    ("ball", "rest", "message"),
+    [
+        ("", PAIR.format('friction=".7"'), "two coefficients of sliding friction, 0.7 and 1"),
+        ("", '<contact><pair geom1="ball" geom2="flor"/></contact>', "geom 'flor', which does not exist.*floor"),
+        ("", '<tendon><spatial name="t" range="0 1"/></tendon>', "<spatial> 't' has limits, which is read of joints"),
+        ('/></body><body><joint range="2 1" limited="true"/><geom size=".1"', "", "limits 0.0349066 and"),
+    ],
+)
+def test_what_contacts_cannot_be_is_refused_by_name(ball, rest, message, tmp_path):
+    with pytest.raises(SystemDefinitionError, match=message):
+        robot(tmp_path, FLOOR + BALL.format(ball), rest)
+
+
+def test_model_files_have_the_arguments_of_contacts(tmp_path):
+    one = robot(tmp_path, FLOOR + BALL.format(""), contacts="planes", restitution=0.5)
+    text = '[system]\nrobot = "robot.xml"\ncontacts = "planes"\nrestitution = 0.5\n'
+    assert parse_model(text, folder=tmp_path).system == one
+
+
+SITTER = """<mujoco><default><joint axis="0 1 0"/><geom type="capsule" size=".04" friction=".7"/></default><worldbody>
+<geom type="plane" size="5 5 .1"/><body pos="0 0 .7"><joint name="x" type="slide" axis="1 0 0"/><joint name="z"
+type="slide" axis="0 0 1"/><joint name="pitch"/><geom fromto="-.2 0 0 .2 0 0" mass="6"/><body pos=".2 0 0"><joint
+name="hip" damping="1" stiffness="20"/><geom fromto="0 0 0 .1 0 -.4" mass="1"/></body></body></worldbody></mujoco>"""
+
+
+@pytest.mark.rotated
+def test_a_robot_falls_on_its_capsules_and_rests(tmp_path):
+    (tmp_path / "sitter.xml").write_text(SITTER)
+    stepper = sc.compile_stepper(sc.LagrangianSystem.from_mjcf(tmp_path / "sitter.xml", contacts="planes"), "svi:2")
+    start = dict.fromkeys(["x", "z", "pitch", "hip"], 0.0)
+    run = stepper.integrate(start, velocity=start | {"x": 0.5, "pitch": 0.3}, h=0.0025, t_end=6.0)
+    assert run.contact_modes[-1][1] == ("open", "stick", "stick", "open")
+    assert run.energy_error() < 1e-6
+    assert max(np.diff(run.energy()).max() / 1e-12, np.abs(run.velocity[-1]).max() / 1e-10) < 1
+    assert run.contact_forces()[-1, :, 0].sum() == pytest.approx(7 * 9.81, rel=1e-6)
