@@ -29,6 +29,7 @@ from scvi_codegen.analysis.verification.roundoff import roundoff_checks
 from scvi_codegen.analysis.verification.stepping import predictor_checks, step_checks
 from scvi_codegen.analysis.verification.structure import largest_step, structure_checks
 from scvi_codegen.analysis.verification.system_under_test import State, SystemUnderTest
+from scvi_codegen.analysis.verification.transitions import STEPS, run_of, transition_checks
 from scvi_codegen.analysis.verification.variable_steps import VariableSteps, at_fixed_energy, variable_step_checks
 from scvi_codegen.codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.common.errors import StateError, StepFailedError
@@ -38,9 +39,12 @@ from scvi_codegen.methods.discretise import discretised_form
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runs.compiler import compile_stepper
+from scvi_codegen.runs.results.saved_states import parameters_on_sides
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import STEPPER, Stepper
 from scvi_codegen.systems.arrays.system import ArraySystem
+from scvi_codegen.systems.contacts.modes import in_all_modes
+from scvi_codegen.systems.kinks import located_kinks
 from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS, MechanicalSystem
 
 __all__ = ["Certificate", "Check", "Outcome", "verify"]
@@ -55,6 +59,22 @@ LONGEST, HALVINGS, PART = 1.0, 40, 0.1
 def _compiled(*arguments: Any, **keywords: Any) -> Stepper:
     """Return a stepper whose kinks are formulas: measured are single steps."""
     return compile_stepper(*arguments, kinks="as formulas", **keywords)
+
+
+def _in_modes(
+    system: MechanicalSystem, method: Method, stepper: Stepper | None, solver: str
+) -> tuple[MechanicalSystem, Stepper]:
+    """Return the system whose parameters contain the modes of a stepper, by default one that is compiled now."""
+    form = discretised_form(in_all_modes(system), method)
+    located, kinks = located_kinks(form)
+    if stepper is None:
+        stepper = compile_stepper(system, method, solver=solver, kinks="located" if kinks else "as formulas")
+    if stepper.interface.masked != len(form.reactions):
+        raise StateError(
+            f"'{system.name}' has other contacts than {stepper!r}: pass a system with all of them, contacts= of "
+            "from_text, or omit stepper"
+        )
+    return located if stepper.interface.modes else form, stepper
 
 
 @checks_arguments(system=SYSTEM_OR_ARRAYS, stepper=STEPPER)
@@ -112,14 +132,7 @@ def verify(
         of_known_sizes = partial(verify, solver=solver, tolerance=tolerance)
         of_run |= {"of_known_sizes": of_known_sizes, "tolerance": tolerance}
         return verify_arrays(system, method, stepper, (q, p, cast(float, h), t), began, **of_run)
-    system = discretised_form(system, method)
-    stepper = stepper or _compiled(system, method, solver=solver)
-    if stepper.interface.mode_names:
-        remedy = 'omit stepper, or compile it with kinks="as formulas"'
-        raise StateError(
-            f"{stepper!r} changes its modes along runs, and one step of one formula is measured: "
-            f"{'omit the contacts' if stepper.interface.contacts else remedy}"
-        )
+    system, stepper = _in_modes(system, method, stepper, solver)
     start = _initial_state(system, stepper, q, p, h, t)
     return _certificate(system, method, stepper, start, began, solver=solver, tolerance=tolerance)
 
@@ -154,6 +167,10 @@ def _certificate(
     tolerance: float | None,
 ) -> Certificate:
     flags, with_events, stepper = stepper.flags, stepper, stepper.with_events(())
+    run = None
+    if stepper.interface.mode_names:
+        run = run_of(stepper, start, start.h, start.t + STEPS * start.h)
+        system = system.with_parameters(**stepper.parameters_by_name(parameters_on_sides(run, start.t)))
     steps, single = stepper, at_fixed_energy(system, stepper.energy(start.q, start.p, start.t))
     if single is not system or stepper.interface.time_transformation is not None:
         steps = _compiled(single, method, solver=solver, flags=flags)
@@ -162,17 +179,18 @@ def _certificate(
     in_time = system.clock.plain if system.clock and system.clock.plain else system
     runs = VariableSteps(tested, stepper, in_time, system, tolerance)
     checks = (
+        *(transition_checks(tested, run) if run else ()),
         *(variable_step_checks(runs) if variable else ()),
         *step_checks(tested),
         *predictor_checks(tested),
-        *(() if system.constraints else roundoff_checks(tested)),
+        *(() if system.constraints or run else roundoff_checks(tested)),
         *structure_checks(tested),
         *derivative_checks(tested),
         *(time_transformation_derivative_checks(runs) if system.clock else ()),
         *convergence_checks(tested),
         *identity_checks(tested),
         *impact_checks(tested, with_events),
-        largest_step(tested),
+        *(() if run else (largest_step(tested),)),
     )
     parameters = {name.name: value for name, value in single.constants.items()}
     return issued(

@@ -3,7 +3,7 @@
 A step in transformed time, dt = g dtau, has its duration as a further result, and the energy as a further parameter.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -44,12 +44,14 @@ class _Map:
     scales: Array  # sizes of the results
     outputs: NDArray[np.int_]  # indices of the results among the arguments
     end: Callable[[list[Number]], Array]
+    fixed: Sequence[int] = ()  # parameters that are modes
 
     def direction(self, phase: float = 1.0) -> Array:
-        """Return a direction in which all arguments change, each scaled with its size."""
+        """Return a direction in which all arguments but modes change, each scaled with its size."""
         values, m = self.parameters, len(self.state.q)
         h = self.state.h
         sizes = np.concatenate([self.scales[: 2 * m], np.where(values, values, 1.0), [h, h]])
+        sizes[[2 * m + column for column in self.fixed]] = 0.0
         return np.asarray(sizes * (1.5 + np.sin(phase + 1.7 * np.arange(len(sizes)))))
 
     def propagated(self, vector: Array, *, back: bool) -> Array:
@@ -79,7 +81,7 @@ class _Map:
     def transpose_error(self) -> float:
         """Return the defect (J v, w) - (v, J^T w), where w weighs all components of the end alike."""
         v = self.direction()
-        w = np.cos(2.0 + np.arange(len(v))) / np.abs(v)
+        w = np.cos(2.0 + np.arange(len(v))) / np.where(v, np.abs(v), np.inf)
         forward, back = (self.propagated(vector, back=which) for vector, which in ((v, False), (w, True)))
         size = max(np.abs(forward * w).max(), np.abs(v * back).max(), LEAST)
         return float(abs(forward @ w - v @ back) / size)
@@ -101,7 +103,7 @@ def _map_of(tested: SystemUnderTest, stepper: Stepper) -> _Map:
         return ends[key]
 
     values = np.array(list(tested.parameters.values()))
-    return _Map(stepper, state, values, tested.scales(state), np.arange(2 * m), end)
+    return _Map(stepper, state, values, tested.scales(state), np.arange(2 * m), end, tested.stepper.mode_columns)
 
 
 def _map_in_tau(runs: VariableSteps) -> _Map:

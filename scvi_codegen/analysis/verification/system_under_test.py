@@ -137,6 +137,7 @@ class SystemUnderTest:
         moved = {}
         for k, (name, value) in enumerate(self._defaults.items(), 1):
             moved[name] = value * (1 + PARAMETER_PERTURBATION * np.sin(k)) or PARAMETER_PERTURBATION * np.cos(k)
+        moved |= {name: self._defaults[name] for name in self.stepper.interface.mode_names}
         at_zero = {name: moved[name] if value else 0.0 for name, value in self._defaults.items()}
         for values in (moved, at_zero):
             if self._works(values):

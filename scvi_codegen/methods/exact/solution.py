@@ -20,7 +20,12 @@ from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.methods.exact.newton import Array as Numbers
 from scvi_codegen.methods.exact.newton import Floats, NotConvergedError, Solve, newton, solver
-from scvi_codegen.systems.constraints import position_conditions, velocity_conditions
+from scvi_codegen.systems.constraints import (
+    constraint_masks,
+    force_directions,
+    position_conditions,
+    velocity_conditions,
+)
 from scvi_codegen.systems.first_order import FirstOrderSystem
 from scvi_codegen.systems.formulas.expressions import Tape, jacobian
 from scvi_codegen.systems.system import MechanicalSystem
@@ -111,7 +116,8 @@ class ExactMotion:
 
     @cached_property
     def _constraint_tape(self) -> Tape:
-        """Constraint Jacobian G, d/dt of the rates at constant v, conditions on positions, and rates."""
+        """Jacobian G of constraints, directions D of their forces, d/dt of the rates at constant v, conditions on
+        positions, rates, and 1 - mask."""
         q, v, t = self.system.coordinates, self.second, self.system.time
 
         def rate(f: sympy.Expr) -> sympy.Expr:
@@ -120,7 +126,10 @@ class ExactMotion:
         positions = position_conditions(self.system)
         rates = list(map(sympy.Add, map(rate, positions), velocity_conditions(self.system)))
         derivatives = [moving.diff(x) for moving in rates for x in v]
-        return Tape([*derivatives, *map(rate, rates), *positions, *rates], self.symbols)
+        directions, places = force_directions(self.system), np.ndindex(len(rates), len(v))
+        forces = [directions.get((k, i), sympy.S.Zero) for k, i in places] if self.system.reactions else derivatives
+        idle = [1 - mask for mask in constraint_masks(self.system)]
+        return Tape([*derivatives, *forces, *map(rate, rates), *positions, *rates, *idle], self.symbols)
 
     def _values(self, tape: Tape, q: Numbers, second: Numbers, t: Number) -> Numbers:
         return np.array(tape([*q, *second, t, *self.parameters]), dtype=object)
@@ -186,15 +195,15 @@ class ExactMotion:
 
     def _constrained_accelerations(self, mass: Numbers, applied: Numbers, q: Numbers, v: Numbers, t: Number) -> Numbers:
         """Return (m + c,) accelerations, and multipliers with which constraints have zero second derivatives."""
-        derivatives, (growth, _, _) = self._constraint_terms(q, v, t)
-        return solved(_saddle(mass, derivatives), np.concatenate([applied, -growth]))
+        derivatives, forces, (growth, _, _, idle) = self.constraint_terms(q, v, t)
+        return solved(_saddle(mass, derivatives, forces, idle), np.concatenate([applied, -growth]))
 
-    def _constraint_terms(self, q: Numbers, v: Numbers, t: Number) -> tuple[Numbers, Numbers]:
-        """Return the (c, m) constraint Jacobian; (3, c) d/dt of the rates at constant v, constraints, rates."""
-        m = len(q)
-        count = len(self.system.constraints)
-        values = self._values(self._constraint_tape, q, v, t)
-        return values[: count * m].reshape(count, m), values[count * m :].reshape(3, count)
+    def constraint_terms(self, q: Numbers, v: Numbers, t: Number) -> tuple[Numbers, Numbers, Numbers]:
+        """Return the (c, m) Jacobian and directions of forces; (4, c) d/dt of the rates at constant v, constraints,
+        rates, and 1 where a constraint is not imposed."""
+        m, count = len(q), len(self.system.constraints)
+        derivatives, forces, terms = np.split(self._values(self._constraint_tape, q, v, t), (count * m, 2 * count * m))
+        return derivatives.reshape(count, m), forces.reshape(count, m), terms.reshape(4, count)
 
     def met(self, q: Any, p: Any, t: Any = 0) -> tuple[Numbers, Numbers]:
         """Project (q, p) onto the constraints to all digits; without constraints it is returned unchanged."""
@@ -206,11 +215,11 @@ class ExactMotion:
         v = self.velocity(q, p, t)
         for _ in range(MAX_PROJECTIONS):
             mass = self._mass_and_applied(q, v, t)[0]
-            derivatives, (_, g, _) = self._constraint_terms(q, v, t)
-            q = q + solved(_saddle(mass, derivatives), np.concatenate([still, -g]))[:m]
+            derivatives, _, (_, g, _, idle) = self.constraint_terms(q, v, t)
+            q = q + solved(_saddle(mass, derivatives, derivatives, idle), np.concatenate([still, -g]))[:m]
         mass = self._mass_and_applied(q, v, t)[0]
-        derivatives, (_, _, rate) = self._constraint_terms(q, v, t)
-        v = v + solved(_saddle(mass, derivatives), np.concatenate([still, -rate]))[:m]
+        derivatives, _, (_, _, rate, idle) = self.constraint_terms(q, v, t)
+        v = v + solved(_saddle(mass, derivatives, derivatives, idle), np.concatenate([still, -rate]))[:m]
         return q, self.momentum(q, v, t)
 
     def multipliers(self, q: Numbers, v: Numbers, t: Number) -> Numbers:
@@ -357,11 +366,12 @@ class FirstOrderMotion(ExactMotion):
         return np.concatenate([v, solved(by_y, by_q.T @ v - by_q @ v - by_t - values[: len(q)])])
 
 
-def _saddle(mass: Numbers, derivatives: Numbers) -> Numbers:
-    """Return the saddle-point matrix [M, -G^T; G, 0]."""
+def _saddle(mass: Numbers, derivatives: Numbers, forces: Numbers, idle: Numbers) -> Numbers:
+    """Return the matrix [M, -D^T; G, 1 - mask], D = G for ideal constraints."""
     count, m = derivatives.shape
     matrix = numbers(np.zeros((m + count, m + count)))
-    matrix[:m, :m], matrix[:m, m:], matrix[m:, :m] = mass, -derivatives.T, derivatives
+    matrix[:m, :m], matrix[:m, m:], matrix[m:, :m] = mass, -forces.T, derivatives
+    matrix[range(m, m + count), range(m, m + count)] = idle
     return matrix
 
 
