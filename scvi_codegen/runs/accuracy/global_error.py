@@ -458,6 +458,8 @@ class Runs:
                 compared.lose()
             if not last and safety * compared.largest() > self.requested:
                 break
+        if trajectory.modes is not None and trajectory.modes.choices > 1:
+            compared.lose()  # all runs chose the same one of several motions
         differences, reached = compared.relative(lambda errors: np.maximum(safety * errors, floor) <= self.requested)
         largest = float(differences.max(initial=0.0))
         return GlobalError(
@@ -536,6 +538,9 @@ class _Samples:
             fastest = np.arange(1, steps + 1, size) + parts.argmax(axis=1)
             rows = [0, *fastest.tolist()]
             rows += [steps] if rows[-1] < steps else []
+        if trajectory.modes is not None:  # momenta jump at impacts, a rounding earlier or later
+            rows = np.arange(len(t))[rows]
+            rows = rows[~np.isin(t[rows], trajectory.modes.t) | (rows == 0) | (rows == steps)]
         self.t, self.states = t[rows], [vectors[rows] for vectors in states]
         self.epsilon, self.firsts = roundoff(interface.words), first_of_groups(interface, m)
         self.errors = self.epsilon * np.abs(np.array([np.asarray(vectors) for vectors in self.states]))

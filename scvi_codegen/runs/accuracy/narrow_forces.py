@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.common.errors import StepFailedError
+from scvi_codegen.runs.results.saved_states import parameters_on_sides
 from scvi_codegen.runs.stepping.step_plan import Fixed
 
 Array = NDArray[np.float64]
@@ -37,17 +38,20 @@ def differences_in_pieces(run: Any, size: float) -> Array:
     """
     largest = np.zeros((2, run.q.shape[1]))
     for part in run.pieces or (run,):
-        pieces, rows, ends = part._restarted(0, size), list[int](), list[tuple[Array, Array]]()
+        pieces, times, ends = part._restarted(0, size), list[float](), list[tuple[Array, Array]]()
+        changes = () if part.modes is None else part.modes.t  # of contacts: the step before ends in the state before an impact
         for k in np.flatnonzero(np.abs(np.diff(part.t)) > LONG * size).tolist():
             t, h = part.t.item(k), part.t.item(k + 1) - part.t.item(k)
             try:
                 pieces.plan = Fixed(h / (count := math.ceil(abs(h) / size)))
+                pieces._parameters[:] = parameters_on_sides(part, t)
                 pieces._begin(part.q[k], part.p[k], t)
-                pieces.advance(count)
-                rows.append(k + 1)
+                pieces.advance(last := count - bool(np.isin(part.t[k + 1], changes)))
+                times.append(part.t.item(k + 1) if last == count else t + last * h / count)
                 ends.append((pieces.q, pieces.p))
             except StepFailedError:  # the step was solved over what its pieces meet
                 largest[:] = np.inf
-        if rows:
-            np.fmax(largest, np.abs(np.array(ends) - np.stack([part.q, part.p], 1)[rows]).max(axis=0), out=largest)
+        if times:
+            states = np.stack(part._states_at(np.array(times)), 1)
+            np.fmax(largest, np.abs(np.array(ends) - states).max(axis=0), out=largest)
     return largest

@@ -219,7 +219,8 @@ class CrossingSearch:
         records = self._joined(recorded)
         records = records[records["acted"] != 0]
         latest = np.array(list(self.watch.mode))
-        return ModeHistory(records["t"], np.concatenate([records["mode"], latest[np.newaxis]]))
+        values = np.concatenate([records["mode"], latest[np.newaxis]])
+        return ModeHistory(records["t"], values, getattr(self.watch, "ambiguous", 1))
 
     def _joined(self, recorded: Sequence[NDArray[Any]]) -> Any:
         none = self.binding.records(self.binding.new("crossing[1]"), 0)

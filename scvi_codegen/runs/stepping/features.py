@@ -150,7 +150,7 @@ FEATURES = {
         ("with events that set parameters", _DERIVATIVES, "make them terminal, and restart with the new parameters"),
         (
             "with contacts",
-            "error check_growth device observe_ensemble hessian chaos_ensemble flow advice shadow_energy",
+            "check_growth device observe_ensemble hessian chaos_ensemble flow advice shadow_energy",
             "use runs and ensembles with h, or with t_end and a tolerance, without it",
         ),
         ("with constraints", "device observe_ensemble", "use coordinates without constraints, or omit it"),
