@@ -24,12 +24,11 @@ from scvi_codegen.analysis.verification.arrays import state_of_fields, verify_ar
 from scvi_codegen.analysis.verification.certificate import Certificate, Check, Outcome, issued
 from scvi_codegen.analysis.verification.convergence import convergence_checks, identity_checks
 from scvi_codegen.analysis.verification.derivatives import derivative_checks, time_transformation_derivative_checks
-from scvi_codegen.analysis.verification.impacts import impact_checks
+from scvi_codegen.analysis.verification.impacts import impact_checks, run_of, transition_checks
 from scvi_codegen.analysis.verification.roundoff import roundoff_checks
 from scvi_codegen.analysis.verification.stepping import predictor_checks, step_checks
 from scvi_codegen.analysis.verification.structure import largest_step, structure_checks
 from scvi_codegen.analysis.verification.system_under_test import State, SystemUnderTest
-from scvi_codegen.analysis.verification.transitions import STEPS, run_of, transition_checks
 from scvi_codegen.analysis.verification.variable_steps import VariableSteps, at_fixed_energy, variable_step_checks
 from scvi_codegen.codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.common.errors import StateError, StepFailedError
@@ -52,8 +51,9 @@ __all__ = ["Certificate", "Check", "Outcome", "verify"]
 
 SEEDS = range(20)
 """Seeds of the random states that are tried if no state is passed."""
-LONGEST, HALVINGS, PART = 1.0, 40, 0.1
-"""Largest step tried, number of halvings, and the largest change of the state per step relative to its size."""
+LONGEST, HALVINGS, PART, STEPS = 1.0, 40, 0.1, 400
+"""Largest step tried, number of halvings, and the largest change of the state per step relative to its size; number of
+steps of a run with transitions."""
 
 
 def _compiled(*arguments: Any, **keywords: Any) -> Stepper:
@@ -64,15 +64,14 @@ def _compiled(*arguments: Any, **keywords: Any) -> Stepper:
 def _in_modes(
     system: MechanicalSystem, method: Method, stepper: Stepper | None, solver: str
 ) -> tuple[MechanicalSystem, Stepper]:
-    """Return the system whose parameters contain the modes of a stepper, by default one that is compiled now."""
+    """Return the system whose parameters contain the modes of a stepper, and this; by default it is compiled now."""
     form = discretised_form(in_all_modes(system), method)
     located, kinks = located_kinks(form)
     if stepper is None:
         stepper = compile_stepper(system, method, solver=solver, kinks="located" if kinks else "as formulas")
     if stepper.interface.masked != len(form.reactions):
         raise StateError(
-            f"'{system.name}' has other contacts than {stepper!r}: pass a system with all of them, contacts= of "
-            "from_text, or omit stepper"
+            f"'{system.name}' lacks contacts of {stepper!r}, or has others: declare them by from_text(contacts=..)"
         )
     return located if stepper.interface.modes else form, stepper
 
@@ -169,7 +168,7 @@ def _certificate(
     flags, with_events, stepper = stepper.flags, stepper, stepper.with_events(())
     run = None
     if stepper.interface.mode_names:
-        run = run_of(stepper, start, start.h, start.t + STEPS * start.h)
+        run = run_of(stepper, start, start.h, t_end=start.t + STEPS * start.h)
         system = system.with_parameters(**stepper.parameters_by_name(parameters_on_sides(run, start.t)))
     steps, single = stepper, at_fixed_energy(system, stepper.energy(start.q, start.p, start.t))
     if single is not system or stepper.interface.time_transformation is not None:

@@ -74,14 +74,14 @@ def _order(tested: SystemUnderTest) -> Finding | None:
     if tested.method.frequency is not None:
         return None
     order = tested.method.order
-    measured, error = measured_order(tested)
+    measured, error = _measured_order(tested)
     if measured is None:
         return Finding(error, float(FLOOR), "exact step")
     least = order - SLACK if order else LEAST_ORDER
     return Finding(measured, least, f"at a local error of {error:.1e}", at_least=True)
 
 
-def measured_order(tested: SystemUnderTest) -> tuple[float | None, float]:
+def _measured_order(tested: SystemUnderTest) -> tuple[float | None, float]:
     """Return the order from the errors of h and h/2, and the larger error; ``None`` for an exact step."""
     state, power = tested.states[0], (tested.method.order or 1) + 1
     h = mp.mpf(state.h)

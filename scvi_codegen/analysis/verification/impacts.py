@@ -1,22 +1,35 @@
-"""Checks of events that change the state, on a run of the compiled integrator that meets them."""
+"""Checks of events that change the state, of contacts and of located kinks, on a run that meets them."""
 
+import math
 import warnings
 from collections.abc import Callable, Iterator
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 import sympy
 
 from scvi_codegen.analysis.verification.certificate import Check, Finding, checked
-from scvi_codegen.analysis.verification.system_under_test import EPSILON, SystemUnderTest, canonical_form, linearised
+from scvi_codegen.analysis.verification.system_under_test import (
+    EPSILON,
+    State,
+    SystemUnderTest,
+    canonical_form,
+    linearised,
+)
 from scvi_codegen.codegen.rendering.events import EventFormulas
 from scvi_codegen.common.errors import EventWarning, StateError
+from scvi_codegen.common.precision import mp
 from scvi_codegen.methods.discretise import is_symplectic
+from scvi_codegen.methods.exact.solution import ExactMotion, Numbers, exact_motion, numbers
+from scvi_codegen.runs.results.recomputation import changes_by_events
+from scvi_codegen.runs.results.saved_states import parameters_on_sides
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.trajectory import Trajectory
-from scvi_codegen.systems.event import Crossings
+from scvi_codegen.systems.event import Crossings, Event, Kink
+from scvi_codegen.systems.formulas.expressions import Tape
 from scvi_codegen.systems.formulas.symbols import TIME, symbol
 
 STEPS, ROUND_OFF, ROUNDINGS = 2000, 64.0 * EPSILON, 16.0
@@ -69,10 +82,7 @@ def impact_checks(tested: SystemUnderTest, stepper: Stepper, parameters: Any = N
 
 def _surfaces(tested: SystemUnderTest, stepper: Stepper, parameters: Any, crossings: list[Any]) -> Finding:
     """Return the largest value of an event function; add the run and its changes to ``crossings``."""
-    start = tested.initial
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", EventWarning)  # a run of this length may end where impacts accumulate
-        run = stepper.integrate(start.q, start.p, h=start.h, steps=STEPS, t=start.t, parameters=parameters)
+    run = run_of(stepper, tested.initial, tested.initial.h, steps=STEPS, parameters=parameters)
     crossings.extend((run, _changes(run)))
     return Finding(max(change.residual for change in crossings[1]), ROUND_OFF, f"{len(crossings[1])} changes")
 
@@ -221,3 +231,154 @@ def _symplecticity(run: Trajectory, changes: list[Change]) -> Finding | None:
         matrix = step(start).tangent()[-1]
         defects.append(float(np.abs(matrix.T @ form @ matrix - form).max() / np.abs(matrix).max() ** 2))
     return Finding(defects[1], max(defects[0] / LEAST_REDUCTION, NOISE), "step / 8")
+
+
+SAMPLED_STATES, SAMPLED_CHANGES, ROUNDED, DIFFERENCE = 40, 12, 256.0 * EPSILON, mp.mpf(10) ** -30
+"""Numbers of states and transitions that are checked; bound on zeros relative to their terms; width in 60 digits."""
+LEAST_STEPS, HALVINGS, TRANSITIONS, SLACK, DECIDED = 16, 4, 2, 0.5, 1e-12
+"""Of runs by which an order is measured: least steps, halvings, transitions, slack of the order, rounding errors."""
+CONDITIONS = (
+    ("sides of kinks", "u has the sign of its side at all states (60 digits)", ("kink",)),
+    ("complementarity", "gaps and normal forces are >= 0 (60 digits)", ("closes", "lifts", "leaves")),
+    ("friction", "it is in its cone, and opposite to slip (60 digits)", ("stops", "forward", "backward", "begins")),
+    ("closed contacts", "gaps, their rates, and slips that stick are 0 (60 digits)", ("constraint",)),
+)
+"""Names and statements of conditions, and the kinds of transitions that end them."""
+
+
+@dataclass(frozen=True)
+class RunInModes:
+    """Run of the stepper under test, whose parameters contain modes.
+
+    The functions of its transitions (:mod:`scvi_codegen.systems.contacts.modes`) are >= 0 between them and 0 there.
+    Forces in them are those of the exact motion in the mode, in 60 digits.
+    """
+
+    tested: SystemUnderTest
+    run: Trajectory
+
+    def motion(self, parameters: Array) -> ExactMotion:
+        """Return the exact motion in the mode of parameters."""
+        return exact_motion(self.tested.system).with_parameters(parameters.tolist())
+
+    @cached_property
+    def events(self) -> list[Event]:
+        """Kinks and transitions that the run is searched for."""
+        return [crossings.event for crossings in self.run.switches]
+
+    @cached_property
+    def functions(self) -> Tape:
+        """Their functions by (q, p, v, t, parameters, multipliers)."""
+        of = EventFormulas(self.run.stepper.interface, self.events)
+        return Tape(of.functions, (*of.q, *of.p, *of.v, symbol(TIME), *of.parameters, *of.multipliers))
+
+    def values(self, x: Numbers, parameters: Array) -> Numbers:
+        """Return the functions at x = (q, p, t), u of kinks times its side, then +- constraints and their rates."""
+        motion, (q, p), zeros, forces = self.motion(parameters), np.split(x[:-1], 2), list[Any](), list[Any]()
+        v, named = motion.velocity(q, p, x[-1]), self.tested.stepper.parameters_by_name(parameters)
+        if self.tested.system.constraints:
+            zeros, forces = [*motion.constraint_terms(q, v, x[-1])[2][1:3].ravel()], motion.multipliers(q, v, x[-1])
+        values = self.functions([*q, *p, *v, x[-1], *motion.parameters, *forces])
+        sides = [np.sign(named[event.mode]) if isinstance(event, Kink) else 1 for event in self.events]
+        return np.array([*np.multiply(values, sides), *zeros, *(-zero for zero in zeros)], dtype=object)
+
+    def derivatives(self, x: Numbers, parameters: Array) -> Numbers:
+        """Return the derivatives of the values by x, by differences."""
+        now, moves = self.values(x, parameters), np.eye(len(x), dtype=int)
+        return np.array([(self.values(x + DIFFERENCE * move, parameters) - now) / DIFFERENCE for move in moves]).T
+
+    def relative(self, x: Numbers, parameters: Array) -> Array:
+        """Return the values relative to the sum of their terms: derivatives by x times x and its change in a step."""
+        rates = np.array([*np.concatenate(self.motion(parameters).rates(*np.split(x[:-1], 2), x[-1])), 1])
+        terms = np.abs(self.derivatives(x, parameters)) @ (np.abs(x) + np.abs(rates * self.run.h))
+        return (self.values(x, parameters) / np.where(terms == 0, 1, terms)).astype(float)
+
+    @cached_property
+    def changes(self) -> list[tuple[float, int, Numbers, Numbers, tuple[Array, Array]]]:
+        """Some of the transitions that are alone at their time: it, number, x before and after, parameters there."""
+        run, found = self.run, []
+        for crossings, rows in changes_by_events(replace(run, events=())):
+            for t, q, p, row in zip(crossings.t.tolist(), crossings.q, crossings.p, rows.tolist(), strict=True):
+                sides = parameters_on_sides(run, run.t.item(max(row - 1, 0))), parameters_on_sides(run, t)
+                ends = numbers([*q, *p, t]), numbers([*run.q[row], *run.p[row], t])
+                found.append((t, self.events.index(crossings.event), *ends, sides))
+        times = [change[0] for change in found]
+        alone = sorted((change for change in found if times.count(change[0]) == 1), key=lambda change: change[0])
+        return alone[:: -(-len(alone) // SAMPLED_CHANGES) or 1]
+
+    @cached_property
+    def states(self) -> list[tuple[Numbers, Array]]:
+        """States x with parameters: some of those of the run, and those before transitions."""
+        rows, run = range(0, len(self.run), -(-len(self.run) // SAMPLED_STATES)), self.run
+        states = [(numbers([*run.q[k], *run.p[k], run.t[k]]), parameters_on_sides(run, run.t.item(k))) for k in rows]
+        return states + [(before, sides[0]) for _, _, before, _, sides in self.changes]
+
+
+def run_of(stepper: Stepper, start: State, h: float, **plan: Any) -> Trajectory:
+    """Return the run from a state by steps h; it may end where impacts accumulate."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", EventWarning)
+        return cast(Trajectory, stepper.integrate(start.q, start.p, h=h, t=start.t, **plan))
+
+
+def transition_checks(tested: SystemUnderTest, run: Trajectory) -> Iterator[Check]:
+    """Yield the checks of a run by the stepper under test."""
+    of, count = RunInModes(tested, run), 4 * len(tested.system.constraints)
+    yield from checked("transitions", "their functions are 0 where modes change (60 digits)", partial(_zeros, of))
+    kinds = [getattr(event, "kind", "kink") for event in of.events] + ["constraint"] * count
+    for name, statement, ends in CONDITIONS:
+        if chosen := [k for k, kind in enumerate(kinds) if kind in ends]:
+            yield from checked(name, statement, partial(_conditions, of, chosen))
+    statement = "continuous; where L jumps p+ - p- = lambda u_q and H+ - H- = -lambda u_t (60 digits)"
+    yield from checked("states at kinks", statement, partial(_states_at_kinks, of))
+    statement = f"order {tested.method.order} in h of the end of a run, and of its balance H - W"
+    yield from checked("order across transitions", statement, partial(_order, of))
+
+
+def _zeros(of: RunInModes) -> Finding:
+    if not of.changes:
+        raise StateError(f"no transition alone within {of.run.steps} steps: give another state, or step size")
+    values = [abs(of.relative(before, sides[0])[k]) for _, k, before, _, sides in of.changes]
+    return Finding(max(values), ROUNDED, f"relative to its terms, {len(values)} transitions")
+
+
+def _conditions(of: RunInModes, chosen: list[int]) -> Finding:
+    """Return how far below 0 functions are at states of the run, relative to their terms."""
+    low = [state for state in of.states if min(of.values(*state)[chosen]) < 0]
+    worst = max((float(-of.relative(*state)[chosen].min()) for state in low), default=0.0)
+    return Finding(worst, ROUNDED, f"relative to their terms, {len(of.states)} states")
+
+
+def _states_at_kinks(of: RunInModes) -> Finding | None:
+    errors, m = list[float](), of.tested.system.dimension
+    for t, k, before, after, sides in of.changes:
+        jump = after - before
+        if isinstance(of.events[k], Kink) and jump.any():
+            n = of.derivatives(before, sides[0])[k]
+            impulse, ends = jump[m:-1] @ n[:m] / (n[:m] @ n[:m]), zip(sides, (before, after), strict=True)
+            old, new = (of.motion(side).energy(x[:m], x[m:-1], mp.mpf(t)) for side, x in ends)
+            jump = np.array([*jump[:m], *(jump[m:-1] - impulse * n[:m]), new - old + impulse * n[-1]])
+        if isinstance(of.events[k], Kink):
+            errors.append(float(max(abs(jump)) / max(1, *abs(before))))
+    return Finding(max(errors), ROUNDED, f"relative, {len(errors)} crossings") if errors else None
+
+
+def _order(of: RunInModes) -> Finding:
+    """Return the least order of both errors, of runs with steps h, h/2 and h/8 over the first transitions."""
+    if any(getattr(event, "power_sides", ()) for event in of.events):
+        raise StateError("motions are not smooth at kinks with powers that are not whole: the order is lower there")
+    start, best, stepper = of.tested.initial, Finding(-math.inf, math.nan), of.tested.stepper
+    times = [*(change[0] for change in of.changes), of.run.t.item(-1)][: TRANSITIONS + 1]
+    end, scales = sum(times[-2:]) / len(times[-2:]), of.tested.scales(start)
+    for halving in range(HALVINGS):
+        steps = max(LEAST_STEPS, math.ceil((end - start.t) / abs(of.run.h))) << halving
+        runs = [run_of(stepper, start, (end - start.t) / (part * steps), t_end=end) for part in (1, 2, 8)]
+        apart = [np.abs((np.hstack([run.q[-1] - runs[2].q[-1], run.p[-1] - runs[2].p[-1]])) / scales) for run in runs]
+        errors = [(float(z.max()), run.energy_error()) for z, run in zip(apart[:2], runs, strict=False)]
+        orders = [math.log2(a / b) for a, b in zip(*errors, strict=True) if b > DECIDED]
+        remark = f"errors {max(errors[0]):.1e}, then {max(errors[1]):.1e}; infinite: round-off"
+        found = Finding(min(orders, default=math.inf), (of.tested.method.order or 1) - SLACK, remark, at_least=True)
+        best = max(best, found)
+        if best.satisfied:
+            break
+    return best

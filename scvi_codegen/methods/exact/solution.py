@@ -20,12 +20,7 @@ from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.methods.exact.newton import Array as Numbers
 from scvi_codegen.methods.exact.newton import Floats, NotConvergedError, Solve, newton, solver
-from scvi_codegen.systems.constraints import (
-    constraint_masks,
-    force_directions,
-    position_conditions,
-    velocity_conditions,
-)
+from scvi_codegen.systems.constraints import force_directions, position_conditions, velocity_conditions
 from scvi_codegen.systems.first_order import FirstOrderSystem
 from scvi_codegen.systems.formulas.expressions import Tape, jacobian
 from scvi_codegen.systems.system import MechanicalSystem
@@ -116,8 +111,7 @@ class ExactMotion:
 
     @cached_property
     def _constraint_tape(self) -> Tape:
-        """Jacobian G of constraints, directions D of their forces, d/dt of the rates at constant v, conditions on
-        positions, rates, and 1 - mask."""
+        """G, directions D of forces, d/dt of the rates at constant v, conditions on positions, rates, and 1 - mask."""
         q, v, t = self.system.coordinates, self.second, self.system.time
 
         def rate(f: sympy.Expr) -> sympy.Expr:
@@ -126,9 +120,9 @@ class ExactMotion:
         positions = position_conditions(self.system)
         rates = list(map(sympy.Add, map(rate, positions), velocity_conditions(self.system)))
         derivatives = [moving.diff(x) for moving in rates for x in v]
-        directions, places = force_directions(self.system), np.ndindex(len(rates), len(v))
-        forces = [directions.get((k, i), sympy.S.Zero) for k, i in places] if self.system.reactions else derivatives
-        idle = [1 - mask for mask in constraint_masks(self.system)]
+        directions, reactions = force_directions(self.system), self.system.reactions
+        forces = [directions.get(place, sympy.S.Zero) for place in np.ndindex(len(rates), len(v))]
+        idle = [sympy.S.Zero] * (len(rates) - len(reactions)) + [1 - reaction.active for reaction in reactions]
         return Tape([*derivatives, *forces, *map(rate, rates), *positions, *rates, *idle], self.symbols)
 
     def _values(self, tape: Tape, q: Numbers, second: Numbers, t: Number) -> Numbers:
@@ -199,8 +193,7 @@ class ExactMotion:
         return solved(_saddle(mass, derivatives, forces, idle), np.concatenate([applied, -growth]))
 
     def constraint_terms(self, q: Numbers, v: Numbers, t: Number) -> tuple[Numbers, Numbers, Numbers]:
-        """Return the (c, m) Jacobian and directions of forces; (4, c) d/dt of the rates at constant v, constraints,
-        rates, and 1 where a constraint is not imposed."""
+        """Return (c, m) G and D; (4, c) d/dt of the rates at constant v, constraints, rates, and 1 - mask."""
         m, count = len(q), len(self.system.constraints)
         derivatives, forces, terms = np.split(self._values(self._constraint_tape, q, v, t), (count * m, 2 * count * m))
         return derivatives.reshape(count, m), forces.reshape(count, m), terms.reshape(4, count)

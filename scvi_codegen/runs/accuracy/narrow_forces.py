@@ -39,7 +39,7 @@ def differences_in_pieces(run: Any, size: float) -> Array:
     largest = np.zeros((2, run.q.shape[1]))
     for part in run.pieces or (run,):
         pieces, times, ends = part._restarted(0, size), list[float](), list[tuple[Array, Array]]()
-        changes = () if part.modes is None else part.modes.t  # of contacts: the step before ends in the state before an impact
+        changes = () if part.modes is None else part.modes.t  # of contacts: steps end in states before impacts
         for k in np.flatnonzero(np.abs(np.diff(part.t)) > LONG * size).tolist():
             t, h = part.t.item(k), part.t.item(k + 1) - part.t.item(k)
             try:
