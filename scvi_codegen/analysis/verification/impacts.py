@@ -28,7 +28,7 @@ from scvi_codegen.runs.results.saved_states import parameters_on_sides
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.trajectory import Trajectory
-from scvi_codegen.systems.event import Crossings, Event, Kink
+from scvi_codegen.systems.event import Crossings, Kink
 from scvi_codegen.systems.formulas.expressions import Tape
 from scvi_codegen.systems.formulas.symbols import TIME, symbol
 
@@ -234,25 +234,13 @@ def _symplecticity(run: Trajectory, changes: list[Change]) -> Finding | None:
 
 
 SAMPLED_STATES, SAMPLED_CHANGES, ROUNDED, DIFFERENCE = 40, 12, 256.0 * EPSILON, mp.mpf(10) ** -30
-"""Numbers of states and transitions that are checked; bound on zeros relative to their terms; width in 60 digits."""
 LEAST_STEPS, HALVINGS, TRANSITIONS, SLACK, DECIDED = 16, 4, 2, 0.5, 1e-12
-"""Of runs by which an order is measured: least steps, halvings, transitions, slack of the order, rounding errors."""
-CONDITIONS = (
-    ("sides of kinks", "u has the sign of its side at all states (60 digits)", ("kink",)),
-    ("complementarity", "gaps and normal forces are >= 0 (60 digits)", ("closes", "lifts", "leaves")),
-    ("friction", "it is in its cone, and opposite to slip (60 digits)", ("stops", "forward", "backward", "begins")),
-    ("closed contacts", "gaps, their rates, and slips that stick are 0 (60 digits)", ("constraint",)),
-)
-"""Names and statements of conditions, and the kinds of transitions that end them."""
+"""Bound on zeros relative to their terms; of runs that measure an order: slack of the order, rounding errors."""
 
 
 @dataclass(frozen=True)
 class RunInModes:
-    """Run of the stepper under test, whose parameters contain modes.
-
-    The functions of its transitions (:mod:`scvi_codegen.systems.contacts.modes`) are >= 0 between them and 0 there.
-    Forces in them are those of the exact motion in the mode, in 60 digits.
-    """
+    """Run under test, and functions that are >= 0 in its modes (:mod:`scvi_codegen.systems.contacts.modes`)."""
 
     tested: SystemUnderTest
     run: Trajectory
@@ -262,25 +250,20 @@ class RunInModes:
         return exact_motion(self.tested.system).with_parameters(parameters.tolist())
 
     @cached_property
-    def events(self) -> list[Event]:
-        """Kinks and transitions that the run is searched for."""
-        return [crossings.event for crossings in self.run.switches]
-
-    @cached_property
     def functions(self) -> Tape:
-        """Their functions by (q, p, v, t, parameters, multipliers)."""
-        of = EventFormulas(self.run.stepper.interface, self.events)
+        """Functions of kinks and transitions by (q, p, v, t, parameters, multipliers)."""
+        of = EventFormulas(self.run.stepper.interface, self.run.stepper.searched)
         return Tape(of.functions, (*of.q, *of.p, *of.v, symbol(TIME), *of.parameters, *of.multipliers))
 
     def values(self, x: Numbers, parameters: Array) -> Numbers:
         """Return the functions at x = (q, p, t), u of kinks times its side, then +- constraints and their rates."""
-        motion, (q, p), zeros, forces = self.motion(parameters), np.split(x[:-1], 2), list[Any](), list[Any]()
+        motion, (q, p), zeros, forces = self.motion(parameters), np.split(x[:-1], 2), np.zeros(0), np.zeros(0)
         v, named = motion.velocity(q, p, x[-1]), self.tested.stepper.parameters_by_name(parameters)
         if self.tested.system.constraints:
-            zeros, forces = [*motion.constraint_terms(q, v, x[-1])[2][1:3].ravel()], motion.multipliers(q, v, x[-1])
+            zeros, forces = motion.constraint_terms(q, v, x[-1])[2][1:3].ravel(), motion.multipliers(q, v, x[-1])
         values = self.functions([*q, *p, *v, x[-1], *motion.parameters, *forces])
-        sides = [np.sign(named[event.mode]) if isinstance(event, Kink) else 1 for event in self.events]
-        return np.array([*np.multiply(values, sides), *zeros, *(-zero for zero in zeros)], dtype=object)
+        sides = [np.sign(named[event.mode]) if isinstance(event, Kink) else 1 for event in self.run.stepper.searched]
+        return np.array([*np.multiply(values, sides), *zeros, *-zeros], dtype=object)
 
     def derivatives(self, x: Numbers, parameters: Array) -> Numbers:
         """Return the derivatives of the values by x, by differences."""
@@ -289,7 +272,8 @@ class RunInModes:
 
     def relative(self, x: Numbers, parameters: Array) -> Array:
         """Return the values relative to the sum of their terms: derivatives by x times x and its change in a step."""
-        rates = np.array([*np.concatenate(self.motion(parameters).rates(*np.split(x[:-1], 2), x[-1])), 1])
+        q, p = np.split(x[:-1], 2)
+        rates = np.array([*np.concatenate(self.motion(parameters).rates(q, p, x[-1])), 1])
         terms = np.abs(self.derivatives(x, parameters)) @ (np.abs(x) + np.abs(rates * self.run.h))
         return (self.values(x, parameters) / np.where(terms == 0, 1, terms)).astype(float)
 
@@ -301,32 +285,36 @@ class RunInModes:
             for t, q, p, row in zip(crossings.t.tolist(), crossings.q, crossings.p, rows.tolist(), strict=True):
                 sides = parameters_on_sides(run, run.t.item(max(row - 1, 0))), parameters_on_sides(run, t)
                 ends = numbers([*q, *p, t]), numbers([*run.q[row], *run.p[row], t])
-                found.append((t, self.events.index(crossings.event), *ends, sides))
+                found.append((t, run.stepper.searched.index(crossings.event), *ends, sides))
         times = [change[0] for change in found]
         alone = sorted((change for change in found if times.count(change[0]) == 1), key=lambda change: change[0])
         return alone[:: -(-len(alone) // SAMPLED_CHANGES) or 1]
 
-    @cached_property
-    def states(self) -> list[tuple[Numbers, Array]]:
-        """States x with parameters: some of those of the run, and those before transitions."""
-        rows, run = range(0, len(self.run), -(-len(self.run) // SAMPLED_STATES)), self.run
-        states = [(numbers([*run.q[k], *run.p[k], run.t[k]]), parameters_on_sides(run, run.t.item(k))) for k in rows]
-        return states + [(before, sides[0]) for _, _, before, _, sides in self.changes]
+    def states(self) -> Iterator[tuple[Numbers, Array]]:
+        """Yield states x with parameters: some of those of the run, and those before transitions."""
+        for t in self.run.t[:: -(-len(self.run) // SAMPLED_STATES)].tolist():
+            yield numbers([*np.concatenate(self.run.at(t)), t]), parameters_on_sides(self.run, t)
+        yield from ((before, sides[0]) for _, _, before, _, sides in self.changes)
 
 
 def run_of(stepper: Stepper, start: State, h: float, **plan: Any) -> Trajectory:
     """Return the run from a state by steps h; it may end where impacts accumulate."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", EventWarning)
-        return cast(Trajectory, stepper.integrate(start.q, start.p, h=h, t=start.t, **plan))
+        return stepper.integrate(start.q, start.p, h=h, t=start.t, **plan)
 
 
 def transition_checks(tested: SystemUnderTest, run: Trajectory) -> Iterator[Check]:
     """Yield the checks of a run by the stepper under test."""
     of, count = RunInModes(tested, run), 4 * len(tested.system.constraints)
     yield from checked("transitions", "their functions are 0 where modes change (60 digits)", partial(_zeros, of))
-    kinds = [getattr(event, "kind", "kink") for event in of.events] + ["constraint"] * count
-    for name, statement, ends in CONDITIONS:
+    kinds = [getattr(event, "kind", "kink") for event in run.stepper.searched] + ["constraint"] * count
+    for name, statement, ends in (
+        ("sides of kinks", "u has the sign of its side at all states (60 digits)", ("kink",)),
+        ("complementarity", "gaps and normal forces are >= 0 (60 digits)", ("closes", "lifts", "leaves")),
+        ("friction", "it is in its cone, and opposite to slip (60 digits)", ("stops", "forward", "backward", "begins")),
+        ("closed contacts", "gaps, their rates, and slips that stick are 0 (60 digits)", ("constraint",)),
+    ):
         if chosen := [k for k, kind in enumerate(kinds) if kind in ends]:
             yield from checked(name, statement, partial(_conditions, of, chosen))
     statement = "continuous; where L jumps p+ - p- = lambda u_q and H+ - H- = -lambda u_t (60 digits)"
@@ -344,28 +332,26 @@ def _zeros(of: RunInModes) -> Finding:
 
 def _conditions(of: RunInModes, chosen: list[int]) -> Finding:
     """Return how far below 0 functions are at states of the run, relative to their terms."""
-    low = [state for state in of.states if min(of.values(*state)[chosen]) < 0]
-    worst = max((float(-of.relative(*state)[chosen].min()) for state in low), default=0.0)
-    return Finding(worst, ROUNDED, f"relative to their terms, {len(of.states)} states")
+    low = [float(-of.relative(*state)[chosen].min()) for state in of.states() if min(of.values(*state)[chosen]) < 0]
+    return Finding(max(low, default=0.0), ROUNDED, "relative to their terms")
 
 
 def _states_at_kinks(of: RunInModes) -> Finding | None:
-    errors, m = list[float](), of.tested.system.dimension
-    for t, k, before, after, sides in of.changes:
+    errors, m, searched = list[float](), of.tested.system.dimension, of.run.stepper.searched
+    for t, k, before, after, sides in (change for change in of.changes if isinstance(searched[change[1]], Kink)):
         jump = after - before
-        if isinstance(of.events[k], Kink) and jump.any():
+        if jump.any():
             n = of.derivatives(before, sides[0])[k]
             impulse, ends = jump[m:-1] @ n[:m] / (n[:m] @ n[:m]), zip(sides, (before, after), strict=True)
             old, new = (of.motion(side).energy(x[:m], x[m:-1], mp.mpf(t)) for side, x in ends)
             jump = np.array([*jump[:m], *(jump[m:-1] - impulse * n[:m]), new - old + impulse * n[-1]])
-        if isinstance(of.events[k], Kink):
-            errors.append(float(max(abs(jump)) / max(1, *abs(before))))
+        errors.append(float(max(abs(jump)) / max(1, *abs(before))))
     return Finding(max(errors), ROUNDED, f"relative, {len(errors)} crossings") if errors else None
 
 
 def _order(of: RunInModes) -> Finding:
     """Return the least order of both errors, of runs with steps h, h/2 and h/8 over the first transitions."""
-    if any(getattr(event, "power_sides", ()) for event in of.events):
+    if any(getattr(event, "power_sides", ()) for event in of.run.stepper.searched):
         raise StateError("motions are not smooth at kinks with powers that are not whole: the order is lower there")
     start, best, stepper = of.tested.initial, Finding(-math.inf, math.nan), of.tested.stepper
     times = [*(change[0] for change in of.changes), of.run.t.item(-1)][: TRANSITIONS + 1]
@@ -377,8 +363,8 @@ def _order(of: RunInModes) -> Finding:
         errors = [(float(z.max()), run.energy_error()) for z, run in zip(apart[:2], runs, strict=False)]
         orders = [math.log2(a / b) for a, b in zip(*errors, strict=True) if b > DECIDED]
         remark = f"errors {max(errors[0]):.1e}, then {max(errors[1]):.1e}; infinite: round-off"
-        found = Finding(min(orders, default=math.inf), (of.tested.method.order or 1) - SLACK, remark, at_least=True)
-        best = max(best, found)
+        least = (of.tested.method.order or 1) - SLACK
+        best = max(best, Finding(min(orders, default=math.inf), least, remark, at_least=True))
         if best.satisfied:
             break
     return best

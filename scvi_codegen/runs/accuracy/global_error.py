@@ -251,6 +251,10 @@ def _alternative(trajectory: Any, result: GlobalError) -> str:
 
     The latter is for conservative motions.
     """
+    if (modes := trajectory.modes) is not None and modes.choices > 1:
+        return (
+            f"; but {modes.choices} modes of the contacts were consistent: other motions are as consistent as this one"
+        )
     if math.isinf(result.estimate):
         return f"; or use a method of higher order: others took more than {FURTHER} times the steps of the first run"
     if kinks := trajectory.stepper.interface.kinks:
@@ -539,8 +543,8 @@ class _Samples:
             rows = [0, *fastest.tolist()]
             rows += [steps] if rows[-1] < steps else []
         if trajectory.modes is not None:  # momenta jump at impacts, a rounding earlier or later
-            rows = np.arange(len(t))[rows]
-            rows = rows[~np.isin(t[rows], trajectory.modes.t) | (rows == 0) | (rows == steps)]
+            changed = {*trajectory.modes.t.tolist()} - {t[0], t[-1]}
+            rows = [k for k in np.arange(len(t))[rows] if t[k] not in changed]
         self.t, self.states = t[rows], [vectors[rows] for vectors in states]
         self.epsilon, self.firsts = roundoff(interface.words), first_of_groups(interface, m)
         self.errors = self.epsilon * np.abs(np.array([np.asarray(vectors) for vectors in self.states]))

@@ -39,14 +39,14 @@ def differences_in_pieces(run: Any, size: float) -> Array:
     largest = np.zeros((2, run.q.shape[1]))
     for part in run.pieces or (run,):
         pieces, times, ends = part._restarted(0, size), list[float](), list[tuple[Array, Array]]()
-        changes = () if part.modes is None else part.modes.t  # of contacts: steps end in states before impacts
         for k in np.flatnonzero(np.abs(np.diff(part.t)) > LONG * size).tolist():
             t, h = part.t.item(k), part.t.item(k + 1) - part.t.item(k)
             try:
                 pieces.plan = Fixed(h / (count := math.ceil(abs(h) / size)))
                 pieces._parameters[:] = parameters_on_sides(part, t)
                 pieces._begin(part.q[k], part.p[k], t)
-                pieces.advance(last := count - bool(np.isin(part.t[k + 1], changes)))
+                touching = part.modes is not None and part.t[k + 1] in part.modes.t  # the step ends before an impact
+                pieces.advance(last := count - touching)
                 times.append(part.t.item(k + 1) if last == count else t + last * h / count)
                 ends.append((pieces.q, pieces.p))
             except StepFailedError:  # the step was solved over what its pieces meet
