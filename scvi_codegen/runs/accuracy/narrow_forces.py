@@ -33,8 +33,8 @@ def differences_in_pieces(run: Any, size: float) -> Array:
 
     Args:
         run: trajectory with all states of adaptive steps.
-        size: of the pieces; steps from ``LONG`` times it on are taken in pieces. If one fails, the differences are
-            infinite.
+        size: of the pieces; steps from ``LONG`` times it on are taken in pieces, those to an impact without the last one.
+            If one fails, the differences are infinite.
     """
     largest = np.zeros((2, run.q.shape[1]))
     for part in run.pieces or (run,):
@@ -45,8 +45,7 @@ def differences_in_pieces(run: Any, size: float) -> Array:
                 pieces.plan = Fixed(h / (count := math.ceil(abs(h) / size)))
                 pieces._parameters[:] = parameters_on_sides(part, t)
                 pieces._begin(part.q[k], part.p[k], t)
-                touching = part.modes is not None and part.t[k + 1] in part.modes.t  # the step ends before an impact
-                pieces.advance(last := count - touching)
+                pieces.advance(last := count - (part.modes is not None and part.t[k + 1] in part.modes.t))
                 times.append(part.t.item(k + 1) if last == count else t + last * h / count)
                 ends.append((pieces.q, pieces.p))
             except StepFailedError:  # the step was solved over what its pieces meet
