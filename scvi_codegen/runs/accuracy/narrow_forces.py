@@ -33,8 +33,8 @@ def differences_in_pieces(run: Any, size: float) -> Array:
 
     Args:
         run: trajectory with all states of adaptive steps.
-        size: of the pieces; steps from ``LONG`` times it on are taken in pieces, those to an impact without the last one.
-            If one fails, the differences are infinite.
+        size: of the pieces; steps from ``LONG`` times it on are taken in pieces, all but the last before an impact. If
+            one fails, the differences are infinite.
     """
     largest = np.zeros((2, run.q.shape[1]))
     for part in run.pieces or (run,):
