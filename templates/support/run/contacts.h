@@ -29,18 +29,17 @@ enum {
 
 #define CONTACT_ROUNDING 1e-10 /* part of their size below which gaps, rates and forces count as 0 */
 #define CONTACT_SLOW 1e-6 /* part of its size below which the direction of a slip in space is kept */
-#define CONTACT_BEGIN 1e-6 /* first part of a slip in space, relative to a step; the next ones .. */
-#define CONTACT_ANGLE 1e-4 /* .. turn by less, until .. */
-#define CONTACT_STIFF 6e-2 /* .. its rate relative to that by its friction is larger than this */
-#define CONTACT_BRAKES 0.25 /* longest part of a step relative to the time to a stop of a slip in space .. */
-#define CONTACT_GROWS 0.2 /* .. and relative to that since its beginning */
+#define CONTACT_BEGIN 1e-6 /* first part of a slip in space, relative to a step */
+#define CONTACT_PART 0.2 /* longest parts relative to the times from its beginning and to its stop .. */
+#define CONTACT_RELAXES 3.0 /* .. and to the relaxation of its direction, for which iterations on stages converge .. */
+#define CONTACT_SHORT 3e-4 /* .. once that is longer than this part of a step */
 #define CONTACT_PENETRATION 1e-9 /* part of its size by which a gap may be negative at a start */
 #define CONTACT_MISSED 128.0 /* effects of rounding beyond which a negative gap shows a missed transition */
 #define CONTACT_LOWEST 16.0 /* roundings of a gap below which a rebound ends */
 #define CONTACT_RESIDUALS 16.0 /* residuals of its located zero below which a rebound ends */
 #define CONTACT_TURN 0.866 /* cosine of an angle after which a direction is renewed */
 #define CONTACT_ASIDE 1e-9 /* largest angle between friction and slip in space */
-#define CONTACT_FAST 1e9 /* length of a vector that is a direction */
+#define CONTACT_FAST 1e3 /* speed relative to that of a slip whose direction is kept */
 #define CONTACT_COMPLIANCE 1e-3 /* of friction at the start of a relaxation */
 #define CONTACT_DEPENDENT 1e-12 /* part of a column below which a pivot counts as 0 */
 #define CONTACT_GAIN 1e-9 /* part of the work of an impact by which energy may grow */
@@ -127,9 +126,9 @@ static void put_mode(const contact_places *at, contact_mode mode, const real *w,
   if (at->slips == 1)
     slides[0] = mode.direction[0];
   for (int i = 0; at->slips == 2 && i < 2; i++) {
-    const real size = length_of(mode.direction, 2), slow = length_of(w, 2) > CONTACT_SLOW * speed ? 0.0 : speed * speed;
+    const real size = length_of(mode.direction, 2), slow = length_of(w, 2) > CONTACT_SLOW * speed ? 0.0 : pow(CONTACT_FAST * speed, 2.0);
     slides[0] = held ? size : slips;
-    slides[1 + i] = (held && size > 0.0 ? CONTACT_FAST / size : slow) * mode.direction[i];
+    slides[1 + i] = (held && size > 0.0 ? pow(CONTACT_FAST * speed, 2.0) / size : slow) * mode.direction[i];
     slides[3 + i] = held ? 0.0 : mode.direction[i];
   }
 }
@@ -762,7 +761,8 @@ static int choose_modes(const event_step *step, const contact_terms *of, const c
     put_mode(CONTACTS + k, best[k], is_slow || slip < 0 ? AT_REST : of->rate + slip, speed, step->watch->mode);
     if (is_slow) {
       step->watch->fastest[k] = fmax(step->watch->fastest[k], speed);
-      step->watch->first[k] = CONTACT_BEGIN * fabs(step->whole);
+      step->watch->began[k] = step->watch->time;
+      step->watch->whole[k] = fabs(step->whole);
     }
   }
   put_modes(step->watch->mode, step->own);
@@ -1076,110 +1076,92 @@ static int slips_at(const event_step *step, const event_sample *at, contact_term
   return solve_contacts(of, mode, of->second, force, second, NULL);
 }
 
-/* Whether a slip in space begins at a rate that is small relative to that by its friction. */
-static int is_gentle(const event_step *step, const contact_terms *of, int k, const real *force, real rate)
+/* Directions in a part of a step of slips that begin, by the midpoint rule: friction is opposite to w + (part/2) w', w'
+ * that of the middle. At the beginning, w = 0, that is w' parallel to -d where friction jumps; where it does not jump,
+ * w' = 0, the friction at rest, which w follows as long as the friction that would stop it is stiff. */
+static int turn_slips(const event_step *step, const event_sample *at, const contact_terms *of, const int *begins,
+    contact_mode *mode, real *force, real part)
 {
-  int slides = 0; /* of several that slide, none is turned */
-  for (int j = 0; j < EVENT_CONTACTS; j++)
-    slides += CONTACTS[j].slips == 2 && step->watch->mode[CONTACTS[j].direction] != 0.0;
-  if (slides > 1)
-    return 0;
-  const int slip = CONTACTS[k].tangential;
-  const real by_friction = length_of(force + slip, 2) * of->W[slip * (CONTACT_ROWS + 1)];
-  return step->watch->first[k] > 0.0 && rate > -CONTACT_ROUNDING * by_friction && rate < CONTACT_STIFF * by_friction;
+  event_sample middle = {.t = at->t + 0.5 * part, .q = step->memory, .p = step->memory + M};
+  contact_terms there;
+  contact_problem in = {.of = &there};
+  real right[CONTACT_ROWS];
+  solver_report own;
+  int status = NAME(step)(at->t, 0.5 * part, at->q, at->p, step->own, step->options, middle.q, middle.p, &own,
+      step->workspace);
+  if (status == OK)
+    status = terms_at(step, &middle, &there);
+  if (status != OK)
+    return status;
+  memcpy(right, there.second, sizeof right);
+  in.right = right;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int slip = CONTACTS[k].tangential;
+    in.limit[k] = mode[k].sticks;
+    if (!begins[k])
+      continue;
+    mode[k] = CONTACT_STICKS;
+    for (int i = 0; i < 2; i++)
+      right[slip + i] += 2.0 / part * of->rate[slip + i];
+  }
+  relax(&in, mode, 0.0, CONTACT_SWEEPS, force);
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const real *const tau = force + CONTACTS[k].tangential;
+    for (int i = 0; begins[k] && i < 2; i++)
+      mode[k].direction[i] = -tau[i] / length_of(tau, 2);
+  }
+  return status;
 }
 
-/* Slips in space at the beginning of a part of a step. Solutions are not smooth where they stop, and steps do not
- * resolve where they begin: the direction of slow ones is kept, and steps are in proportion to |w|/|w'|, at most
- * *longest. The direction `ahead` of others is renewed after a turn. */
+/* Slips in space at the beginning of a part of a step, of at most *longest. Where they stop and where they begin
+ * solutions are not smooth: parts are in proportion to |w|/|w'|, and to the time |w|/(W tau) in which the direction
+ * relaxes to that of other forces. Slow ones that stop keep their direction, and those that begin that of the middle of
+ * each part, until parts of relaxation are no longer short. The direction `ahead` of others is renewed after a turn. */
 static int follow_slips(const event_step *step, const event_sample *at, real *longest)
 {
   contact_terms of;
   contact_mode mode[EVENT_CONTACTS];
-  real force[CONTACT_ROWS], second[CONTACT_ROWS];
-  int status;
+  real force[CONTACT_ROWS], second[CONTACT_ROWS], direction[EVENT_CONTACTS][2], most = *longest;
+  int keeps[EVENT_CONTACTS], begins[EVENT_CONTACTS], changes = 0, turns = 0, status;
   *longest = INFINITY;
   if (!slips_at(step, at, &of, mode, force, second, &status))
     return status;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int slip = CONTACTS[k].tangential;
-    real *const start = step->watch->mode + CONTACTS[k].direction + 1, *const ahead = start + 2;
-    const real *const w = of.rate + slip, size = CONTACTS[k].slips == 2 ? length_of(w, 2) : 0.0;
+    const real *const start = step->watch->mode + CONTACTS[k].direction + 1, *const ahead = start + 2;
+    const real *const w = of.rate + slip, size = length_of(w, 2), *const d = mode[k].direction;
+    keeps[k] = begins[k] = -1;
     if (CONTACTS[k].slips < 2 || start[-1] == 0.0 || mode[k].held)
       continue;
-    const real *const d = mode[k].direction, rate = d[0] * second[slip] + d[1] * second[slip + 1];
-    const int keeps = keeps_direction(start, w);
-    real *const fastest = step->watch->fastest + k;
-    *fastest = fmax(*fastest, fmax(size, of.speed[slip]));
-    const real slow = CONTACT_SLOW * *fastest;
-    const real until_slow = rate > 0.0 ? 2.0 * slow / rate : INFINITY;
-    const int begins = keeps && is_gentle(step, &of, k, force, rate);
-    const int is_slow = rate < 0.0 && size <= slow, is_released = keeps && !begins && size > slow;
-    if (keeps && !is_released)
-      *longest = fmin(*longest, begins ? step->watch->first[k] : until_slow);
-    else if (!is_slow)
-      *longest = fmin(*longest, (rate < 0.0 ? CONTACT_BRAKES : CONTACT_GROWS) * size / fabs(rate));
-    const int turns = ahead[0] * w[0] + ahead[1] * w[1] < CONTACT_TURN * size;
-    if (keeps ? !is_released : !(is_slow || turns))
-      continue;
+    const real rate = d[0] * second[slip] + d[1] * second[slip + 1], by_friction = length_of(force + slip, 2) * of.W[slip * (CONTACT_ROWS + 1)];
+    const real part = CONTACT_PART * size / fabs(rate), relaxes = CONTACT_RELAXES * size / by_friction;
+    const real age = fabs(step->watch->time - step->watch->began[k]);
+    const int kept = keeps_direction(start, w), stops = rate < -CONTACT_ROUNDING * by_friction;
+    const int stiff = CONTACT_PART * by_friction > CONTACT_RELAXES * rate && relaxes < CONTACT_SHORT * step->watch->whole[k];
+    step->watch->fastest[k] = fmax(step->watch->fastest[k], fmax(size, of.speed[slip]));
+    keeps[k] = stops ? size <= CONTACT_SLOW * step->watch->fastest[k] : kept && (age == 0.0 || stiff);
+    begins[k] = keeps[k] && !stops && age > 0.0;
+    if (!stops)
+      *longest = fmin(*longest, keeps[k] ? fmax(CONTACT_BEGIN * step->watch->whole[k], CONTACT_PART * age) : fmin(part, relaxes));
+    else if (!keeps[k])
+      *longest = fmin(*longest, part);
+    turns |= begins[k];
+    changes |= begins[k] || keeps[k] != kept || (!kept && ahead[0] * w[0] + ahead[1] * w[1] < CONTACT_TURN * size);
+    for (int i = 0; i < 2; i++)
+      direction[k][i] = size > 0.0 && !(keeps[k] && kept) ? w[i] / size : ahead[i];
+  }
+  if (turns)
+    status = turn_slips(step, at, &of, begins, mode, force, fmin(*longest, most));
+  if (status == OK && changes)
     status = add_change(step, FIRST_TRANSITION, at);
-    if (status != OK)
-      return status;
-    for (int i = 0; i < 2; i++) {
-      ahead[i] = w[i] / size;
-      start[i] = is_slow ? *fastest * *fastest * ahead[i] : 0.0;
+  for (int k = 0; status == OK && changes && k < EVENT_CONTACTS; k++) {
+    real *const start = step->watch->mode + CONTACTS[k].direction + 1;
+    for (int i = 0; keeps[k] >= 0 && i < 2; i++) {
+      start[2 + i] = begins[k] ? mode[k].direction[i] : direction[k][i];
+      start[i] = keeps[k] ? pow(CONTACT_FAST * step->watch->fastest[k], 2.0) * start[2 + i] : 0.0;
     }
   }
   put_modes(step->watch->mode, step->own);
   return status;
-}
-
-/* Turns slips in space that begin slowly at the end of a part. Where w' = W (s - mu N w/|w|) is small, w follows s,
- * opposite to the friction that would stop it, at an angle with lag' = s' - lag W mu N/|w|, too stiff for steps at
- * first: impulses of the imposed rows turn it, with its component in the former direction. */
-static int turn_slips(const event_step *step, event_sample *at, int *turned)
-{
-  contact_terms of;
-  contact_mode mode[EVENT_CONTACTS];
-  real force[CONTACT_ROWS], second[CONTACT_ROWS], right[CONTACT_ROWS] = {0.0};
-  int turns[EVENT_CONTACTS] = {0}, status;
-  if (!slips_at(step, at, &of, mode, force, second, &status))
-    return status;
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const int slip = CONTACTS[k].tangential;
-    const real *const d = mode[k].direction, *const start = step->watch->mode + CONTACTS[k].direction + 1;
-    if (CONTACTS[k].slips < 2 || start[-1] == 0.0 || mode[k].held || !keeps_direction(start, of.rate + slip))
-      continue;
-    turns[k] = is_gentle(step, &of, k, force, d[0] * second[slip] + d[1] * second[slip + 1]);
-    mode[k] = turns[k] ? CONTACT_STICKS : mode[k];
-    *turned |= turns[k];
-  }
-  if (!*turned || !solve_contacts(&of, mode, of.second, force, second, NULL))
-    return OK;
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const real *const tau = force + CONTACTS[k].tangential, *const w = of.rate + CONTACTS[k].tangential;
-    real *const start = step->watch->mode + CONTACTS[k].direction + 1, *const ahead = start + 2;
-    const real load = length_of(tau, 2), size = length_of(start, 2), speed = ahead[0] * w[0] + ahead[1] * w[1];
-    mode[k].direction[0] = mode[k].direction[1] = 0.0; /* friction of others has no impulse */
-    if (!turns[k])
-      continue;
-    const real angle = (ahead[1] * tau[0] - ahead[0] * tau[1]) / load;
-    const real relaxed = fabs(step->h) * load * of.W[CONTACTS[k].tangential * (CONTACT_ROWS + 1)];
-    const real lag = angle / (1.0 + relaxed / speed); /* by a step of Euler's implicit method */
-    const real d[2] = {-(tau[0] + lag * tau[1]) / load, -(tau[1] - lag * tau[0]) / load};
-    const real part = speed / (d[0] * ahead[0] + d[1] * ahead[1]);
-    step->watch->first[k] *= fmin(2.0, CONTACT_ANGLE / fmax(fabs(angle - lag), DBL_MIN));
-    for (int i = 0; i < 2; i++) {
-      right[CONTACTS[k].tangential + i] = w[i] - part * d[i];
-      ahead[i] = d[i];
-      start[i] = size * d[i];
-    }
-  }
-  put_modes(step->watch->mode, step->own);
-  if (solve_contacts(&of, mode, right, force, second, NULL))
-    for (int r = 0; r < CONTACT_ROWS; r++)
-      for (int i = 0; i < M; i++)
-        at->p[i] += of.G[r * M + i] * force[r];
-  return add_change(step, FIRST_TRANSITION, at);
 }
 #endif
