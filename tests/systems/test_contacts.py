@@ -624,3 +624,14 @@ def test_kinks_of_friction_coefficients_are_located() -> None:
     later = 0.7 - first
     assert run.q[-1, 0] == pytest.approx(0.1 + (1 - 3 * first) * later - later**2 / 4, abs=1e-14)
     assert [round(float(t), 12) for t in run.switches[0].t] == [round(first, 12)]
+
+
+@pytest.mark.parametrize("steps", [{"h": 0.07}, {"h": 0.2}, {}])
+def test_modes_at_a_kink_are_those_of_its_side(steps: dict[str, float]) -> None:
+    """A belt carries a block until it comes to where friction is less."""
+    block = sc.contact("y", slip="x_dot - 0.7*t", friction="where(x > 0.1, 0.05, 0.3)")
+    run = of(f"{PLANE} - 10*y", "x y", [block], "svi:2").integrate([0, 0], velocity=[0, 0], t_end=1.1, **steps)
+    first = np.sqrt(0.2 / 0.7)
+    assert run.contact_modes == [(0, ("stick",)), (pytest.approx(first, abs=1e-14), ("slip",))]
+    later = 1.1 - first
+    assert run.q[-1, 0] == pytest.approx(0.1 + 0.7 * first * later + later**2 / 4, abs=1e-14)

@@ -142,10 +142,10 @@ class _Binding:
                 f"'{self.system.name}' has {len(elements)} contacts, of at most {MOST_CONTACTS}: leave some out"
             )
         for number, item in enumerate(elements, 1):
-            named = _mapped(item, partial(self._read, item))
+            named = mapped(item, partial(self._read, item))
             if getattr(named, "of", ()):
                 named = replace(named, gap=self._distance(item, named.gap, named.of), of=())
-            expressions.append(_mapped(named, lambda formula, _: self.turning.in_coordinates(formula)))
+            expressions.append(mapped(named, lambda formula, _: self.turning.in_coordinates(formula)))
             rows.append(self._add(number, named))
         reduced = self.system.reduced
         system = replace(
@@ -321,7 +321,7 @@ class _Binding:
         return Slipping(tuple(slides * x / length for x in vector), slides * ahead + 1 - slides, names)
 
 
-def _mapped(item: ContactLike, function: Callable[[Any, str], Any]) -> Any:
+def mapped(item: ContactLike, function: Callable[[Any, str], Any]) -> Any:
     """Return a contact with the values of a function of each of its formulas and the role of this."""
 
     def of(formulas: Any, role: str) -> Any:
