@@ -11,8 +11,6 @@
  * Impacts obey the same conditions for impulses and velocities (C. Glocker, Set-Valued Force Laws, 2001). Requires:
  * parts/contacts.c.jinja. */
 enum {
-  CONTACT_COMBINATIONS = 15000, /* largest number of modes that are enumerated */
-  CONTACT_OPTIONS = 4, /* open, stick, slip in either direction */
   CONTACT_TRIALS = 8, /* of a relaxation, each of twice as many sweeps */
   CONTACT_SWEEPS = 50, /* over the forces of contacts */
   CONTACT_IMPACTS = 100, /* of a contact in a corner */
@@ -414,53 +412,29 @@ typedef struct {
   int is_strict; /* slips that begin have a rate */
   int is_relaxed; /* contacts at their limit do not stick */
   int is_free[EVENT_CONTACTS], rests[EVENT_CONTACTS], begins[EVENT_CONTACTS], limit[EVENT_CONTACTS];
-  contact_mode option[EVENT_CONTACTS][CONTACT_OPTIONS];
-  int options[EVENT_CONTACTS];
+  contact_mode role[EVENT_CONTACTS]; /* whether it may be closed, and its friction any (sticks) or in its direction */
 } contact_problem;
 
-static void add_option(contact_problem *in, int k, contact_mode mode)
-{
-  in->option[k][in->options[k]++] = mode;
-}
-
-/* Adds the modes at a slip that rests. */
-static void add_options_at_rest(contact_problem *in, int k)
-{
-  in->rests[k] = 1;
-  add_option(in, k, CONTACT_STICKS);
-  add_option(in, k, CONTACT_SLIPS[CONTACTS[k].slips == 2 ? 1 : 2]);
-  if (CONTACTS[k].slips == 1)
-    add_option(in, k, CONTACT_SLIPS[0]);
-}
-
-/* Adds the modes of a contact that its gap and its slip at a state allow. */
-static void add_options(contact_problem *in, int k, const contact_change *now)
+/* Sets the modes of a contact that its gap and its slip at a state allow. */
+static void allow_modes(contact_problem *in, int k, const contact_change *now)
 {
   const contact_terms *const of = in->of;
   const contact_places *at = CONTACTS + k;
   const real *const w = of->rate + at->tangential, speed = at->slips > 0 ? of->speed[at->tangential] : 0.0;
-  contact_mode slides = CONTACT_SLIPS[1];
-  if (at->normal >= 0)
-    add_option(in, k, CONTACT_IS_OPEN);
   in->is_free[k] = of->absent[k] || now->leaves[k] ||
       (at->normal >= 0 && !now->touches[k] &&
           (of->value[at->normal] > CONTACT_ROUNDING * of->size[at->normal] ||
               of->rate[at->normal] > CONTACT_ROUNDING * of->speed[at->normal]));
-  if (in->is_free[k]) {
-    in->rests[k] = 0;
+  in->role[k] = in->is_free[k] ? CONTACT_IS_OPEN : CONTACT_SLIPS[1];
+  if (in->is_free[k] || at->slips == 0)
     return;
-  }
   in->begins[k] = now->begins[k];
-  if (at->slips == 0 || now->begins[k]) {
-    add_option(in, k, CONTACT_SLIPS[at->slips == 1 ? 1 + now->begins[k] : 1]);
-  } else if (now->rests[k] || length_of(w, at->slips) <= CONTACT_ROUNDING * speed) {
-    add_options_at_rest(in, k);
-  } else {
-    for (int i = 0; i < at->slips; i++)
-      slides.direction[i] = w[i] / length_of(w, at->slips);
-    add_option(in, k, slides);
-  }
+  in->rests[k] = !now->begins[k] && (now->rests[k] || length_of(w, at->slips) <= CONTACT_ROUNDING * speed);
   in->limit[k] = in->rests[k] || in->begins[k];
+  if (in->limit[k])
+    in->role[k] = CONTACT_STICKS;
+  for (int i = 0; i < at->slips && !in->limit[k]; i++)
+    in->role[k].direction[i] = w[i] / length_of(w, at->slips);
 }
 
 /* Whether modes satisfy the conditions; their forces, and the rates with them. */
@@ -502,41 +476,6 @@ static int is_consistent(const contact_problem *in, const contact_mode *mode, re
   return 1;
 }
 
-/* Number of consistent combinations of the options, of motions that differ; the one that sticks most is the first of
- * those with the least sum of 2 for each contact that does not stick, less 1 for each that is closed. */
-static int enumerate_modes(const contact_problem *in, contact_mode *best)
-{
-  contact_mode mode[EVENT_CONTACTS];
-  real force[CONTACT_ROWS], after[CONTACT_ROWS], first[CONTACT_ROWS];
-  int place[EVENT_CONTACTS] = {0}, consistent = 0, least = 1 << 30;
-  for (int more = 1; more;) {
-    int weight = 0;
-    for (int k = 0; k < EVENT_CONTACTS; k++) {
-      mode[k] = in->option[k][place[k]];
-      weight += 2 * !mode[k].sticks - mode[k].closed;
-    }
-    if (is_consistent(in, mode, force, after)) {
-      real differs = 0.0, size = 0.0;
-      for (int r = 0; r < CONTACT_ROWS && consistent; r++) {
-        differs = fmax(differs, fabs(after[r] - first[r]));
-        size = fmax(size, fabs(in->right[r]));
-      }
-      if (!consistent)
-        memcpy(first, after, sizeof first);
-      consistent += !consistent || differs > CONTACT_ROUNDING * size;
-      if (weight < least)
-        memcpy(best, mode, sizeof mode);
-      least = weight < least ? weight : least;
-    }
-    more = 0;
-    for (int k = EVENT_CONTACTS - 1; k >= 0 && !more; k--) { /* the next of all combinations */
-      place[k] = (place[k] + 1) % in->options[k];
-      more = place[k] > 0;
-    }
-  }
-  return consistent;
-}
-
 /* Number of independent rows that a mode imposes. */
 static int rank_of(const contact_problem *in, const contact_mode *mode)
 {
@@ -571,9 +510,10 @@ static int hold_contacts(const contact_problem *in, contact_mode *mode)
 /* Forces by projection onto the friction cones, contact by contact (M. Jean, Comput. Methods Appl. Mech. Eng. 177,
  * 1999), from those given; role: whether a contact is closed, and its friction any (sticks) or in its direction.
  * Compliance distributes friction in proportion to its limits. */
-static void relax(const contact_problem *in, const contact_mode *role, real compliance, int sweeps, real *force)
+static void relax(const contact_problem *in, real compliance, int sweeps, real *force)
 {
   const contact_terms *const of = in->of;
+  const contact_mode *const role = in->role;
   real strongest = 0.0;
   for (; sweeps > 0; sweeps--)
     for (int k = 0; k < EVENT_CONTACTS; k++) {
@@ -604,10 +544,10 @@ static void relax(const contact_problem *in, const contact_mode *role, real comp
 
 /* Modes of forces in the friction cones; those below their limits stick. Where others determine a slip its friction is
  * kept relative to the normal force. Returns whether a limit changed, that of a slip that begins. */
-static int modes_of_forces(contact_problem *in, const contact_mode *role, int trial, const real *force,
-    contact_mode *mode)
+static int modes_of_forces(contact_problem *in, int trial, const real *force, contact_mode *mode)
 {
   const contact_terms *const of = in->of;
+  const contact_mode *const role = in->role;
   real small = in->scale;
   int changed = 0;
   for (int r = 0; r < CONTACT_ROWS; r++)
@@ -637,25 +577,29 @@ static int modes_of_forces(contact_problem *in, const contact_mode *role, int tr
   return changed;
 }
 
-/* Finds modes by relaxation of the forces, from those given, then from 0, with friction in proportion to its limits. If
- * slips without a rate are all that is consistent, these begin. Returns 0 if none is found. */
+/* Finds consistent modes: all contacts that meet closed, all slips at rest sticking; else by relaxation of the forces,
+ * from the present ones, then from 0, with friction in proportion to its limits. If slips without a rate are all that
+ * is consistent, these begin. Returns 0 if none is found. */
 static int relax_modes(contact_problem *in, real *force, contact_mode *best)
 {
   real exact[CONTACT_ROWS], after[CONTACT_ROWS];
-  contact_mode role[EVENT_CONTACTS], mode[EVENT_CONTACTS];
-  int limit[EVENT_CONTACTS], found = 0;
+  contact_mode mode[EVENT_CONTACTS];
+  int limit[EVENT_CONTACTS], found = 0, begins = 0;
+  memcpy(best, in->role, sizeof mode);
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    begins |= in->begins[k];
+  if (!begins && !hold_contacts(in, best) && is_consistent(in, best, exact, after))
+    return 1;
   in->is_relaxed = 1;
   memcpy(limit, in->limit, sizeof limit);
-  for (int k = 0; k < EVENT_CONTACTS; k++)
-    role[k] = in->rests[k] || in->begins[k] ? CONTACT_STICKS : in->option[k][in->options[k] - 1];
   for (int trial = 0; trial < CONTACT_TRIALS; trial++) {
     const int sweeps = CONTACT_SWEEPS << trial;
     memcpy(in->limit, limit, sizeof limit);
     if (trial > 0)
-      relax(in, role, CONTACT_COMPLIANCE, sweeps, force);
+      relax(in, CONTACT_COMPLIANCE, sweeps, force);
     for (int changes = 0, changed = 1; changed && changes <= EVENT_CONTACTS; changes++) {
-      relax(in, role, 0.0, sweeps, force);
-      changed = modes_of_forces(in, role, trial, force, mode);
+      relax(in, 0.0, sweeps, force);
+      changed = modes_of_forces(in, trial, force, mode);
     }
     for (in->is_strict = 1; in->is_strict >= found; in->is_strict--)
       if (is_consistent(in, mode, exact, after)) {
@@ -679,32 +623,22 @@ static int refuse(const event_step *step, int reason, int k, real value)
   return NOT_CONVERGED;
 }
 
-/* Names the contact of Painleve's paradox by its entry of G M^-1 (G - mu d T)^T <= 0, if there is one. */
-static int refuse_modes(const event_step *step, const contact_problem *in)
+/* The first contact of Painleve's paradox, G M^-1 (G - mu d T)^T <= 0 of a slip, at rest in any direction; -1: none. */
+static int painleve(const contact_problem *in, int at_rest, real *entry)
 {
-  for (int k = 0; k < EVENT_CONTACTS; k++)
-    for (int i = 0; i < in->options[k] && CONTACTS[k].normal >= 0; i++) {
-      const real *W = in->of->W + CONTACTS[k].normal * CONTACT_ROWS;
-      real entry = W[CONTACTS[k].normal];
-      for (int j = 0; j < CONTACTS[k].slips; j++)
-        entry -= in->of->coefficient[3 * k] * in->option[k][i].direction[j] * W[CONTACTS[k].tangential + j];
-      if (entry <= 0.0)
-        return refuse(step, CONTACT_WITHOUT_MODE, k, entry);
-    }
-  return refuse(step, CONTACT_WITHOUT_MODE, -1, 0.0);
-}
-
-/* Whether a mode sticks by static friction above that of sliding, so that slip would begin, too. */
-static int needs_static_friction(const contact_terms *of, const contact_mode *mode)
-{
-  real force[CONTACT_ROWS], second[CONTACT_ROWS];
-  int needs = 0;
-  if (!solve_contacts(of, mode, of->second, force, second, NULL))
-    return 0;
-  for (int k = 0; k < EVENT_CONTACTS; k++)
-    needs |= mode[k].sticks &&
-        length_of(force + CONTACTS[k].tangential, CONTACTS[k].slips) > friction_limit(of, k, 0, force);
-  return needs;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int normal = CONTACTS[k].normal, slips = CONTACTS[k].slips;
+    const real *const W = in->of->W + normal * CONTACT_ROWS, *const coupling = W + CONTACTS[k].tangential;
+    real along = in->limit[k] && at_rest ? length_of(coupling, slips) : 0.0;
+    if (normal < 0 || slips == 0 || in->is_free[k])
+      continue;
+    for (int j = 0; j < slips; j++)
+      along += in->role[k].direction[j] * coupling[j];
+    *entry = W[normal] - in->of->coefficient[3 * k] * along;
+    if (*entry <= 0.0)
+      return k;
+  }
+  return -1;
 }
 
 /* Whether friction is negative, less static than sliding at rest, or a restitution is not in [0, 1]. */
@@ -716,33 +650,20 @@ static int is_impossible(const contact_terms *of, int k)
   return !(mu >= 0.0 && held >= 0.0 && e >= 0.0 && e <= 1.0) || (rests && held < (1.0 - CONTACT_ROUNDING) * mu);
 }
 
-/* Whether the combinations of modes are few, and slips in space have no direction to be found. */
-static int are_few(const contact_problem *in)
-{
-  real combinations = 1.0;
-  for (int k = 0; k < EVENT_CONTACTS; k++)
-    combinations *= CONTACTS[k].slips == 2 && (in->rests[k] || in->begins[k]) ? INFINITY : in->options[k];
-  return combinations <= CONTACT_COMBINATIONS;
-}
-
-/* Sets the consistent modes at a state that stick most, of many and of redundant contacts those near given forces. */
+/* Sets the consistent modes at a state that stick most, of redundant contacts those near given forces. */
 static int choose_modes(const event_step *step, const contact_terms *of, const contact_change *now, real *force)
 {
   contact_problem in = {.of = of, .right = of->second, .is_strict = 1};
   contact_mode best[EVENT_CONTACTS];
-  real second[CONTACT_ROWS];
-  int imposed[CONTACT_ROWS] = {0}, consistent = 0, held = 0;
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    in.rests[k] = now->rests[k];
-    held |= step->watch->mode[CONTACTS[k].held] != 0.0;
-    add_options(&in, k, now);
+  real second[CONTACT_ROWS], entry = 0.0;
+  int imposed[CONTACT_ROWS] = {0};
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    allow_modes(&in, k, now);
+  if (!relax_modes(&in, force, best)) {
+    const int paradox = painleve(&in, 1, &entry);
+    return refuse(step, CONTACT_WITHOUT_MODE, paradox, paradox < 0 ? 0.0 : entry);
   }
-  if (!held && are_few(&in))
-    consistent = enumerate_modes(&in, best);
-  if (consistent > step->watch->ambiguous && !needs_static_friction(of, best))
-    step->watch->ambiguous = consistent;
-  if ((!consistent || hold_contacts(&in, best)) && !relax_modes(&in, force, best))
-    return refuse_modes(step, &in);
+  step->watch->ambiguous |= painleve(&in, 0, &entry) >= 0;
   solve_contacts(of, best, of->second, force, second, imposed);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential;
@@ -784,15 +705,10 @@ static int impulses_of(const contact_terms *of, int contact, const int *closed, 
     in.scale = fmax(in.scale, of->speed[r]);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     in.is_free[k] = CONTACTS[k].normal < 0 || !(k == contact || closed[k]);
-    if (k != contact)
-      add_option(&in, k, CONTACT_IS_OPEN);
-    if (!in.is_free[k] && CONTACTS[k].slips > 0)
-      add_options_at_rest(&in, k);
-    else if (!in.is_free[k])
-      add_option(&in, k, CONTACT_SLIPS[1]);
+    in.rests[k] = !in.is_free[k] && CONTACTS[k].slips > 0;
+    in.role[k] = in.is_free[k] ? CONTACT_IS_OPEN : in.rests[k] ? CONTACT_STICKS
+                                                               : CONTACT_SLIPS[1];
   }
-  if (are_few(&in) && enumerate_modes(&in, mode))
-    return is_consistent(&in, mode, impulse, after);
   memset(impulse, 0, BYTES(CONTACT_ROWS));
   return relax_modes(&in, impulse, mode) && is_consistent(&in, mode, impulse, after);
 }
@@ -1104,7 +1020,8 @@ static int turn_slips(const event_step *step, const event_sample *at, const cont
     for (int i = 0; i < 2; i++)
       right[slip + i] += 2.0 / part * of->rate[slip + i];
   }
-  relax(&in, mode, 0.0, CONTACT_SWEEPS, force);
+  memcpy(in.role, mode, sizeof in.role);
+  relax(&in, 0.0, CONTACT_SWEEPS, force);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const real *const tau = force + CONTACTS[k].tangential;
     for (int i = 0; begins[k] && i < 2; i++)
