@@ -184,7 +184,11 @@ class _Binding:
         if not arrays or not isinstance(formula, str):
             return [item]
         sizes = {name: size for name, size in indices.items() if isinstance(size, int)}
-        known = *arrays, *(Array(array.name + DOT, array.axes) for array in arrays), Array("", tuple(map(Size, sizes)))
+        entries = (
+            *arrays,
+            *(Array(array.name + DOT, array.axes) for array in arrays),
+            Array("", tuple(map(Size, sizes))),
+        )
         rules = EntryRules(sizes, {}, {array.name: entry_names(array, {}) for array in arrays})
 
         def formulas(value: Any) -> Iterable[Any]:
@@ -192,7 +196,7 @@ class _Binding:
                 return zip(*map(formulas, value), strict=True)
             if not isinstance(value, str):
                 return repeat(value)
-            term = parse_constraint(value if value == first else value + loops, known, self.names | self.functions)
+            term = parse_constraint(value if value == first else value + loops, entries, self.names | self.functions)
             return [term.formula.xreplace(rule) for _, rule in rules.rules(term)]
 
         fields = {name: getattr(item, name) for name in item.__dataclass_fields__ if name != "name"}
