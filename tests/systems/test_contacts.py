@@ -366,7 +366,7 @@ def test_slip_in_space_begins_without_a_jump_of_friction(steps: dict[str, float]
     first = [1, 2, 2e-13 * begins, 1e-13 * np.sin(begins)]
     true = solve_ivp(rates, (begins, 3), first, "Radau", rtol=1e-11, atol=1e-15).y[:, -1]
     error = np.abs(np.concatenate([run.q[-1, :2], run.velocity[-1, :2]]) - true).max()
-    assert error < (5e-9 if not steps else 6e-11 if steps["h"] > 0.02 else 1.5e-11)
+    assert error < (6e-9 if not steps else 1.5e-10 if steps["h"] > 0.02 else 1.5e-11)
     assert np.abs(run.q[:, 2]).max() < 1e-14
 
 
@@ -382,7 +382,7 @@ def test_two_slips_in_space_begin_one_after_another() -> None:
         rates = of_sliding(lambda t, force=force: (force(t), 2.943), lambda t: np.zeros(2))
         true = solve_ivp(rates, (begins, 3), [0, 0, *1e-13 * force(begins)], "Radau", rtol=1e-11, atol=1e-15).y[:, -1]
         moving = slice(3 * k, 3 * k + 2)
-        assert np.abs(np.concatenate([run.q[-1, moving], run.velocity[-1, moving]]) - true).max() < 1e-10
+        assert np.abs(np.concatenate([run.q[-1, moving], run.velocity[-1, moving]]) - true).max() < 2e-10
 
 
 TURNS = sc.LagrangianSystem.from_text(

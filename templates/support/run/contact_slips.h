@@ -2,8 +2,9 @@
 
 /* Directions of slips in space where these stop and begin. */
 #define CONTACT_BEGIN 1e-6 /* first part of a slip in space, relative to a step */
-#define CONTACT_PART 0.2 /* longest parts relative to the times from its beginning and to its stop .. */
-#define CONTACT_RELAXES 3.0 /* .. and to the relaxation of its direction, for which iterations on stages converge .. */
+#define CONTACT_BRAKES 0.25 /* longest parts relative to the time to its stop .. */
+#define CONTACT_GROWS 0.2 /* .. to that from its beginning .. */
+#define CONTACT_RELAXES 2.0 /* .. and to the relaxation of its direction, for which iterations on stages converge .. */
 #define CONTACT_SHORT 3e-4 /* .. once that is longer than this part of a step */
 #define CONTACT_TURN 0.866 /* cosine of an angle after which a direction is renewed */
 
@@ -88,7 +89,7 @@ static int turn_slips(const event_step *step, const event_sample *at, const cont
 /* Slips in space at the beginning of a part of a step, of at most *longest. Where they stop and where they begin
  * solutions are not smooth: parts are in proportion to |w|/|w'|, and to the time |w|/(W tau) in which the direction
  * relaxes to that of other forces. Slow ones that stop keep their direction, and those that begin that of the middle of
- * each part, until parts of relaxation are no longer short, which are taken in the first step. The direction `ahead` of others is renewed after a turn. */
+ * each part, until parts of relaxation are no longer short. The direction `ahead` of others is renewed after a turn. */
 static int follow_slips(const event_step *step, const event_sample *at, real *longest)
 {
   contact_terms of;
@@ -108,17 +109,18 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
       continue;
     const real rate = d[0] * second[slip] + d[1] * second[slip + 1];
     const real by_friction = length_of(force + slip, 2) * of.W[slip * (CONTACT_ROWS + 1)];
-    const real part = CONTACT_PART * size / fabs(rate), relaxes = CONTACT_RELAXES * size / by_friction;
+    const real part = (rate < 0.0 ? CONTACT_BRAKES : CONTACT_GROWS) * size / fabs(rate);
+    const real relaxes = CONTACT_RELAXES * size / by_friction;
     const real whole = step->watch->whole[k], age = fabs(step->watch->time - step->watch->began[k]);
     const int kept = keeps_direction(start, w), stops = rate < -CONTACT_ROUNDING * by_friction;
-    const int stiff = CONTACT_PART * by_friction > CONTACT_RELAXES * rate && relaxes < CONTACT_SHORT * whole;
+    const int stiff = CONTACT_GROWS * by_friction > CONTACT_RELAXES * rate && relaxes < CONTACT_SHORT * whole;
     step->watch->fastest[k] = fmax(step->watch->fastest[k], fmax(size, of.speed[slip]));
     keeps[k] = stops ? size <= CONTACT_SLOW * step->watch->fastest[k] : kept && (age == 0.0 || stiff);
     begins[k] = keeps[k] && !stops && age > 0.0;
     if (keeps[k] && !stops)
-      *longest = fmin(*longest, fmax(CONTACT_BEGIN * whole, CONTACT_PART * age));
+      *longest = fmin(*longest, fmax(CONTACT_BEGIN * whole, CONTACT_GROWS * age));
     else if (!keeps[k])
-      *longest = fmin(*longest, stops || age >= whole ? part : fmin(part, relaxes));
+      *longest = fmin(*longest, stops ? part : fmin(part, relaxes));
     turns |= begins[k];
     changes |= begins[k] || keeps[k] != kept || (!kept && ahead[0] * w[0] + ahead[1] * w[1] < CONTACT_TURN * size);
     for (int i = 0; i < 2; i++)
