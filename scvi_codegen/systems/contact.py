@@ -177,10 +177,10 @@ def contacts_of(tables: Sequence[Mapping[str, Any]]) -> tuple[ContactLike, ...]:
     contacts: list[ContactLike] = []
     for table in tables:
         kind: Any = Friction if {"gap", "surface"}.isdisjoint(table) else Contact
-        known = [*kind.__dataclass_fields__, *(("surface",) if kind is Contact else ())]
-        if unknown := sorted(set(table) - set(known)):
+        arguments = [*kind.__dataclass_fields__, *(("surface",) if kind is Contact else ())]
+        if unknown := sorted(set(table) - set(arguments)):
             raise SystemDefinitionError(
-                f"'{unknown[0]}' of a contact is unknown{closest(unknown[0], list(known))} Known: {', '.join(known)}"
+                f"'{unknown[0]}' of a contact is unknown{closest(unknown[0], arguments)} Known: {', '.join(arguments)}"
             )
         lacking = [name for name in ("slip", "limit") if kind is Friction and name not in table]
         if lacking:

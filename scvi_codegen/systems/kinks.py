@@ -19,7 +19,7 @@ from scvi_codegen.systems.checks.continuity import MOST_SURFACES, jump_message, 
 from scvi_codegen.systems.event import Kink, Refraction
 from scvi_codegen.systems.formulas.expressions import parts_of_type
 from scvi_codegen.systems.formulas.intermediates import parts
-from scvi_codegen.systems.formulas.kinks import Mode, switching_function, unit_step
+from scvi_codegen.systems.formulas.kinks import Mode, steps_on_sides, switching_function, unit_step
 from scvi_codegen.systems.formulas.tables import without_tables
 
 if TYPE_CHECKING:
@@ -38,6 +38,8 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
 
     Systems in transformed time, and with more than ``MOST_KINKS`` switching functions, stay as they are.
     """
+    from scvi_codegen.systems.contacts.modes import mapped
+
     owned = [field.name for field in fields(system) if field.name in FORMULAS]
     formulas = [formula for name in owned for formula in _formulas(getattr(system, name))]
     formulas += [part for reaction in system.reactions for part in reaction.direction]  # of friction
@@ -52,10 +54,7 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
     taken |= {variable.name for variable in (*system.coordinates, *system.velocities, *system.parameters)}
     numbers = (k for k in range(1, 10**6) if f"mode_{k}" not in taken)
     modes = {u: Mode(f"mode_{k}", real=True) for u, k in zip(sorted(arguments, key=str), numbers, strict=False)}
-    rules: dict[Expr, Expr] = {}
-    for step in located:
-        u, sign = switching_function(step.args[0])
-        rules[step] = unit_step(step.args[0] + sign * modes[u])
+    rules = steps_on_sides(located, modes)
     rules |= {power: rules[step] * power for power, step in powers.items() if step in rules}
     jumps = set(_jumps(system))
     jumps = arguments if jumps and len(arguments) > MOST_SURFACES else jumps
@@ -64,6 +63,7 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
     changes["reactions"] = tuple(
         replace(reaction, direction=_replaced(reaction.direction, rules)) for reaction in system.reactions
     )
+    changes["contacts"] = tuple(mapped(item, lambda part, _: part.xreplace(rules)) for item in system.contacts)
     changes["parameters"] = (*system.parameters, *modes.values())
     changes["defaults"] = (*system.defaults, *(0.0 for _ in modes))
     for name, value in (changes | {"_key": None, "_text": None}).items():

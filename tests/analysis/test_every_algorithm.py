@@ -27,7 +27,11 @@ OTHERS = {
     "run/tangent_growth.h": "compared with derivatives of single steps in test_chaos_indicators.py",
     "iteration/linear_part.h": "compared with Pade's approximation of linear chains in test_linear_part.py",
     "run/event_times.h": "compared with exact times in test_events_of_time.py",
-    "run/contacts.h": "compared with closed forms in test_contacts.py",
+    **{
+        f"run/contact{x}.h": "compared with closed forms in test_contacts.py"
+        for x in ("s", "_rows", "_forces", "_modes")
+    },
+    **{f"run/contact_{x}.h": "compared with closed forms in test_contacts.py" for x in ("impacts", "slips")},
     "run/observation.h": "compared with the states of runs in test_observers.py",
     "frameworks/casadi_flow.h": "interface of CasADi to a compiled step",
     "frameworks/flow.h": "interface of JAX and PyTorch to a compiled step",

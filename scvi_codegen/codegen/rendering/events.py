@@ -53,10 +53,10 @@ from scvi_codegen.systems.formulas.array_statements import (
     parse_constraint,
 )
 from scvi_codegen.systems.formulas.arrays import ArrayTerm, parse_coordinate, parse_sums
-from scvi_codegen.systems.formulas.expressions import evaluated, unsupported_part
+from scvi_codegen.systems.formulas.expressions import evaluated, parts_of_type, unsupported_part
 from scvi_codegen.systems.formulas.grammar import named_tables
 from scvi_codegen.systems.formulas.indices import Access, Array, Loop, Size
-from scvi_codegen.systems.formulas.kinks import rint, unit_step
+from scvi_codegen.systems.formulas.kinks import rint, steps_on_sides, unit_step
 from scvi_codegen.systems.formulas.rotations import RotationNames, entries_in_formulas
 from scvi_codegen.systems.formulas.symbols import DOT, TIME, identifier, input_formulas, symbol
 from scvi_codegen.systems.formulas.table import functions_of
@@ -127,7 +127,12 @@ class EventFormulas:
         self.p = [sympy.Dummy() if symbol(name) in taken else symbol(name) for name in interface.momenta]
         self.multipliers = [symbol(name) for name in multiplier_names(interface) if symbol(name) not in taken]
         self.functions = [self._read(event.function, f"event function '{event.function}'") for event in self.events]
-        for event, function in zip(self.events, self.functions, strict=True):
+        found = [*zip(self.events, self.functions, strict=True)]
+        sides = {u: symbol(event.mode) for event, u in found if isinstance(event, Kink)}
+        for k, (event, function) in enumerate(found):
+            if isinstance(event, Transition):  # with coefficients of the mode of a step
+                steps = parts_of_type(unit_step, function)
+                self.functions[k] = function.xreplace(steps_on_sides(steps, sides))
             if interface.variables and event.restitution is not None:
                 raise EventError(f"'{interface.system}' is a first-order system without impacts: write them in then=")
             moving = sorted(free.name for free in function.free_symbols & {*self.p, *self.v, *self.multipliers})

@@ -21,6 +21,8 @@ from scvi_codegen.systems.event import Transition
 
 ROUNDING = 1e-9
 """Part of their size below which rates and impulses count as 0."""
+FAST = 1e3
+"""Speed relative to that of a slip whose direction is kept (contacts.h)."""
 SAME_IMPULSE, SAME_MOMENTUM = 1e-6, 1e-13
 """Differences from the run relative to an impulse or a slip, and to momenta, up to which they are the same."""
 
@@ -178,7 +180,7 @@ def kept_direction(stepper: Integrator, k: int, state: Array, t: float, paramete
     """
     contacts, named = stepper.interface.contacts, stepper.parameters_by_name(parameters)
     values = np.array([named[name] for name in contacts[k].directions])
-    ahead, speed = values[3:], float(np.sqrt(np.linalg.norm(values[1:3])))
+    ahead, speed = values[3:], float(np.sqrt(np.linalg.norm(values[1:3]))) / FAST
     closed = [(j, item) for j, item in enumerate(contacts) if item.closed is None or named[item.closed]]
     slides = [j for j, item in closed if item.slips and not any(named[name] for name in item.sticks)]
     directions = {j: np.array([named[contacts[j].directions[0]]]) for j in slides} | {k: ahead}

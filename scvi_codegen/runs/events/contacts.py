@@ -53,11 +53,11 @@ def check_forward(run: Any) -> None:
 
 
 def warn_of_choices(watch: Any) -> None:
-    """Warn if several modes were consistent at a transition, and if the restitution of an impact was replaced."""
-    if getattr(watch, "ambiguous", 0) > 1:
+    """Warn if several motions were possible at a transition, and if the restitution of an impact was replaced."""
+    if getattr(watch, "ambiguous", 0):
         warn(
-            f"up to {watch.ambiguous} modes of the contacts were consistent at a transition; the run continued in "
-            "those that stick most",
+            "a transition has several motions, with a contact open and with it closed: G M^-1 (G - mu d T)^T <= 0 "
+            "(Painleve's paradox); reduce friction, or change the geometry",
             EventWarning,
         )
     if law := getattr(watch, "law", 0):

@@ -142,10 +142,10 @@ class _Binding:
                 f"'{self.system.name}' has {len(elements)} contacts, of at most {MOST_CONTACTS}: leave some out"
             )
         for number, item in enumerate(elements, 1):
-            named = _mapped(item, partial(self._read, item))
+            named = mapped(item, partial(self._read, item))
             if getattr(named, "of", ()):
                 named = replace(named, gap=self._distance(item, named.gap, named.of), of=())
-            expressions.append(_mapped(named, lambda formula, _: self.turning.in_coordinates(formula)))
+            expressions.append(mapped(named, lambda formula, _: self.turning.in_coordinates(formula)))
             rows.append(self._add(number, named))
         reduced = self.system.reduced
         system = replace(
@@ -184,7 +184,11 @@ class _Binding:
         if not arrays or not isinstance(formula, str):
             return [item]
         sizes = {name: size for name, size in indices.items() if isinstance(size, int)}
-        known = *arrays, *(Array(array.name + DOT, array.axes) for array in arrays), Array("", tuple(map(Size, sizes)))
+        entries = (
+            *arrays,
+            *(Array(array.name + DOT, array.axes) for array in arrays),
+            Array("", tuple(map(Size, sizes))),
+        )
         rules = EntryRules(sizes, {}, {array.name: entry_names(array, {}) for array in arrays})
 
         def formulas(value: Any) -> Iterable[Any]:
@@ -192,7 +196,7 @@ class _Binding:
                 return zip(*map(formulas, value), strict=True)
             if not isinstance(value, str):
                 return repeat(value)
-            term = parse_constraint(value if value == first else value + loops, known, self.names | self.functions)
+            term = parse_constraint(value if value == first else value + loops, entries, self.names | self.functions)
             return [term.formula.xreplace(rule) for _, rule in rules.rules(term)]
 
         fields = {name: getattr(item, name) for name in item.__dataclass_fields__ if name != "name"}
@@ -321,7 +325,7 @@ class _Binding:
         return Slipping(tuple(slides * x / length for x in vector), slides * ahead + 1 - slides, names)
 
 
-def _mapped(item: ContactLike, function: Callable[[Any, str], Any]) -> Any:
+def mapped(item: ContactLike, function: Callable[[Any, str], Any]) -> Any:
     """Return a contact with the values of a function of each of its formulas and the role of this."""
 
     def of(formulas: Any, role: str) -> Any:

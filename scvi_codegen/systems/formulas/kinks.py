@@ -8,7 +8,7 @@ s is the unit step, 1 at 0, so ``sign(0)`` is 1. Each s(u) has the switching fun
 same. SymPy's functions of these names become these. Both values of ``where`` are computed, so both must be defined.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache, reduce
 from typing import Any
 
@@ -100,6 +100,12 @@ def switching_function(u: Expr) -> tuple[Expr, int]:
         else:
             factors.append(factor.primitive()[1])
     return Mul(*factors), sign
+
+
+def steps_on_sides(steps: Iterable[Expr], modes: Mapping[Expr, Expr]) -> dict[Expr, Expr]:
+    """Return unit_step(u + mode) of the steps unit_step(u) whose switching functions have a mode, on one side of u."""
+    found = [(step, *switching_function(step.args[0])) for step in steps]
+    return {step: unit_step(step.args[0] + sign * modes[u]) for step, u, sign in found if u in modes}
 
 
 def wrap(x: Expr, length: Expr) -> Expr:

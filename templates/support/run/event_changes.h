@@ -301,7 +301,7 @@ static int shorten_part(const event_step *step, const event_sample *left, event_
     real *part)
 {
   const real whole = *part;
-  real longest;
+  real longest = fabs(whole);
   int status = follow_slips(step, left, &longest);
   if (longest < fabs(whole))
     *part = copysign(longest, whole);
@@ -331,7 +331,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
   for (int changes = 0; status == OK; changes++) {
     event_sample at = {.q = states + 4 * M, .p = states + 5 * M};
     real part = length;
-    int acts = 0, far = 0, ends, cut = 0, turned = 0;
+    int acts = 0, far = 0, ends, cut = 0;
 #ifdef CONTACTS_IN_SPACE
     if (!adaptive)
       status = shorten_part(step, &left, &right, run->t, changes, &part);
@@ -384,10 +384,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       copy_state(at.q, at.p, right.q, right.p);
     } else if (!acts && !step->watch->ended) {
       step->watch->started = 1;
-#ifdef CONTACTS_IN_SPACE
-      status = turn_slips(step, &right, &turned);
-#endif
-      if (changes > 0 || turned)
+      if (changes > 0)
         set_run(run, run->t, &right);
       if (status == OK)
         status = check_walls(step, &left, &right);
@@ -415,10 +412,6 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
 #ifdef EVENT_CONTACTS
     if (status == OK && !cut)
       status = change_contacts(step, group, &at);
-#endif
-#ifdef CONTACTS_IN_SPACE
-    if (status == OK)
-      status = turn_slips(step, &at, &turned);
 #endif
     ends = fabs(length) <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->whole);
     if (status == OK)
@@ -594,7 +587,10 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
 #endif
 #ifdef CONTACTS_IN_SPACE
     const event_sample now = {.t = run->t, .q = run->q, .p = run->p};
-    real longest = INFINITY;
+    real longest = fabs(run->h);
+#if EVENTS_CONTROLLED
+    longest = control ? exp2((real)run->grid_level / 4.0) : longest; /* the size that the controller has found */
+#endif
     if (status == OK)
       status = follow_slips(&step, &now, &longest);
 #endif

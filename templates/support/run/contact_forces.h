@@ -1,0 +1,204 @@
+#include "contact_rows.h"
+
+/* Forces of contacts in their modes: W f = -b for the imposed rows of r'' = b + W f (contacts.h). */
+#define CONTACT_ROUNDING 1e-10 /* part of their size below which gaps, rates and forces count as 0 */
+#define CONTACT_DEPENDENT 1e-12 /* part of a column below which a pivot counts as 0 */
+
+/* Reduces the rows (A, b) by elimination with the pivots on the diagonal that are independent of those before but for
+ * rounding, so that their rows and columns are. Returns the number of others. */
+static int eliminate(real (*line)[CONTACT_ROWS + 1], int count, int *independent)
+{
+  int others = 0;
+  for (int i = 0; i < count; i++) {
+    real size = 0.0;
+    for (int r = 0; r < count; r++)
+      size = fmax(size, fabs(line[r][i]));
+    independent[i] = fabs(line[i][i]) > CONTACT_DEPENDENT * size;
+    others += !independent[i];
+    for (int r = 0; r < count && independent[i]; r++) {
+      const real factor = line[r][i] / line[i][i];
+      for (int j = i; r != i && j <= count; j++)
+        line[r][j] -= factor * line[i][j];
+    }
+  }
+  return others;
+}
+
+/* Moves a solution of dependent columns along their null vectors to that of the least sum of weight x^2. */
+static void reduce_norm(real (*line)[CONTACT_ROWS + 1], int count, const int *independent, const real *weight, real *x)
+{
+  real null[CONTACT_ROWS][CONTACT_ROWS];
+  int found = 0;
+  for (int d = 0; d < count; d++) {
+    real *const n = null[found], norm = 0.0, along = 0.0;
+    if (independent[d])
+      continue;
+    for (int i = 0; i < count; i++)
+      n[i] = independent[i] ? -line[i][d] / line[i][i] : i == d;
+    for (int e = 0; e < found; e++) {
+      real part = 0.0;
+      for (int i = 0; i < count; i++)
+        part += weight[i] * n[i] * null[e][i];
+      for (int i = 0; i < count; i++)
+        n[i] -= part * null[e][i];
+    }
+    for (int i = 0; i < count; i++) {
+      norm += weight[i] * n[i] * n[i];
+      along += weight[i] * n[i] * x[i];
+    }
+    for (int i = 0; i < count; i++) {
+      x[i] -= along / norm * n[i];
+      n[i] /= sqrt(norm);
+    }
+    found++;
+  }
+}
+
+/* Rate of a row, right + W f. */
+static real rate_after(const contact_terms *of, const real *right, const real *force, int row)
+{
+  real rate = right[row];
+  for (int j = 0; j < CONTACT_ROWS; j++)
+    rate += of->W[row * CONTACT_ROWS + j] * force[j];
+  return rate;
+}
+
+/* Largest friction force or impulse of a contact, by its coefficient of sliding (0) or sticking (1). */
+static real friction_limit(const contact_terms *of, int k, int which, const real *force)
+{
+  return of->coefficient[3 * k + which] * (CONTACTS[k].normal < 0 ? 1.0 : force[CONTACTS[k].normal]);
+}
+
+/* Solves for the forces of the rows in given modes with after = right + W f = 0 in imposed rows, those of least norm,
+ * friction relative to its limit, if these are dependent; returns 0 if they contradict each other, or such forces
+ * differ in the rates. If `imposed` is not NULL, it becomes 1 for rows to impose, which are independent. */
+static int solve_contacts(const contact_terms *of, const contact_mode *mode, const real *right, real *force,
+    real *after, int *imposed)
+{
+  real matrix[CONTACT_ROWS][CONTACT_ROWS + 1], column[CONTACT_ROWS][CONTACT_ROWS]; /* forces by unknowns */
+  real x[CONTACT_ROWS], least[CONTACT_ROWS], still[CONTACT_ROWS] = {0.0}, moved[CONTACT_ROWS] = {0.0};
+  real weight[CONTACT_ROWS], load = DBL_MIN;
+  int row[CONTACT_ROWS], independent[CONTACT_ROWS], owner[CONTACT_ROWS], count = 0, dependent;
+  memset(force, 0, BYTES(CONTACT_ROWS));
+  memset(column, 0, sizeof column);
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const contact_places *at = CONTACTS + k;
+    real *const sliding = at->normal < 0 ? force : column[count];
+    for (int i = 0; i < at->slips; i++)
+      sliding[at->tangential + i] = -of->coefficient[3 * k] * mode[k].direction[i];
+    if (at->normal >= 0 && mode[k].closed) {
+      row[count] = at->normal;
+      owner[count] = -1;
+      column[count++][at->normal] = 1.0;
+    }
+    for (int i = 0; i < at->slips; i++)
+      if (mode[k].sticks >> i & 1) {
+        row[count] = at->tangential + i;
+        owner[count] = k;
+        column[count++][at->tangential + i] = 1.0;
+      }
+  }
+  for (int i = 0; i < count; i++) {
+    const real *W = of->W + row[i] * CONTACT_ROWS;
+    for (int j = 0; j < count; j++)
+      matrix[i][j] = 0.0;
+    for (int r = 0; r < CONTACT_ROWS; r++)
+      for (int j = 0; j < count; j++)
+        matrix[i][j] += W[r] * column[j][r];
+    matrix[i][count] = -rate_after(of, right, force, row[i]);
+  }
+  dependent = eliminate(matrix, count, independent);
+  for (int i = 0; i < count; i++) {
+    least[i] = x[i] = independent[i] ? matrix[i][count] / matrix[i][i] : 0.0;
+    weight[i] = 1.0;
+  }
+  for (int pass = 0; pass < 2 && dependent; pass++) {
+    reduce_norm(matrix, count, independent, weight, least);
+    for (int i = 0; i < count; i++) {
+      moved[row[i]] = least[i];
+      load = fmax(load, fabs(least[i]));
+    }
+    for (int i = 0; i < count; i++) {
+      const real limit = owner[i] < 0 ? load : friction_limit(of, owner[i], 1, moved);
+      weight[i] = 1.0 / fmax(limit, CONTACT_SLOW * load);
+    }
+  }
+  memset(moved, 0, sizeof moved);
+  for (int i = 0; i < count; i++)
+    for (int r = 0; r < CONTACT_ROWS; r++) {
+      force[r] += column[i][r] * least[i];
+      moved[r] += column[i][r] * (least[i] - x[i]);
+    }
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    after[r] = rate_after(of, right, force, r);
+  for (int i = 0; i < count && imposed; i++)
+    imposed[row[i]] = independent[i];
+  for (int r = 0; r < CONTACT_ROWS && dependent; r++) {
+    real size = fabs(right[r]);
+    for (int j = 0; j < CONTACT_ROWS; j++)
+      size += fabs(of->W[r * CONTACT_ROWS + j] * force[j]);
+    if (fabs(rate_after(of, still, moved, r)) > CONTACT_ROUNDING * size)
+      return 0;
+    for (int i = 0; i < count; i++)
+      if (row[i] == r && fabs(after[r]) > CONTACT_ROUNDING * size)
+        return 0;
+  }
+  return 1;
+}
+
+/* Present modes, with the directions of slips at a state, in space of (ahead.w) w + start. */
+static void modes_at(const contact_terms *of, const real *modes, contact_mode *mode)
+{
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const real *const w = of->rate + CONTACTS[k].tangential, *const start = modes + CONTACTS[k].direction + 1;
+    mode[k] = mode_of(modes, k);
+    if (CONTACTS[k].slips < 2 || start[-1] == 0.0 || mode[k].held)
+      continue;
+    const real along = start[2] * w[0] + start[3] * w[1], x[2] = {along * w[0] + start[0], along * w[1] + start[1]};
+    for (int i = 0; i < 2 && length_of(x, 2) > 0.0; i++)
+      mode[k].direction[i] = x[i] / length_of(x, 2);
+  }
+}
+
+/* Forces of the rows in the modes among parameters, 0 if they are not defined. */
+static int forces_at(real t, const real *q, const real *p, const real *parameters, contact_mode *mode, real *force,
+    real *workspace)
+{
+  contact_terms of;
+  real modes[EVENT_MODES], after[CONTACT_ROWS];
+  const int status = rows_at(t, q, p, parameters, &of, workspace);
+  for (int k = 0; k < EVENT_MODES; k++)
+    modes[k] = parameters[MODE_PLACE[k]];
+  modes_at(&of, modes, mode);
+  if (status != OK || !solve_contacts(&of, mode, of.second, force, after, NULL))
+    memset(force, 0, BYTES(CONTACT_ROWS));
+  return status;
+}
+
+int NAME(contact_forces)(real t, const real *q, const real *p, const real *parameters, real *force, real *workspace)
+{
+  contact_mode mode[EVENT_CONTACTS];
+  return forces_at(t, q, p, parameters, mode, force, workspace);
+}
+
+/* Multipliers and parameters for the functions of transitions: of dependent contacts the multipliers of least norm, and
+ * the masks of all that are closed or stick. */
+static int distribute(real t, const real *q, const real *p, const real *parameters, real *multipliers, real *shown,
+    real *workspace)
+{
+  contact_mode mode[EVENT_CONTACTS];
+  int any = 0, status;
+  memcpy(shown, parameters, BYTES(PARAMETERS));
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    any |= parameters[MODE_PLACE[CONTACTS[k].held]] > CONTACT_HELD;
+  status = any ? forces_at(t, q, p, parameters, mode, multipliers, workspace) : OK;
+  for (int k = 0; k < EVENT_CONTACTS && any; k++) {
+    const contact_places *at = CONTACTS + k;
+    if (at->closed >= 0)
+      shown[MODE_PLACE[at->closed]] = mode[k].closed;
+    for (int i = 0; i < at->slips; i++)
+      shown[MODE_PLACE[at->sticks + i]] = mode[k].sticks >> i & 1;
+    shown[MODE_PLACE[at->held]] = shown[MODE_PLACE[at->held]] != 0.0;
+  }
+  return status;
+}

@@ -1,0 +1,159 @@
+#include "contact_modes.h"
+
+/* Impacts of contacts with friction (C. Glocker & F. Pfeiffer, Nonlinear Dyn. 7, 1995). */
+enum {
+  CONTACT_IMPACTS = 100, /* of a contact in a corner */
+  CONTACT_SECANTS = 50 /* for the rate after a restitution */
+};
+
+/* Laws of impact, each where those before create kinetic energy: restitution of rates (Newton), of impulses (Poisson),
+ * none. */
+enum {
+  CONTACT_NEWTON,
+  CONTACT_POISSON,
+  CONTACT_PLASTIC
+};
+
+#define CONTACT_LOWEST 16.0 /* roundings of a gap below which a rebound ends */
+#define CONTACT_RESIDUALS 16.0 /* residuals of its located zero below which a rebound ends */
+#define CONTACT_GAIN 1e-9 /* part of the work of an impact by which energy may grow */
+
+/* Impulses of a contact that approaches with the given rates, and of those that are closed, in consistent modes; 0 if
+ * there are none. */
+static int impulses_of(const contact_terms *of, int contact, const int *closed, real restitution, const real *rate,
+    real *impulse)
+{
+  contact_problem in = {.of = of};
+  contact_mode mode[EVENT_CONTACTS];
+  real right[CONTACT_ROWS], after[CONTACT_ROWS];
+  memcpy(right, rate, sizeof right);
+  right[CONTACTS[contact].normal] *= 1.0 + restitution;
+  in.right = right;
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    in.scale = fmax(in.scale, of->speed[r]);
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    in.is_free[k] = CONTACTS[k].normal < 0 || !(k == contact || closed[k]);
+    in.rests[k] = !in.is_free[k] && CONTACTS[k].slips > 0;
+    in.role[k] = in.is_free[k] ? CONTACT_IS_OPEN : in.rests[k] ? CONTACT_STICKS
+                                                               : CONTACT_SLIPS;
+  }
+  memset(impulse, 0, BYTES(CONTACT_ROWS));
+  return relax_modes(&in, impulse, mode) && is_consistent(&in, mode, impulse, after);
+}
+
+/* Adds to the impulses of a compression those of a restitution, with e times its normal impulse in the friction cone
+ * (C. Glocker & F. Pfeiffer, Nonlinear Dyn. 7, 1995): as those of a contact that approaches with a rate, which follows
+ * by secants. */
+static int restitute(const contact_terms *of, int contact, const int *closed, const real *rate, real *impulse)
+{
+  const int normal = CONTACTS[contact].normal;
+  const real goal = of->coefficient[3 * contact + 2] * impulse[normal];
+  real after[CONTACT_ROWS], added[CONTACT_ROWS] = {0.0}, low = 0.0, of_low = 0.0;
+  real high = -of->coefficient[3 * contact + 2] * rate[normal];
+  int exists = 1, differs = goal > 0.0;
+  for (int r = 0; r < CONTACT_ROWS; r++) {
+    after[r] = rate[r];
+    for (int j = 0; j < CONTACT_ROWS; j++)
+      after[r] += of->W[r * CONTACT_ROWS + j] * impulse[j];
+  }
+  for (int k = 0; exists && differs && k < CONTACT_SECANTS; k++) {
+    after[normal] = -high;
+    exists = impulses_of(of, contact, closed, 0.0, after, added);
+    const real slope = (added[normal] - of_low) / (high - low);
+    low = high;
+    of_low = added[normal];
+    differs = fabs(of_low - goal) > 4.0 * DBL_EPSILON * goal;
+    high += (goal - of_low) / slope;
+  }
+  for (int r = 0; exists && goal > 0.0 && r < CONTACT_ROWS; r++)
+    impulse[r] += added[r];
+  return exists && !differs;
+}
+
+/* Impulses of the rows of contacts that approach, one after another, until none does, by a law of restitution, in the
+ * friction cone. Closed contacts take part with e = 0. */
+static int find_impulses(const event_step *step, const contact_terms *of, const int *approaches, const int *closed,
+    int law, real *total)
+{
+  memset(total, 0, BYTES(CONTACT_ROWS));
+  for (int round = 0; round < CONTACT_IMPACTS * EVENT_CONTACTS; round++) {
+    real rate[CONTACT_ROWS], impulse[CONTACT_ROWS];
+    int meets = -1;
+    for (int r = 0; r < CONTACT_ROWS; r++)
+      rate[r] = rate_after(of, of->rate, total, r);
+    for (int k = EVENT_CONTACTS - 1; k >= 0; k--)
+      if (approaches[k] && rate[CONTACTS[k].normal] < -CONTACT_ROUNDING * of->speed[CONTACTS[k].normal])
+        meets = k;
+    if (meets < 0)
+      return OK;
+    if (!impulses_of(of, meets, closed, law == CONTACT_NEWTON ? of->coefficient[3 * meets + 2] : 0.0, rate, impulse) ||
+        (law == CONTACT_POISSON && !restitute(of, meets, closed, rate, impulse)))
+      return refuse(step, CONTACT_WITHOUT_IMPULSE, meets, 0.0);
+    for (int r = 0; r < CONTACT_ROWS; r++)
+      total[r] += impulse[r];
+  }
+  return refuse(step, CONTACT_IN_CORNER, -1, 0.0);
+}
+
+/* Kinetic energy that impulses create, relative to the sizes of its terms. */
+static real gain_of(const contact_terms *of, const real *impulse)
+{
+  real gain = 0.0, size = 0.0;
+  for (int r = 0; r < CONTACT_ROWS; r++) {
+    gain += 0.5 * impulse[r] * (of->rate[r] + rate_after(of, of->rate, impulse, r));
+    size += impulse[r] * of->rate[r];
+  }
+  return size != 0.0 ? gain / fabs(size) : 0.0;
+}
+
+/* Whether the height w^2 / (2 g'') of a rebound is of the size of rounding, or of the residual of the located zero; of
+ * a gap that moves, of that of the search, which sees no rounding of time. */
+static int is_low(const event_step *step, const contact_terms *before, const contact_terms *of, int k)
+{
+  const int row = CONTACTS[k].normal;
+  real lowest = CONTACT_LOWEST * of->rounding[row] + CONTACT_RESIDUALS * fabs(before->value[row]);
+  for (int i = 0; i < TRANSITIONS && of->drift[row] > CONTACT_ROUNDING * of->speed[row]; i++)
+    if (TRANSITION[i][0] == k && TRANSITION[i][1] == CONTACT_CLOSES)
+      lowest += 4.0 * step->watch->history[EVENT_FIRST[FIRST_TRANSITION + i]].slack;
+  return of->rate[row] * of->rate[row] <= -2.0 * of->second[row] * lowest;
+}
+
+/* Impulses of all contacts that meet at a state, by the first law that creates no kinetic energy, and which contacts
+ * touch and rest afterwards. */
+static int collide(const event_step *step, event_sample *at, contact_terms *of, const int *closed, contact_change *now)
+{
+  const contact_terms before = *of;
+  real impulse[CONTACT_ROWS];
+  int approaches[EVENT_CONTACTS], law = CONTACT_NEWTON, status;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int normal = CONTACTS[k].normal;
+    approaches[k] = normal >= 0 && !of->absent[k] && !now->leaves[k] &&
+        (now->closes[k] || (!closed[k] && fabs(of->value[normal]) <= CONTACT_ROUNDING * of->size[normal]));
+  }
+  status = find_impulses(step, of, approaches, closed, law, impulse);
+  while (status == OK ? law < CONTACT_PLASTIC && gain_of(of, impulse) > CONTACT_GAIN : law == CONTACT_POISSON) {
+    step->watch->refusal = 0;
+    status = find_impulses(step, of, approaches, closed, ++law, impulse);
+  }
+  step->watch->law = law > step->watch->law ? law : step->watch->law;
+  for (int r = 0; status == OK && r < CONTACT_ROWS; r++)
+    for (int i = 0; i < M; i++)
+      at->p[i] += of->G[r * M + i] * impulse[r];
+  if (status == OK)
+    status = terms_at(step, at, of);
+  for (int k = 0; status == OK && k < EVENT_CONTACTS; k++) {
+    const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
+    if (slips > 0)
+      now->rests[k] = !now->begins[k] && length_of(of->rate + slip, slips) <= CONTACT_ROUNDING * before.speed[slip];
+    if (normal < 0 || !(approaches[k] || closed[k]))
+      continue;
+    if (impulse[normal] > 0.0 && (closed[k] || law == CONTACT_PLASTIC || before.coefficient[3 * k + 2] == 0.0))
+      now->touches[k] = 1;
+    if (of->rate[normal] > CONTACT_ROUNDING * before.speed[normal])
+      now->touches[k] = 0;
+    if (approaches[k] && (step->watch->accumulates[k] || is_low(step, &before, of, k)))
+      now->touches[k] = 1;
+    step->watch->accumulates[k] = 0;
+  }
+  return status;
+}

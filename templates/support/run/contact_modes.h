@@ -1,0 +1,298 @@
+#include "contact_forces.h"
+
+/* Choice of modes: forces in the friction cones, by projection, propose them; the conditions of contacts.h decide. */
+enum {
+  CONTACT_TRIALS = 8, /* of a relaxation, each of twice as many sweeps */
+  CONTACT_SWEEPS = 50 /* over the forces of contacts */
+};
+
+#define CONTACT_ASIDE 1e-9 /* largest angle between friction and slip in space */
+#define CONTACT_COMPLIANCE 1e-3 /* of friction at the start of a relaxation */
+
+/* Modes among which those of contacts are chosen, and their conditions on the rates right + W f of the rows: second
+ * rates for forces, rates for impulses. is_free: open by its gap; rests: its slip is 0; begins: 1 or -1 if it slips
+ * after it stuck; limit: 1 if static friction is its limit. */
+typedef struct {
+  const contact_terms *of;
+  const real *right;
+  real scale; /* of the rates */
+  int is_strict; /* slips that begin have a rate */
+  int is_relaxed; /* contacts at their limit do not stick */
+  int is_free[EVENT_CONTACTS], rests[EVENT_CONTACTS], begins[EVENT_CONTACTS], limit[EVENT_CONTACTS];
+  contact_mode role[EVENT_CONTACTS]; /* whether it may be closed, and its friction any (sticks) or in its direction */
+} contact_problem;
+
+/* Sets the modes of a contact that its gap and its slip at a state allow. */
+static void allow_modes(contact_problem *in, int k, const contact_change *now)
+{
+  const contact_terms *const of = in->of;
+  const contact_places *at = CONTACTS + k;
+  const real *const w = of->rate + at->tangential, speed = at->slips > 0 ? of->speed[at->tangential] : 0.0;
+  in->is_free[k] = of->absent[k] || now->leaves[k] ||
+      (at->normal >= 0 && !now->touches[k] &&
+          (of->value[at->normal] > CONTACT_ROUNDING * of->size[at->normal] ||
+              of->rate[at->normal] > CONTACT_ROUNDING * of->speed[at->normal]));
+  in->role[k] = in->is_free[k] ? CONTACT_IS_OPEN : CONTACT_SLIPS;
+  if (in->is_free[k] || at->slips == 0)
+    return;
+  in->begins[k] = now->begins[k];
+  in->rests[k] = !now->begins[k] && (now->rests[k] || length_of(w, at->slips) <= CONTACT_ROUNDING * speed);
+  in->limit[k] = in->rests[k] || in->begins[k];
+  if (in->limit[k])
+    in->role[k] = CONTACT_STICKS;
+  for (int i = 0; i < at->slips && !in->limit[k]; i++)
+    in->role[k].direction[i] = w[i] / length_of(w, at->slips);
+}
+
+/* Whether modes satisfy the conditions; their forces, and the rates with them. */
+static int is_consistent(const contact_problem *in, const contact_mode *mode, real *force, real *after)
+{
+  const contact_terms *const of = in->of;
+  real small = CONTACT_ROUNDING * in->scale;
+  if (!solve_contacts(of, mode, in->right, force, after, NULL))
+    return 0;
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    small = fmax(small, CONTACT_ROUNDING * fmax(fabs(in->right[r]), fabs(after[r])));
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
+    real begin = 0.0, moves = 0.0, aside;
+    if (in->is_free[k])
+      continue;
+    if (normal >= 0 && mode[k].closed && !(force[normal] * of->W[normal * (CONTACT_ROWS + 1)] > small))
+      return 0;
+    if (normal >= 0 && !mode[k].closed && after[normal] < -small)
+      return 0;
+    if (!mode[k].closed || slips == 0 || !(in->rests[k] || in->begins[k]))
+      continue;
+    for (int i = 0; i < slips; i++) {
+      begin += mode[k].direction[i] * after[slip + i];
+      moves = fmax(moves, fabs(after[slip + i]));
+    }
+    aside = slips == 2 ? mode[k].direction[0] * after[slip + 1] - mode[k].direction[1] * after[slip] : 0.0;
+    if ((mode[k].sticks || mode[k].held) && /* the friction of one that is held is at most at its limit */
+        (length_of(force + slip, slips) - friction_limit(of, k, in->limit[k], force)) *
+                of->W[slip * (CONTACT_ROWS + 1)] >
+            (in->is_relaxed && mode[k].sticks ? -small : small))
+      return 0;
+    if (mode[k].held ? moves > small
+                     : !mode[k].sticks &&
+                (!(begin > (in->is_strict && !in->begins[k] ? small : -small)) ||
+                    fabs(aside) > fmax(small, CONTACT_ASIDE * begin)))
+      return 0;
+  }
+  return 1;
+}
+
+/* Number of independent rows that a mode imposes. */
+static int rank_of(const contact_problem *in, const contact_mode *mode)
+{
+  real force[CONTACT_ROWS], after[CONTACT_ROWS];
+  int imposed[CONTACT_ROWS] = {0}, rank = 0;
+  solve_contacts(in->of, mode, in->right, force, after, imposed);
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    rank += imposed[r];
+  return rank;
+}
+
+/* Marks the contacts whose rows the imposed ones determine; returns whether one of them is closed. */
+static int hold_contacts(const contact_problem *in, contact_mode *mode)
+{
+  const int rank = rank_of(in, mode);
+  int any = 0;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const contact_mode now = mode[k];
+    const int slips = CONTACTS[k].slips > 0 && !now.sticks && (in->rests[k] || in->begins[k]);
+    mode[k].held = 0;
+    if (now.closed ? !slips : in->is_free[k])
+      continue;
+    mode[k] = now.closed ? CONTACT_STICKS : CONTACT_SLIPS;
+    const int held = rank_of(in, mode) == rank;
+    mode[k] = now;
+    mode[k].held = held;
+    any |= held && now.closed;
+  }
+  return any;
+}
+
+/* Forces by projection onto the friction cones, contact by contact (M. Jean, Comput. Methods Appl. Mech. Eng. 177,
+ * 1999), from those given; role: whether a contact is closed, and its friction any (sticks) or in its direction.
+ * Compliance distributes friction in proportion to its limits. */
+static void relax(const contact_problem *in, real compliance, int sweeps, real *force)
+{
+  const contact_terms *const of = in->of;
+  const contact_mode *const role = in->role;
+  real strongest = 0.0;
+  for (; sweeps > 0; sweeps--)
+    for (int k = 0; k < EVENT_CONTACTS; k++) {
+      const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
+      real diagonal = normal < 0 ? 0.0 : of->W[normal * (CONTACT_ROWS + 1)], oblique = diagonal, trace = 0.0;
+      real bound, size, friction[2] = {0.0, 0.0};
+      for (int i = 0; i < slips; i++) {
+        trace += of->W[(slip + i) * (CONTACT_ROWS + 1)];
+        if (normal >= 0 && !role[k].sticks)
+          oblique -= of->coefficient[3 * k] * role[k].direction[i] * of->W[normal * CONTACT_ROWS + slip + i];
+      }
+      if (normal >= 0)
+        force[normal] -= rate_after(of, in->right, force, normal) / (oblique > 0.0 ? oblique : diagonal);
+      if (normal >= 0 && !(role[k].closed && force[normal] > 0.0))
+        force[normal] = 0.0;
+      bound = role[k].closed ? friction_limit(of, k, in->limit[k], force) : 0.0;
+      strongest = fmax(strongest, bound);
+      const real kept = 1.0 - fmin(compliance * strongest, bound) / fmax(bound, DBL_MIN);
+      for (int i = 0; i < slips; i++)
+        friction[i] = role[k].sticks
+            ? kept * force[slip + i] - rate_after(of, in->right, force, slip + i) / trace
+            : -bound * role[k].direction[i];
+      size = length_of(friction, slips);
+      for (int i = 0; i < slips; i++)
+        force[slip + i] = friction[i] * (role[k].sticks && size > bound ? bound / size : 1.0);
+    }
+}
+
+/* Modes of forces in the friction cones; those below their limits stick. Where others determine a slip its friction is
+ * kept relative to the normal force. Returns whether a limit changed, that of a slip that begins. */
+static int modes_of_forces(contact_problem *in, int trial, const real *force, contact_mode *mode)
+{
+  const contact_terms *const of = in->of;
+  const contact_mode *const role = in->role;
+  real small = in->scale;
+  int changed = 0;
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    small = fmax(small, fabs(in->right[r]));
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int normal = CONTACTS[k].normal;
+    const real tau = length_of(force + CONTACTS[k].tangential, CONTACTS[k].slips);
+    mode[k] = role[k];
+    if (normal >= 0 && force[normal] * of->W[normal * (CONTACT_ROWS + 1)] <= CONTACT_ROUNDING * small)
+      mode[k] = CONTACT_IS_OPEN;
+    if ((trial == 0 && in->begins[k]) ||
+        (mode[k].sticks && tau >= (1.0 - CONTACT_ROUNDING) * friction_limit(of, k, in->limit[k], force)))
+      mode[k].sticks = 0;
+  }
+  hold_contacts(in, mode);
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int slip = CONTACTS[k].tangential;
+    const int slips = mode[k].closed && !mode[k].sticks && role[k].sticks ? CONTACTS[k].slips : 0;
+    const real length = length_of(force + slip, slips), limit = friction_limit(of, k, 0, force);
+    for (int i = 0; i < slips && length > 0.0 && limit > 0.0; i++)
+      mode[k].direction[i] = -force[slip + i] / length * (mode[k].held ? length / limit : 1.0);
+    if (slips > 0 && !mode[k].held && in->limit[k]) {
+      in->limit[k] = 0;
+      changed |= of->coefficient[3 * k] != of->coefficient[3 * k + 1];
+    }
+  }
+  return changed;
+}
+
+/* Finds consistent modes: all contacts that meet closed, all slips at rest sticking; else by relaxation of the forces,
+ * from the present ones, then from 0, with friction in proportion to its limits. If slips without a rate are all that
+ * is consistent, these begin. Returns 0 if none is found. */
+static int relax_modes(contact_problem *in, real *force, contact_mode *best)
+{
+  real exact[CONTACT_ROWS], after[CONTACT_ROWS];
+  contact_mode mode[EVENT_CONTACTS];
+  int limit[EVENT_CONTACTS], found = 0, begins = 0;
+  memcpy(best, in->role, sizeof mode);
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    begins |= in->begins[k];
+  if (!begins && !hold_contacts(in, best) && is_consistent(in, best, exact, after))
+    return 1;
+  in->is_relaxed = 1;
+  memcpy(limit, in->limit, sizeof limit);
+  for (int trial = 0; trial < CONTACT_TRIALS; trial++) {
+    const int sweeps = CONTACT_SWEEPS << trial;
+    memcpy(in->limit, limit, sizeof limit);
+    if (trial > 0)
+      relax(in, CONTACT_COMPLIANCE, sweeps, force);
+    for (int changes = 0, changed = 1; changed && changes <= EVENT_CONTACTS; changes++) {
+      relax(in, 0.0, sweeps, force);
+      changed = modes_of_forces(in, trial, force, mode);
+    }
+    for (in->is_strict = 1; in->is_strict >= found; in->is_strict--)
+      if (is_consistent(in, mode, exact, after)) {
+        memcpy(best, mode, sizeof mode);
+        found = 1;
+        if (in->is_strict)
+          return 1;
+      }
+    if (trial == 0)
+      memset(force, 0, BYTES(CONTACT_ROWS));
+  }
+  return found;
+}
+
+/* Notes why no motion is possible; contact k, or all. */
+static int refuse(const event_step *step, int reason, int k, real value)
+{
+  step->watch->refusal = reason;
+  step->watch->refused = k + 1;
+  step->watch->behind = value;
+  return NOT_CONVERGED;
+}
+
+/* The first contact of Painleve's paradox, G M^-1 (G - mu d T)^T <= 0 of a slip, at rest in any direction; -1: none. */
+static int painleve(const contact_problem *in, int at_rest, real *entry)
+{
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int normal = CONTACTS[k].normal, slips = CONTACTS[k].slips;
+    const real *const W = in->of->W + normal * CONTACT_ROWS, *const coupling = W + CONTACTS[k].tangential;
+    real along = in->limit[k] && at_rest ? length_of(coupling, slips) : 0.0;
+    if (normal < 0 || slips == 0 || in->is_free[k])
+      continue;
+    for (int j = 0; j < slips; j++)
+      along += in->role[k].direction[j] * coupling[j];
+    *entry = W[normal] - in->of->coefficient[3 * k] * along;
+    if (*entry <= 0.0)
+      return k;
+  }
+  return -1;
+}
+
+/* Whether friction is negative, less static than sliding at rest, or a restitution is not in [0, 1]. */
+static int is_impossible(const contact_terms *of, int k)
+{
+  const real mu = of->coefficient[3 * k], held = of->coefficient[3 * k + 1], e = of->coefficient[3 * k + 2];
+  const int slip = CONTACTS[k].tangential;
+  const int rests = slip >= 0 && length_of(of->rate + slip, CONTACTS[k].slips) <= CONTACT_ROUNDING * of->speed[slip];
+  return !(mu >= 0.0 && held >= 0.0 && e >= 0.0 && e <= 1.0) || (rests && held < (1.0 - CONTACT_ROUNDING) * mu);
+}
+
+/* Sets the consistent modes at a state that stick most, of redundant contacts those near given forces. */
+static int choose_modes(const event_step *step, const contact_terms *of, const contact_change *now, real *force)
+{
+  contact_problem in = {.of = of, .right = of->second, .is_strict = 1};
+  contact_mode best[EVENT_CONTACTS];
+  real second[CONTACT_ROWS], entry = 0.0;
+  int imposed[CONTACT_ROWS] = {0};
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    allow_modes(&in, k, now);
+  if (!relax_modes(&in, force, best)) {
+    const int paradox = painleve(&in, 1, &entry);
+    return refuse(step, CONTACT_WITHOUT_MODE, paradox, paradox < 0 ? 0.0 : entry);
+  }
+  step->watch->ambiguous |= painleve(&in, 0, &entry) >= 0;
+  solve_contacts(of, best, of->second, force, second, imposed);
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential;
+    const int is_slow = CONTACTS[k].slips > 0 && (in.rests[k] || in.begins[k]);
+    real speed = slip < 0 ? 0.0 : of->speed[slip]; /* and that by forces that cancel */
+    int sticks = 0;
+    for (int i = 0; i < CONTACTS[k].slips && best[k].sticks; i++)
+      sticks |= imposed[slip + i] << i;
+    if (best[k].closed && normal >= 0 && !imposed[normal])
+      best[k].held |= CONTACT_LOADED;
+    if (best[k].sticks && sticks != (1 << CONTACTS[k].slips) - 1)
+      best[k].held |= CONTACT_STUCK;
+    best[k].sticks = sticks;
+    for (int j = 0; j < CONTACT_ROWS && slip >= 0; j++)
+      speed += fabs(of->W[slip * CONTACT_ROWS + j] * force[j] * step->whole);
+    put_mode(CONTACTS + k, best[k], is_slow || slip < 0 ? AT_REST : of->rate + slip, speed, step->watch->mode);
+    if (is_slow) {
+      step->watch->fastest[k] = fmax(step->watch->fastest[k], speed);
+      step->watch->began[k] = step->watch->time;
+      step->watch->whole[k] = fabs(step->whole);
+    }
+  }
+  put_modes(step->watch->mode, step->own);
+  return OK;
+}

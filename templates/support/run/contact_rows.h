@@ -1,0 +1,170 @@
+#include "events.h"
+#include "impacts.h"
+
+/* Rows of contacts, gaps and slips, at a state, and the parameters of their modes (contacts.h). Requires:
+ * parts/contacts.c.jinja. */
+#define CONTACT_SLOW 1e-6 /* part of its size below which the direction of a slip in space is kept */
+#define CONTACT_PENETRATION 1e-9 /* part of its size by which a gap may be negative at a start */
+#define CONTACT_FAST 1e3 /* speed relative to that of a slip whose direction is kept */
+
+/* What the modes of contacts do not allow, in watch->refusal. */
+enum {
+  CONTACT_PENETRATES = 1,
+  CONTACT_WITHOUT_MODE, /* Painleve's paradox, or redundant contacts */
+  CONTACT_WITHOUT_IMPULSE,
+  CONTACT_IN_CORNER,
+  CONTACT_IMPOSSIBLE /* coefficients */
+};
+
+/* A contact without gap is always closed; one without friction does not stick, and has direction 0. Slip in space that
+ * begins has a direction to be found, 0 until then. Bit i of `sticks` imposes slip i. A contact is held where the rows
+ * of others determine its own: open, it carries no load; closed, its friction is -mu d times the normal force at rest.
+ * Of closed and sticking contacts a step imposes independent rows; `held` then has bits for those of others. */
+typedef struct {
+  int closed, sticks, held;
+  real direction[2];
+} contact_mode;
+
+enum {
+  CONTACT_HELD = 1,
+  CONTACT_LOADED = 2, /* closed by others */
+  CONTACT_STUCK = 4 /* sticks by others */
+};
+
+static const real AT_REST[2] = {0.0, 0.0};
+static const contact_mode CONTACT_IS_OPEN = {0, 0, 0, {0.0, 0.0}};
+static const contact_mode CONTACT_STICKS = {1, 3, 0, {0.0, 0.0}};
+static const contact_mode CONTACT_SLIPS = {1, 0, 0, {0.0, 0.0}};
+
+/* Rows at a state: values and rates, second rates b, W and G by rows, coefficients (mu, mu_s, e; limits of friction
+ * without gap), the sizes of the terms of values and rates, the rounding of values, and rates at rest. */
+typedef struct {
+  real numbers[CONTACT_NUMBERS];
+  const real *value, *rate, *second, *W, *G, *coefficient;
+  real size[CONTACT_ROWS], speed[CONTACT_ROWS], rounding[CONTACT_ROWS], drift[CONTACT_ROWS];
+  int absent[EVENT_CONTACTS]; /* whether a condition of the contact fails, or the state is behind it */
+} contact_terms;
+
+/* Transitions that end a mode together, and their consequences: contacts that close, or whose conditions fail, slips
+ * that stop, directions of slips that begin; contacts with g = g' = 0, and with w = 0. */
+typedef struct {
+  int closes[EVENT_CONTACTS], leaves[EVENT_CONTACTS], stops[EVENT_CONTACTS], begins[EVENT_CONTACTS];
+  int touches[EVENT_CONTACTS], rests[EVENT_CONTACTS];
+} contact_change;
+
+static real length_of(const real *x, int count)
+{
+  return count < 2 ? fabs(x[0]) : hypot(x[0], x[1]);
+}
+
+/* Mode of a contact by its parameters; of a slip in space with the direction `ahead`. */
+static contact_mode mode_of(const real *mode, int k)
+{
+  const contact_places *at = CONTACTS + k;
+  const int held = (int)mode[at->held];
+  const real *const slides = mode + at->direction;
+  contact_mode now = {at->closed < 0 || mode[at->closed] != 0.0 || (held & CONTACT_LOADED), 0, held & CONTACT_HELD,
+      {0.0, 0.0}};
+  for (int i = 0; i < at->slips; i++) {
+    now.sticks |= (mode[at->sticks + i] != 0.0 || (held & CONTACT_STUCK)) << i;
+    now.direction[i] = slides[0];
+    if (at->slips == 2)
+      now.direction[i] *= now.held ? slides[1 + i] / fmax(length_of(slides + 1, 2), DBL_MIN) : slides[3 + i];
+  }
+  return now;
+}
+
+/* Sets the parameters of a mode. In the plane the direction of slip is one, d. In space it is that of (ahead.w) w +
+ * start: smooth where w vanishes and slip stops, beyond which ahead.w < 0, with the direction `ahead` at an earlier
+ * step; the second term keeps the direction of slow slips. */
+static void put_mode(const contact_places *at, contact_mode mode, const real *w, real speed, real *modes)
+{
+  const int held = mode.held & CONTACT_HELD, slips = mode.closed && !mode.sticks && !(mode.held & CONTACT_STUCK);
+  real *const slides = modes + at->direction;
+  if (at->closed >= 0)
+    modes[at->closed] = mode.closed && !(mode.held & CONTACT_LOADED);
+  modes[at->held] = mode.held;
+  for (int i = 0; i < at->slips; i++)
+    modes[at->sticks + i] = mode.sticks >> i & 1;
+  if (at->slips == 1)
+    slides[0] = mode.direction[0];
+  for (int i = 0; at->slips == 2 && i < 2; i++) {
+    const real size = length_of(mode.direction, 2), fast = pow(CONTACT_FAST * speed, 2.0);
+    const real slow = length_of(w, 2) > CONTACT_SLOW * speed ? 0.0 : fast;
+    slides[0] = held ? size : slips;
+    slides[1 + i] = (held && size > 0.0 ? fast / size : slow) * mode.direction[i];
+    slides[3 + i] = held ? 0.0 : mode.direction[i];
+  }
+}
+
+/* Size of the terms of a row by positions. Of a rotation or a direction, on whose length it does not depend, that is
+ * |G| |q| instead of a sum by components: of a quaternion twice the derivative by an angle. */
+static real size_by_position(const real *G, const real *q)
+{
+  real sum = 0.0;
+  for (int k = 0, i = 0; k < CONTACT_VECTORS; k++) {
+    real gradient = 0.0, position = 0.0;
+    for (const int next = i + CONTACT_VECTOR[k]; i < next; i++) {
+      gradient = hypot(gradient, G[i]);
+      position = hypot(position, q[i]);
+    }
+    sum += gradient * position;
+  }
+  return sum;
+}
+
+/* Evaluates the numbers of the rows at a state. */
+static int rows_at(real t, const real *q, const real *p, const real *parameters, contact_terms *of, real *workspace)
+{
+  real idle[PARAMETERS], imposed[PARAMETERS], mode[EVENT_MODES];
+  for (int k = 0; k < EVENT_MODES; k++)
+    mode[k] = parameters[MODE_PLACE[k]];
+  memcpy(idle, parameters, BYTES(PARAMETERS));
+  memcpy(imposed, parameters, BYTES(PARAMETERS));
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    put_mode(CONTACTS + k, CONTACT_IS_OPEN, AT_REST, 0.0, mode);
+  put_modes(mode, idle);
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    put_mode(CONTACTS + k, CONTACT_STICKS, AT_REST, 0.0, mode);
+  put_modes(mode, imposed);
+  of->value = of->numbers;
+  of->rate = of->value + CONTACT_ROWS;
+  of->second = of->rate + CONTACT_ROWS;
+  of->W = of->second + CONTACT_ROWS;
+  of->G = of->W + CONTACT_ROWS * CONTACT_ROWS;
+  of->coefficient = of->G + CONTACT_ROWS * M;
+  return NAME(contact_terms)(t, q, p, idle, imposed, of->numbers, workspace);
+}
+
+static int terms_at(const event_step *step, const event_sample *at, contact_terms *of)
+{
+  real *const v = step->memory + 3 * M, power = 0.0;
+  const real duration = fabs(step->whole);
+  int status = rows_at(at->t, at->q, at->p, step->own, of, step->workspace);
+  if (status == OK)
+    status = NAME(velocity)(at->t, at->q, at->p, step->own, v, step->workspace);
+  for (int i = 0; i < M; i++)
+    power += at->p[i] * v[i];
+  for (int r = 0; r < CONTACT_ROWS; r++) {
+    const real by_position = size_by_position(of->G + r * M, at->q);
+    real by_velocity = 0.0;
+    for (int i = 0; i < M; i++)
+      by_velocity += of->G[r * M + i] * v[i];
+    /* |G v| <= sqrt(G M^-1 G^T) sqrt(v^T M v), and the change of the rate in a step */
+    of->speed[r] = sqrt(fabs(of->W[r * (CONTACT_ROWS + 1)] * power)) + fabs(of->rate[r] - by_velocity) +
+        fabs(of->second[r]) * duration;
+    of->drift[r] = fabs(of->rate[r] - by_velocity);
+    of->rounding[r] = DBL_EPSILON * (by_position + fabs(at->t) * of->drift[r]);
+    of->size[r] = by_position + of->speed[r] * duration;
+  }
+  memset(of->absent, 0, sizeof of->absent);
+  for (int i = 0; status == OK && i < TRANSITIONS; i++) {
+    const int event = FIRST_TRANSITION + i, k = TRANSITION[i][0], row = CONTACTS[k].normal;
+    int exists;
+    if (TRANSITION[i][1] != CONTACT_CLOSES || !IS_CONDITIONAL[event])
+      continue;
+    status = conditions(EVENT_FIRST[event], at->t, at->q, at->p, step->parameters, &exists, step->workspace);
+    of->absent[k] = !exists || of->value[row] < -CONTACT_PENETRATION * of->size[row];
+  }
+  return status;
+}
