@@ -208,6 +208,7 @@ def _interface(system: MechanicalSystem, method: Method, **of_kind: Any) -> Inte
         defaults=system.defaults,
         functions=tuple((name, json.dumps(asdict(table))) for name, table in system.functions),
         inputs=system.inputs,
+        input_ranges=system.input_ranges,
         changes_energy=system.changes_energy or inputs_act,
         balances_energy=system.balances_energy,
         lengths=system.lengths,

@@ -85,6 +85,7 @@ def change_coordinates(
         constraints=tuple(g.xreplace(replaced) for g in system.constraints),
         functions=system.functions,
         inputs=system.inputs,
+        input_ranges=system.input_ranges,
         damping=system.damping,
     )
 

@@ -47,7 +47,8 @@ class LagrangianSystem(MechanicalSystem):
         reduced: of a system with rotations or directions, its formulas in the names of these.
         dual_energy: the kinetic energy as a function of coordinates and momenta if that takes fewer operations than the
             mass matrix, which then is not computed, else 0.
-        links: of a robot from a file, the geometry of its moving links, for pictures.
+        links: of a robot from a file, the geometry of its moving links.
+        actuators, keys: names of the inputs of its actuators, and its keyframes, by their names in the file.
         gauge: energy of the rates of constraints that determine the velocities of massless coordinates, else 0
             (:mod:`scvi_codegen.systems.checks.definition`).
 
@@ -62,6 +63,8 @@ class LagrangianSystem(MechanicalSystem):
     dual_energy: Expr = field(default_factory=zero)
     gauge: Expr = field(default_factory=zero, init=False, compare=False, repr=False)
     links: tuple[Any, ...] = field(default=(), compare=False, repr=False)
+    actuators: Mapping[str, str] = field(default_factory=dict, compare=False, repr=False)
+    keys: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, compare=False, repr=False)
 
     __repr__ = summary("name", "coordinates")
 
@@ -81,6 +84,13 @@ class LagrangianSystem(MechanicalSystem):
     def joint_names(self) -> dict[str, str]:
         """Names of the joints of a robot in this system by their names in the file."""
         return {link.label: link.name for link in self.links}
+
+    @property
+    def keyframes(self) -> dict[str, dict[str, Any]]:
+        """States of a robot as arguments of ``integrate``: ``"qpos0"``, at rest at its reference, and its file's."""
+        from scvi_codegen.systems.multibody.trees.keyframes import keyframe
+
+        return {name: keyframe(self.links, self.inputs, key) for name, key in {"qpos0": {}, **self.keys}.items()}
 
     @property
     def formula(self) -> Expr:
@@ -378,6 +388,7 @@ class LagrangianSystem(MechanicalSystem):
         friction: Literal["contact", "ignore"] = "ignore",
         contacts: Literal["planes", "ignore"] = "ignore",
         restitution: float = 0.0,
+        actuators: bool = False,
         check_inertias: bool = True,
         name: str | None = None,
     ) -> LagrangianSystem:
@@ -394,6 +405,7 @@ class LagrangianSystem(MechanicalSystem):
             contacts: ``"planes"`` for contacts of spheres, capsules and boxes with planes, rigid and with sliding
                 friction; the warning has the number of other pairs of geoms that may touch. ``"ignore"``: none.
             restitution: coefficient of impacts of limits and geoms, 0 to 1.
+            actuators: whether motors and servos act; their controls are inputs of their names, or ``ctrl_NAME``.
             name: name of the system; by default that of the model.
 
         Raises:
@@ -403,7 +415,7 @@ class LagrangianSystem(MechanicalSystem):
         from scvi_codegen.systems.multibody.trees.mjcf import links_of_mjcf
 
         parts = _read_parts(limits=limits, friction=friction, contacts=contacts)
-        model, links, gravity, *others = links_of_mjcf(path, parts)
+        model, links, gravity, *others = links_of_mjcf(path, [*parts, *["actuators"] * actuators])
         return cls._of_tree(path, name or model, links, gravity, actuated, check_inertias, restitution, *others)
 
     @classmethod
@@ -416,10 +428,10 @@ class LagrangianSystem(MechanicalSystem):
         from scvi_codegen.systems.multibody.trees.tendons import energies_of
 
         try:
-            closures, tendons, touches = others or ((), (), ())
+            closures, tendons, touches, actuators, keys = others or ((), (), (), (), {})
             touching = contacts_of(links, touches, e)
-            added = conditions_of(links, closures), checked, energies_of(links, tendons), touching, e
-            system: LagrangianSystem = system_of_tree(cls, name, links, gravity, actuated, *added)
+            added = conditions_of(links, closures), checked, energies_of(links, tendons), touching, e, actuators
+            system: LagrangianSystem = system_of_tree(cls, name, links, gravity, actuated, *added, keys=keys)
         except SystemDefinitionError as error:
             raise SystemDefinitionError(f"{path}: {error}") from error
         return system

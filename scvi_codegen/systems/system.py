@@ -178,6 +178,7 @@ class MechanicalSystem(Deferred, ABC):
         functions: tables by name, which texts of formulas call (:class:`~scvi_codegen.systems.formulas.table.Table`).
         inputs: names of inputs, each represented by five of the parameters
             (:mod:`scvi_codegen.systems.formulas.symbols`).
+        input_ranges: name, smallest and largest value of inputs that runs clamp to these.
         constraints: expressions in (q, t), or linear in v, that are 0 along trajectories of a Lagrangian
             (:mod:`scvi_codegen.systems.forces`).
         reactions: masks and directions of force of the last constraints, as of contacts
@@ -204,6 +205,7 @@ class MechanicalSystem(Deferred, ABC):
     contacts: tuple[ContactLike, ...] = ()
     functions: tuple[tuple[str, Table], ...] = ()
     inputs: tuple[str, ...] = ()
+    input_ranges: tuple[tuple[str, float, float], ...] = ()
     damping: Expr = field(default_factory=zero)
     arrays: tuple[Array, ...] = field(default=(), compare=False)
     indices: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
@@ -325,7 +327,7 @@ class MechanicalSystem(Deferred, ABC):
         """Fields that a Lagrangian and its Hamiltonian have in common, by name."""
         names = (
             *("name", "coordinates", "time", "parameters", "defaults"),
-            *("damping", "inputs", "functions", "rotations", "lengths"),
+            *("damping", "inputs", "input_ranges", "functions", "rotations", "lengths"),
         )
         return {name: getattr(self, name) for name in names}
 

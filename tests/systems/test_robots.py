@@ -443,6 +443,28 @@ MOTIONS = {
         '<joint name="t" type="slide" stiffness="3 -2" damping="1 2"/>',
         '<actuator><motor joint="t" gear="-2" damping="1 2 3"/></actuator>',
     ),
+    "motors": (
+        *HINGES,
+        '<actuator><motor name="t" joint="t" gear="-2" ctrlrange="-.3 .2"/>'
+        '<motor name="lift" joint="1-a" gear="3" forcerange="-.2 .1" ctrlrange="0 2"/></actuator>',
+    ),
+    "servos": (
+        *HINGES,
+        '<default><default class="a"><position kp="9" kv="2" gear="2"/></default></default>'
+        '<actuator><position class="a" name="p" joint="t" kp="3"/><position class="a" joint="1-a" forcerange="-1 .1"/>'
+        '<velocity name="v" joint="t" kv="4"/><general name="g" gear="2" joint="1-a" gainprm="2 3 4" gaintype="affine"'
+        ' biastype="affine" biasprm="1 -9 -2"/></actuator>',
+    ),
+    "actuated tendon": (
+        *BALLS,
+        SPATIAL.format('name="s"') + '<actuator><position name="p" tendon="s" kp="3" kv="2"/><general name="g" '
+        'tendon="s" biastype="affine" biasprm="1 2" forcerange="-1 .1"/></actuator>',
+    ),
+    "limited torque": (
+        HINGES[0].replace("name", 'actuatorfrcrange="-.1 .2" name'),
+        HINGES[1],
+        '<actuator><motor name="m" joint="1-a" gear="-2"/><position joint="t"/></actuator>',
+    ),
 }
 
 
@@ -455,7 +477,7 @@ def test_equations_of_motion_are_those_of_mujoco(case, tmp_path):
 <site name="w" pos=".1 .5 .2"/><body name="a" pos=".1 .2 .3" euler="10 20 30">{one}<geom size=".1" pos=".3 .1 0"/>
 <site name="s" pos=".3 .1 .1"/><body name="b" pos=".3 0 0">{two}<geom type="box" size=".1 .2 .3" pos=".3 0 .1"/>
 <site name="e" pos=".2 .2 .1"/></body></body></worldbody>{rest}</mujoco>""")
-    assert max(errors_of_motion(sc.LagrangianSystem.from_mjcf(file), file)) < 1e-12
+    assert max(errors_of_motion(sc.LagrangianSystem.from_mjcf(file, actuators=True), file)) < 1e-12
 
 
 PLANAR = """<joint name="slab" type="planar"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>

@@ -326,18 +326,25 @@ def errors_of_motion(system: Any, path: Path) -> list[float]:
     model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
     data, draw, names = mujoco.MjData(model), np.random.default_rng(1), []
     for j, kind in enumerate(model.jnt_type):
-        name = system.joint_names[model.joint(j).name]
+        name = system.joint_names[model.joint(j).name or model.body(model.jnt_bodyid[j]).name]
         place, turn = [f"{x}_{name}" for x in "xyz"], [f"R_{name}_{x}" for x in "wxyz"]
         names += ([*place, *turn], turn, [name], [name])[kind]
     order = [names.index(str(q)) for q in system.coordinates]
     m, variables = system.dimension, (*system.coordinates, *system.velocities)
-    slopes, forces = gradient(system.lagrangian, variables), system.forces or [S.Zero] * system.dimension
-    tape = Tape([system.lagrangian, *(slopes.get(k, S.Zero) for k in range(2 * m)), *forces], variables)
+    slopes, forces = gradient(system.lagrangian, variables), system.forces or [S.Zero] * m
+    tape = Tape(
+        [system.lagrangian, *(slopes.get(k, S.Zero) for k in range(2 * m)), *forces],
+        (*variables, system.time, *system.parameters),
+    )
+    controls = dict(zip(system.actuators.values(), draw.uniform(-2, 2, len(system.actuators)), strict=True))
+    held = controls | {name: min(max(controls[name], low), high) for name, low, high in system.input_ranges}
+    constants = [held.get(name.removesuffix("_0"), 0.0) for name in ("t", *map(str, system.parameters))]
     energies = []
     for scale in (0.0, 1.0):
         mujoco.mj_resetData(model, data)
         mujoco.mj_integratePos(model, data.qpos, draw.uniform(-1, 1, model.nv) * scale, 1.0)
         data.qvel[:] = scale * draw.uniform(-1, 1, model.nv)
+        data.ctrl[: len(controls)] = [*controls.values()]
         mujoco.mj_forward(model, data)
         rate = flow(model, data.qpos, data.qvel)
         second = flow(model, data.qpos, data.qacc_smooth)
@@ -346,12 +353,12 @@ def errors_of_motion(system: Any, path: Path) -> list[float]:
         step, sides = mp.mpf("1e-15"), []
         for h in (-step, 0, step):
             moved = [x + h * y + h * h / 2 * z for x, y, z in zip(q, v, a, strict=True)]
-            sides.append(tape([*moved, *(y + h * z for y, z in zip(v, a, strict=True))]))
+            sides.append(tape([*moved, *(y + h * z for y, z in zip(v, a, strict=True)), *map(mp.mpf, constants)]))
         energies.append(sides[1][0] - data.energy[1] + data.energy[0])
     before, (_, *values), after = (np.array(side) for side in sides)
     torques, along, acting = values[:m], ((after - before) / (2 * step))[1 + m : 1 + 2 * m], values[2 * m :]
     size = max(map(abs, torques)) + max(map(abs, acting)) + 1
-    power = np.dot(acting, v) - float((data.qfrc_damper + data.qfrc_fluid) @ data.qvel)
+    power = np.dot(acting, v) - float((data.qfrc_damper + data.qfrc_fluid + data.qfrc_actuator) @ data.qvel)
     errors = energies[1] - energies[0], power, np.abs(along - torques - acting).max() / size
     return [float(abs(error)) for error in errors]
 

@@ -35,6 +35,7 @@ KINDS: dict[str, Callable[[Any], bool]] = {
     "tuple[bool, ...]": lambda value: isinstance(value, tuple) and all(isinstance(entry, bool) for entry in value),
     "tuple[float, ...]": lambda value: isinstance(value, tuple) and all(map(_is_number, value)),
     "tuple[tuple[str, ...], ...]": lambda value: isinstance(value, tuple) and all(map(KINDS["tuple[str, ...]"], value)),
+    "tuple[tuple[str, float, float], ...]": lambda value: all(map(_is_number, (x for _, *pair in value for x in pair))),
     "ArrayLayout": lambda value: False,
     "tuple[ContactRows, ...]": lambda value: all(isinstance(row, ContactRows) for row in value),
     "Sizes | None": lambda value: value is None or isinstance(value, Sizes),
@@ -368,6 +369,7 @@ class Interface:
         ranges: call, argument and its bounds of each table that is undefined beyond them.
         functions: name and arguments as JSON of each table that formulas call.
         inputs: names of tabulated inputs, each of which has five parameters.
+        input_ranges: name, smallest and largest value of those that are clamped.
         energy_parameter: of a time-transformed system, the parameter that is the energy of the initial state.
         time_transformation: time-rescaling function g in dt = g dtau that determines its step sizes.
         conserves_energy: whether energy is a first integral.
@@ -416,6 +418,7 @@ class Interface:
     functions: tuple[tuple[str, ...], ...] = ()
     ranges: tuple[tuple[str, ...], ...] = ()
     inputs: tuple[str, ...] = ()
+    input_ranges: tuple[tuple[str, float, float], ...] = ()
     conserves_energy: bool = False
     changes_energy: str | None = None
     balances_energy: bool = False

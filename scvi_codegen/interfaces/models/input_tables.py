@@ -24,7 +24,7 @@ from scvi_codegen.codegen.rendering.source import ExampleInput
 from scvi_codegen.common.atomic import inside, read_text
 from scvi_codegen.common.errors import ModelFileError, StateError
 from scvi_codegen.interfaces.models.options import real
-from scvi_codegen.runs.driver.segments import POWERS, first_inner_time, input_of, parameters_at
+from scvi_codegen.runs.driver.segments import POWERS, clamped_inputs, first_inner_time, input_of, parameters_at
 from scvi_codegen.runs.results.export import loaded
 from scvi_codegen.systems.system import MechanicalSystem
 
@@ -123,6 +123,7 @@ def tables_of_example(
         if inputs:
             table = inputs[name]
             functions[name] = input_of(name, table if isinstance(table, tuple) else (whole, (table, table)))
+    functions = clamped_inputs(system, functions)
     tables = tuple(
         ExampleInput(name, tuple(spline.breakpoints.tolist()), tuple(map(tuple, spline.pieces[:, :POWERS].tolist())))
         for name, spline in functions.items()

@@ -293,12 +293,11 @@ def _robot(system: DrawnSystem) -> MovingShape:
     A link without children ends at twice the distance of its center of mass. The rotation of link i into the world is
     A_i = A_p C_i R(q_i), its origin is o_p + A_p r_i.
     """
-    links, joints = system.links, {link.name: link for link in system.links}
-    members = {member.name: member for member in RotationNames.members_of(system.rotations)}
+    links, members = system.links, {member.name: member for member in RotationNames.members_of(system.rotations)}
     origins: list[Matrix] = []
     turns: list[Matrix] = []
     for link in links:
-        origin, turn = _placed(link, joints, members)
+        origin, turn = _placed(link, members)
         if link.parent >= 0:
             origin = origins[link.parent] + turns[link.parent] * origin
             turn = turns[link.parent] * turn
@@ -323,7 +322,7 @@ def _robot(system: DrawnSystem) -> MovingShape:
     )
 
 
-def _placed(link: Any, joints: Mapping[str, Any], members: Mapping[str, Any]) -> tuple[Matrix, Matrix]:
+def _placed(link: Any, members: Mapping[str, Any]) -> tuple[Matrix, Matrix]:
     """Return the origin of a link in the frame of its parent, and its rotation into it."""
     constant, position = Matrix(link.rotation), Matrix(link.position)
     if link.kind in ("free", "ball"):
@@ -333,15 +332,9 @@ def _placed(link: Any, joints: Mapping[str, Any], members: Mapping[str, Any]) ->
         if link.kind == "free":
             return Matrix([symbol(f"{axis}_{link.name}") for axis in "xyz"]), turn
         return position, constant * turn
-    moved = _displacement(link, joints) - link.zero
+    name, factor, offset = link.follows or (link.name, 1, 0)
+    moved = factor * symbol(name) + offset - link.zero
     if link.kind == "slide":
         return position + moved * constant[:, 2], constant
     sine, cosine = sympy.sin(moved), sympy.cos(moved)
     return position, constant * Matrix([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
-
-
-def _displacement(link: Any, joints: Mapping[str, Any]) -> Expr:
-    if link.follows is None:
-        return symbol(link.name)
-    other, factor, offset = link.follows
-    return factor * _displacement(joints[other], joints) + offset

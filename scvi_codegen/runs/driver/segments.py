@@ -64,6 +64,29 @@ class Input:
         coefficients: Array = self.pieces[min(max(piece, 0), len(self.pieces) - 1)]
         return coefficients[part] if coefficients.ndim == 2 else coefficients
 
+    def clamped(self, low: float, high: float) -> Input:
+        """Return the function clamped to a range, with further breakpoints where polynomials take a bound."""
+        ends, pieces = [float(self.breakpoints[0])], []
+        for piece, end in zip(self.pieces, self.breakpoints[1:].tolist(), strict=True):
+            rows = np.asarray(piece).reshape(-1, POWERS + 1)
+            times = ((row[-1], np.roots([*row[3:0:-1], row[0] - bound])) for row in rows for bound in (low, high))
+            cuts = {first + x.real for first, roots in times for x in roots if x.imag == 0}
+            for cut in (*sorted(float(x) for x in cuts if ends[-1] < x < end), end):
+                part, middle = piece.copy(), ends[-1] + (cut - ends[-1]) / 2 if np.isfinite(cut) else 0.0
+                for k in np.ndindex(piece.shape[:-1]):
+                    value = np.polyval(np.asarray(piece)[k][3::-1], middle - piece[k][POWERS])
+                    if not low <= value <= high:
+                        part[k] = min(max(value, low), high), 0.0, 0.0, 0.0, float(piece[k][POWERS])
+                ends.append(cut)
+                pieces.append(part[np.newaxis])
+        return Input(np.array(ends), np.concatenate(pieces))
+
+
+def clamped_inputs(limited: Any, inputs: Mapping[str, Input]) -> dict[str, Input]:
+    """Return inputs by name, those with a range clamped to it."""
+    bounds = {name: limits for name, *limits in limited.input_ranges}
+    return {name: data.clamped(*bounds[name]) if name in bounds else data for name, data in inputs.items()}
+
 
 def checked_inputs(
     interface: Interface, argument: Mapping[str, Any] | None, trajectories: int | None = None
@@ -83,7 +106,7 @@ def checked_inputs(
             f"the input '{missing[0]}' is not set: pass inputs={{'{missing[0]}': (t, values)}}, or a number"
         )
     read = input_of if interface.words == 1 else _in_two_words
-    return {name: read(name, value, trajectories) for name, value in argument.items()}
+    return clamped_inputs(interface, {name: read(name, value, trajectories) for name, value in argument.items()})
 
 
 def input_of(name: str, argument: Any, trajectories: int | None = None) -> Input:

@@ -18,6 +18,7 @@ from scvi_codegen.runs.states.attitudes import (
     matrices,
     unit_vectors,
 )
+from scvi_codegen.runs.states.frames import Frame, frame_at
 from scvi_codegen.runs.states.rotation_quantities import spins, values_by_name
 from scvi_codegen.runs.states.rotations import Member, members_of
 from scvi_codegen.runs.states.validation import Array, coordinate_shapes, shapes_of
@@ -103,6 +104,10 @@ class AttitudeHistory:
         """Return (n, 3) spins."""
         columns, (q, p) = self._member("spin", name).columns, self._states(t)
         return spins(q[..., columns], p[..., columns])
+
+    def frame(self, name: str) -> Frame:
+        """Return position, rotation, velocities and Jacobians of a link, body or site of a robot in the world."""
+        return frame_at(self.stepper.interface, name, (state := self._states(None))[0], self._velocities(*state, None))
 
     def _quantity(self, name: str) -> Array:
         """Return the values of one name at the states, (n, ..), or (n, k, ..) of an ensemble.

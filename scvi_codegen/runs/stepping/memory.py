@@ -146,6 +146,7 @@ class Memory:
         self._sums_action = hasattr(memory, "actions")
         firsts = {name: parameter_index(stepper.interface, f"{name}_0") for name in stepper.interface.inputs}
         self._inputs = {name: slice(first, first + 5) for name, first in firsts.items()}
+        self._ranges = {name: limits for name, *limits in stepper.interface.input_ranges}
 
     def _first_steps(self, save_every: int) -> int:
         """Return the largest number of steps of the first C call, of a run that saves every ``save_every``-th state."""
@@ -364,7 +365,7 @@ class Memory:
 
     @alone
     def set_inputs(self, **inputs: Any) -> None:
-        """Set inputs to constant numbers for the following steps (zero-order hold).
+        """Set inputs to constant numbers for the following steps (zero-order hold), clamped to their ranges.
 
         >>> run.set_inputs(u=-1.5); run.advance(10)  # doctest: +SKIP
         """
@@ -373,6 +374,8 @@ class Memory:
             if name not in self._inputs:
                 raise no_input(name, self._inputs)
             high, low = self.stepper._states.number(value, f"the input {name}")
+            if name in self._ranges and not self._ranges[name][0] <= high <= self._ranges[name][1]:
+                high, low = min(max(high, self._ranges[name][0]), self._ranges[name][1]), 0.0
             np.asarray(values)[self._inputs[name]] = high, 0.0, 0.0, 0.0, 0.0
             if isinstance(values, Words):
                 values.low[self._inputs[name]] = low, 0.0, 0.0, 0.0, 0.0

@@ -6,8 +6,6 @@ import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from scvi_codegen.common.atomic import inside
 from scvi_codegen.common.errors import ModelFileError
 from scvi_codegen.interfaces.models.model import Model
@@ -85,24 +83,6 @@ def _robot(section: Section, folder: Path) -> Entry:
         text_of(section, "name", "[system]")
     read: Any = LagrangianSystem.from_urdf if urdf else LagrangianSystem.from_mjcf
     system = in_section("[system] robot", lambda: read(path, **arguments))
-    run = {"span": SPAN, "step": STEP}
-    return Entry(system, {"initial": _at_rest(system), "method": METHOD.specification(), "run": run})
-
-
-def _at_rest(system: LagrangianSystem) -> dict[str, dict[str, Any]]:
-    """Return the positions and velocities, by name, of a robot at rest in its reference configuration."""
-    q: dict[str, Any] = {}
-    rates: dict[str, Any] = {}
-    for link in system.links:
-        if link.kind == "free":
-            q |= {f"{axis}_{link.name}": x for axis, x in zip("xyz", link.position, strict=True)}
-            rates |= {f"{axis}_{link.name}": 0.0 for axis in "xyz"}
-        if link.kind in ("free", "ball"):
-            attitude: Any = [list(row) for row in link.rotation]
-            if link.kind == "ball" or attitude == np.eye(3).tolist():
-                attitude = [1.0, 0.0, 0.0, 0.0]
-            q[f"R_{link.name}"] = attitude
-            rates[f"omega_{link.name}"] = [0.0, 0.0, 0.0]
-        elif link.follows is None:
-            q[link.name], rates[link.name] = link.zero, 0.0
-    return {"q": q, "q_dot": rates}
+    rest = system.keyframes["qpos0"]
+    motion = {"initial": {"q": rest["q"], "q_dot": rest["velocity"]}, "run": {"span": SPAN, "step": STEP}}
+    return Entry(system, {**motion, "method": METHOD.specification()})

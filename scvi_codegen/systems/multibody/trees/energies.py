@@ -350,8 +350,10 @@ def system_of_tree(
     tendons: tuple[Expr, Expr, Expr] = (S.Zero, S.Zero, S.Zero),
     touching: Sequence[ContactLike] = (),
     restitution: float = 0.0,
+    actuators: Sequence[Any] = (),
+    **own: Any,
 ) -> Any:
-    """Return the system of a tree, of class ``kind``, energies of tendons, and contacts; see :class:`Tree`."""
+    """Return the system of a tree, of class ``kind``, energies of tendons, contacts, actuators; see :class:`Tree`."""
     tree = Tree(links, gravity)
     for problem in impossible_inertias(tree.links):
         if check_inertias:
@@ -360,15 +362,19 @@ def system_of_tree(
     contacts = *tree.contacts(restitution), *touching
 
     def made(**fields: Any) -> Any:
-        members, drawn = fields.get("rotations", ()), tuple(map(DrawnLink.of, tree.links))
-        fields |= {"links": drawn, "contacts": contacts}
+        members = fields.get("rotations", ())
+        drawn = tuple(DrawnLink.of(link, tree.leaders.get(link.joint.name)) for link in tree.links)
+        ranges = tuple((name, *limits) for _, name, limits, _ in actuators if limits is not None)
+        names = {label: name for label, name, *_ in actuators}
+        fields |= {"links": drawn, "contacts": contacts, "input_ranges": ranges, "actuators": names, **own}
         if constraints or contacts or tendons[0] != 0 or len(fields["coordinates"]) - len(members) < SMALLEST:
             return kind(**fields)
         return kind(**fields, dual_energy=_in_quaternions(dual_energy(tree), **fields))
 
     arguments = tree.arguments(actuated)
     formula = arguments.pop("lagrangian") + tendons[0] - tendons[1]
-    arguments["dissipation"] = arguments["dissipation"] + tendons[2] or None
+    arguments["dissipation"] = Add(arguments["dissipation"], tendons[2], *(each[-1] for each in actuators)) or None
+    arguments["inputs"] += [name for _, name, *_ in actuators]
     try:
         return system_from_sympy(made, "Lagrangian", formula, name=name, constraints=constraints, **arguments)
     except SystemDefinitionError as error:

@@ -6,7 +6,7 @@ Attributes and defaults are those of https://mujoco.readthedocs.io/en/stable/XML
 
 import re
 from collections import deque
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations, zip_longest
 from os import PathLike
@@ -18,6 +18,7 @@ import numpy as np
 
 from scvi_codegen.common.errors import closest
 from scvi_codegen.systems.formulas.rotations import matrix_of
+from scvi_codegen.systems.multibody.trees.actuators import Actuator, Range, actuator_of
 from scvi_codegen.systems.multibody.trees.closures import Closure, Coupling, at_reference
 from scvi_codegen.systems.multibody.trees.contacts import Touch
 from scvi_codegen.systems.multibody.trees.document import Element, Unread, checked_limits, root_of
@@ -70,17 +71,16 @@ SLIDING = 3
 ORIENTATIONS = TURN.split()
 NO_MASS = 1e-15
 """Bodies with less mass are without forces of a medium, and boxes have no smaller sums of moments of inertia."""
+ACTED, GAINS = ("joint", "jointinparent", "tendon"), {"kp", "kv", "gainprm", "biasprm"}
 AXES = dict(zip("xyz", np.eye(3), strict=True))
 Defaults = dict[str, dict[str, str]]
 """Attributes by kind of element."""
 
 
-def links_of_mjcf(
-    path: str | PathLike[str], parts: Collection[str] = ()
-) -> tuple[str, list[Link], Vector, list[Closure | Coupling], list[Tendon], list[Touch]]:
-    """Return the name of the model, its links with parents first, the gravity, equalities, tendons, and touching geoms.
+def links_of_mjcf(path: str | PathLike[str], parts: Collection[str] = ()) -> tuple[Any, ...]:
+    """Return name, links with parents first, gravity, equalities, tendons, touching geoms, actuators, and keyframes.
 
-    ``parts``: among ``"limits"``, ``"friction"`` of joints and ``"contacts"``; a warning names others.
+    ``parts``: among ``"limits"``, ``"friction"`` of joints, ``"contacts"``, ``"actuators"``; a warning names others.
 
     Raises:
         SystemDefinitionError: naming file and element, if something is malformed or unknown, or changes the motion and
@@ -88,7 +88,8 @@ def links_of_mjcf(
     """
     root = _document(Path(path))
     model = _MujocoModel(root, parts)
-    others = [*model.closures()], [*model.tendons()], [*model.touches()]
+    acting = [*model.actuators(tendons := [*model.tendons()])]
+    others = [*model.closures()], tendons, [*model.touches()], acting, dict(model.keyframes([x[1] for x in acting]))
     model.unread.warn(root.file)
     return root.node.get("model") or Path(path).stem, model.scaled(), model.gravity, *others
 
@@ -126,6 +127,7 @@ class _MujocoModel:
         self.compensating: list[Element] = []
         self.meshes: dict[ElementTree.Element, Inertia] = {}
         self.labels = set[str | None]()
+        self.joints = dict[str, Element]()
         self.carriers, self.parents = {-1: -1}, dict[int, int]()
         """Of each body, by its link: the moving body that it is fixed to, and the one that this is connected with."""
         self.geoms: list[Geom] = []
@@ -134,6 +136,9 @@ class _MujocoModel:
         for world in root.children("worldbody"):
             self.read(world)
         self.links = named(self.links)
+        for (tag, name), (place, pose) in self.places.items():
+            if tag == "site" and place >= 0:
+                self.links[place] = replace(self.links[place], frames=(*self.links[place].frames, (name, pose)))
         self.singles = {link.joint.label: link.joint for link in self.links if link.joint.kind in SINGLE}
         self.read_actuators()
         if self.compensating and any(link.inertia.lift[0] for link in self.links):
@@ -145,15 +150,20 @@ class _MujocoModel:
             yield from element.children()
 
     def tendons(self) -> Iterator[Tendon]:
-        """Yield the tendons with forces or rotors; limits and dry friction are listed as unread.
+        """Yield the tendons with forces, rotors or actuators; limits and dry friction are listed as unread.
 
         https://mujoco.readthedocs.io/en/stable/XMLreference.html#tendon
         """
+        acted = (
+            {actuator.text("tendon", "") for actuator in self.entries("actuator")}
+            if "actuators" in self.parts
+            else set()
+        )
         for tendon in self.entries("tendon"):
             self.read_limits(tendon, "tendons", tendon.name)
             stiffness, damping = (self.coefficients(tendon, key) for key in ("stiffness", "damping"))
             armature = tendon.number("armature", 0, 0)
-            if not (any(stiffness) or any(damping) or armature):
+            if not (any(stiffness) or any(damping) or armature or tendon.node.get("name") in acted):
                 continue
             for part in tendon.children("geom", "pulley"):
                 part.refuse(f"is on the tendon '{tendon.name}', which is read through sites only, without wrapping")
@@ -161,7 +171,8 @@ class _MujocoModel:
             points = tuple(self.place(part, "site") for part in tendon.children("site"))
             low, *high = map(float, tendon.vector("springlength", (-1,), (1, 2)))
             slack = None if low == -1 else (low, high[0] if high else low)
-            yield Tendon(factors, points, stiffness, damping, armature, slack)
+            pull = self.bounds(tendon, "actuatorfrc")
+            yield Tendon(factors, points, stiffness, damping, armature, slack, tendon.name, pull)
 
     def read(self, world: Element) -> None:
         """Add links, places and shapes of a world body and of all bodies in it, parents first."""
@@ -178,8 +189,7 @@ class _MujocoModel:
                     self.geoms.append(Geom(geom, link, at @ frame @ self.pose(geom)))
             for site in element.children("site"):
                 self.put(site, link, at @ self.pose(site))
-            inner = (*element.children("frame"), *element.children("body"))
-            pending += [(child, link, at) for child in reversed(inner)]
+            pending += [(child, link, at) for child in reversed(element.children("frame", "body"))]
 
     def put(self, element: Element, link: int, at: Pose) -> None:
         """Store the place of a body or site, if it has a name."""
@@ -202,6 +212,7 @@ class _MujocoModel:
             if joint.has("name") and label in self.labels:
                 joint.refuse("is the second joint of this name: rename one")
             self.labels.add(joint.node.get("name"))
+            self.joints[label] = joint
             self.links.append(Link(label, parent, self.joint(joint, label, moved, frame, parent), Inertia()))
             parent, pose, anchor = len(self.links) - 1, Pose(), at
         place = len(self.links)
@@ -275,7 +286,8 @@ class _MujocoModel:
         """Add the inertias of rotors and the damping of actuators, which are those of lengths gear q, to joints."""
         places = {link.joint.label: i for i, link in enumerate(self.links) if link.joint.kind in SINGLE}
         for actuator in self.entries("actuator"):
-            self.unread.add("actuators", actuator.name)
+            if not ("actuators" in self.parts or "actuation" in self.disabled):
+                self.unread.add("actuators", actuator.name)
             armature, damping = actuator.number("armature", 0, 0), self.coefficients(actuator, "damping")
             if armature or any(damping):
                 place = places.get(actuator.text("joint", actuator.text("jointinparent", "")))
@@ -290,11 +302,7 @@ class _MujocoModel:
 
     def read_limits(self, element: Element, part: str, name: str) -> tuple[tuple[float, float] | None, float]:
         """Return the range and the dry friction of a joint or tendon, in the units of the file, that are in force."""
-        limited = element.choice("limited", "auto", "true", "false")
-        low, high = element.vector("range", (0, 0), (2,))
-        if limited == "auto" and low < high and element.settings.choice("autolimits", "true", "false") == "true":
-            limited = "true"
-        limits = (low, high) if limited == "true" and not self.disabled & {"limit", "constraint"} else None
+        limits = None if self.disabled & {"limit", "constraint"} else self.bounds(element)
         friction = element.number("frictionloss", 0, 0) * (not self.disabled & {"frictionloss", "constraint"})
         present = {"limits": limits is not None, "friction": friction > 0}
         for what in (what for what in present if present[what] and what not in self.parts):
@@ -302,6 +310,46 @@ class _MujocoModel:
         if part == "tendons" and (both := [what for what in present if present[what] and what in self.parts]):
             element.refuse(f"has {PARTS[both[0]]}, which is read of joints only: write {both[0]}='ignore'")
         return limits if "limits" in self.parts else None, friction if "friction" in self.parts else 0.0
+
+    def bounds(self, element: Element, prefix: str = "") -> Range:
+        """Return the attribute ``range`` with a prefix, if it is in force."""
+        limited = element.choice(f"{prefix}limited", "auto", "true", "false")
+        low, high = map(float, element.vector(f"{prefix}range", (0, 0), (2,)))
+        automatic = low < high and element.settings.choice("autolimits", "true", "false") == "true"
+        return (low, high) if limited == "true" or (limited == "auto" and automatic) else None
+
+    def actuators(self, tendons: Sequence[Tendon]) -> Iterator[Actuator]:
+        """Yield the actuators, if they are read; ``actuatorfrcrange`` is that of the only one of a joint or tendon."""
+        elements = [*self.entries("actuator")] if "actuators" in self.parts and "actuation" not in self.disabled else []
+        parts = {("tendon", tendon.name): tendon for tendon in tendons}
+        for label, joint in self.singles.items() if elements else ():
+            own = Tendon(((joint.name, 1.0),), pull=self.bounds(self.joints[label], "actuatorfrc"))
+            parts |= {("joint", label): own, ("jointinparent", label): own}
+        targets = [next(((x, each.text(x)) for x in ACTED if each.has(x)), ("", "")) for each in elements]
+        for element, target in zip(elements, targets, strict=True):
+            if target not in parts:
+                element.refuse("acts on no hinge, slide or tendon of the model, which are the parts that are read")
+            if any(part.pull for part in parts.values()) and (target[0] == "tendon" or targets.count(target) > 1):
+                element.refuse("is one of several on a part with actuatorfrcrange, which is read of single ones only")
+            controls = None if "clampctrl" in self.disabled else self.bounds(element, "ctrl")
+            yield actuator_of(self.links, element, parts[target], controls, self.bounds(element, "force"))
+
+    def keyframes(self, controls: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Yield names and numbers of keyframes; positions outside limits are listed."""
+        sizes = [{"free": 7, "ball": 4, "fixed": 0}.get(link.joint.kind, 1) for link in self.links]
+        lengths = {"qpos": sum(sizes), "qvel": sum(size - (size > 1) for size in sizes)}
+        for number, key in enumerate(self.entries("keyframe")):
+            values: dict[str, Any] = {x: key.vector(x, (), [size]).tolist() for x, size in lengths.items()}
+            values |= zip(controls, key.vector("ctrl", (0,) * len(controls), [len(controls)]).tolist(), strict=True)
+            yield key.node.get("name") or str(number), values
+            for joint, place in zip((link.joint for link in self.links), np.cumsum([0, *sizes]), strict=False):
+                if (
+                    joint.limits
+                    and joint.kind in SINGLE
+                    and key.has("qpos")
+                    and not joint.limits[0] <= values["qpos"][place] <= joint.limits[1]
+                ):
+                    self.unread.add(f"the keyframe '{key.name}' within the limits of joints", joint.label)
 
     def closures(self) -> Iterator[Closure | Coupling]:
         """Yield the equalities that are active; their softness is not read.
@@ -621,7 +669,8 @@ def _classes(root: Element) -> dict[str, Defaults]:
                 if kind is not None and kind.defaults:
                     if wrong := {"class", "name"} & {*child.node.attrib}:
                         child.refuse(f"has {min(wrong)}, which defaults do not have")
-                    classes[name] |= {kind.defaults: _over(classes[name].get(kind.defaults, {}), child.node.attrib)}
+                    own = child.node.attrib | ({"kind": child.tag} if GAINS & {*child.node.attrib} else {})
+                    classes[name] |= {kind.defaults: _over(classes[name].get(kind.defaults, {}), own)}
             for child in element.children("default"):
                 if child.text("class") in classes:
                     child.refuse(f"is the second of the class '{child.text('class')}': one is allowed")
@@ -634,9 +683,9 @@ def _over(defaults: dict[str, str], attributes: dict[str, str]) -> dict[str, str
     """Return attributes over their defaults: one orientation replaces another, and numbers of a size the first ones."""
     turned = any(key in attributes for key in ORIENTATIONS)
     merged = {key: value for key, value in defaults.items() if not (turned and key in ORIENTATIONS)} | attributes
-    if "size" in defaults and "size" in attributes:
-        sizes = attributes["size"].split()
-        merged["size"] = " ".join(sizes + defaults["size"].split()[len(sizes) :])
+    for key in {"size", "gainprm", "biasprm"} & {*defaults} & {*attributes}:
+        sizes = attributes[key].split()
+        merged[key] = " ".join(sizes + defaults[key].split()[len(sizes) :])
     return merged
 
 

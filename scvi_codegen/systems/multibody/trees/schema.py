@@ -57,7 +57,7 @@ MJCF = {
     "mujoco": Kind(
         "model",
         children="compiler* option* default* worldbody* deformable* equality* tendon* actuator* contact* asset* "
-        "custom~ extension~ keyframe~ sensor~ size~ statistic~ visual~",
+        "custom~ extension~ keyframe* sensor~ size~ statistic~ visual~",
     ),
     "compiler": Kind(
         "angle assetdir autolimits balanceinertia boundinertia boundmass eulerseq inertiafromgeom inertiagrouprange "
@@ -76,8 +76,8 @@ MJCF = {
         "flag",
     ),
     "flag": Kind(
-        "constraint contact damper equality filterparent frictionloss gravity limit spring",
-        "actuation autoreset clampctrl diagexact energy eulerdamp fwdinv invdiscrete ipc island midphase multiccd "
+        "actuation clampctrl constraint contact damper equality filterparent frictionloss gravity limit spring",
+        "autoreset diagexact energy eulerdamp fwdinv invdiscrete ipc island midphase multiccd "
         "nativeccd override refsafe sensor sensornoise sleep speculative warmstart",
         {"passive": "enable"},
     ),
@@ -132,18 +132,20 @@ MJCF = {
     "fixed": TENDON,
     "actuator": Kind(children=" ".join(f"{tag}=actuated*" for tag in ACTUATORS.split())),
     "actuated": Kind(
-        "name class joint jointinparent gear armature damping",
-        "actdim actearly actlimited actrange area bias biasprm biastype body cogging controller cranklength cranksite "
-        "ctrllimited ctrlrange dampratio delay diameter dynprm dyntype ffrange force forcelimited forcerange fpmax "
-        "fvmax gain gainprm gaintype group imax inductance inheritrange input instance interp ki kp kv lengthrange "
-        "lmax lmin lugre motorconst nominal nsample plugin posrange range refsite resistance saturation scale site "
-        "slewmax slidersite tausmooth tendon thermal timeconst user velrange vmax",
+        "name class joint jointinparent tendon gear armature damping gaintype gainprm biastype biasprm kp kv "
+        "ctrllimited ctrlrange forcelimited forcerange dyntype timeconst delay dampratio inheritrange",
+        "actdim actearly actlimited actrange area bias body cogging controller cranklength cranksite diameter dynprm "
+        "ffrange force fpmax fvmax gain group imax inductance input instance interp ki lengthrange lmax lmin lugre "
+        "motorconst nominal nsample plugin posrange range refsite resistance saturation scale site slewmax slidersite "
+        "tausmooth thermal user velrange vmax",
         None,
         "config~",
         "actuator",
     ),
     "contact": Kind(children="pair* exclude~"),
     "pair": Kind("name class geom1 geom2 condim friction", f"{SOFTNESS} solreffriction margin gap", defaults="pair"),
+    "keyframe": Kind(children="key*"),
+    "key": Kind("name qpos qvel ctrl", "act mpos mquat plastic time"),
 }
 """Kinds of elements of MJCF, by tag or by the name that their parent calls them."""
 

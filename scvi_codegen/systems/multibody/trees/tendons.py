@@ -18,24 +18,26 @@ from scvi_codegen.systems.rotations.points import torque_of
 
 @dataclass(frozen=True, slots=True)
 class Tendon:
-    """Spring, relaxed at lengths in ``slack`` or as those of joints, damper and rotor on a combination or a path."""
+    """Spring, relaxed at lengths in ``slack`` or as those of joints, damper and rotor on a combination or a path.
+
+    ``pull``: range of the forces of actuators.
+    """
 
     joints: tuple[tuple[str, float], ...]
-    points: tuple[tuple[int, Pose], ...]
-    stiffness: tuple[float, ...]
-    damping: tuple[float, ...]
-    armature: float
-    slack: tuple[float, float] | None
+    points: tuple[tuple[int, Pose], ...] = ()
+    stiffness: tuple[float, ...] = ()
+    damping: tuple[float, ...] = ()
+    armature: float = 0.0
+    slack: tuple[float, float] | None = None
+    name: str = ""
+    pull: tuple[float, float] | None = None
 
 
 def energies_of(links: Sequence[Link], tendons: Iterable[Tendon]) -> tuple[Expr, Expr, Expr]:
     """Return kinetic energy, potential energy, and Rayleigh's function of the damping of tendons."""
     kinetic, potential, dissipated = S.Zero, S.Zero, S.Zero
     for tendon in tendons:
-        length = Add(*(exact_number(factor) * symbol(name) for name, factor in tendon.joints))
-        for ends in pairwise(tendon.points):
-            (start, _), (end, _) = frames_in_common(links, ends)
-            length += sqrt(intermediate((end - start).dot(end - start)))
+        length = length_of(links, tendon)
         rate = rate_of(links, length) if tendon.armature or tendon.damping else S.Zero
         kinetic += exact_number(tendon.armature) * rate**2 / 2
         dissipated += integral(tendon.damping, Abs(rate))
@@ -44,6 +46,15 @@ def energies_of(links: Sequence[Link], tendons: Iterable[Tendon]) -> tuple[Expr,
             extension = length - low if low == high else positive_part(length - high) - positive_part(low - length)
             potential += integral(tendon.stiffness, extension)
     return kinetic, potential, dissipated
+
+
+def length_of(links: Sequence[Link], tendon: Tendon) -> Expr:
+    """Return the combination of coordinates, or the length of the path."""
+    length = Add(*(exact_number(factor) * symbol(name) for name, factor in tendon.joints))
+    for ends in pairwise(tendon.points):
+        (start, _), (end, _) = frames_in_common(links, ends)
+        length += sqrt(intermediate((end - start).dot(end - start)))
+    return length
 
 
 def rate_of(links: Sequence[Link], length: Expr) -> Expr:

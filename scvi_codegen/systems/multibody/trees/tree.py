@@ -7,6 +7,7 @@ import unicodedata
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, count
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,18 +128,19 @@ class Link:
         name: its name.
         parent: position of the parent among the links of the tree, which is smaller than its own; -1 is the world.
         joint: joint to the parent.
-        inertia: of the link and of all that is fixed to it.
+        inertia, frames: of the link and of all that is fixed to it; the latter of links and sites, by name.
     """
 
     name: str
     parent: int
     joint: Joint
     inertia: Inertia
+    frames: tuple[tuple[str, Pose], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class DrawnLink:
-    """Geometry of a link in plain numbers, for pictures: see :class:`Link` and :class:`Joint`."""
+    """Geometry of a link in plain numbers: see :class:`Link` and :class:`Joint`; frames have position and rotation."""
 
     parent: int
     name: str
@@ -149,14 +151,17 @@ class DrawnLink:
     zero: float
     follows: tuple[str, float, float] | None
     label: str
+    frames: tuple[tuple[Any, ...], ...]
 
     @classmethod
-    def of(cls, link: Link) -> DrawnLink:
-        """Return the geometry of a link whose frame is that of its formulas, :func:`aligned`."""
+    def of(cls, link: Link, leader: Any) -> DrawnLink:
+        """Return the geometry of a link whose frame is that of its formulas, :func:`aligned`; it follows ``leader``."""
         joint = link.joint
+        follows = None if joint.follows is None else (leader[0], float(leader[1]), float(leader[2]))
         rotation = tuple(tuple(row) for row in link.joint.pose.rotation.tolist())
         position, center = (tuple(vector.tolist()) for vector in (joint.pose.position, link.inertia.center))
-        rest = joint.zero, joint.follows, joint.label
+        frames = tuple((name, pose.position.tolist(), pose.rotation.tolist()) for name, pose in link.frames)
+        rest = joint.zero, follows, joint.label, frames
         return cls(link.parent, joint.name, joint.kind, position, rotation, center, *rest)
 
 
@@ -167,18 +172,20 @@ def without_fixed(links: Sequence[Link]) -> list[Link]:
     for link in links:
         carrier, at = places[link.parent] if link.parent >= 0 else (-1, Pose())
         pose = at @ link.joint.pose
+        frames = (link.name, Pose()), *link.frames
         if link.joint.kind == "fixed":
             places.append((carrier, pose))
             if carrier >= 0:
                 base = moving[carrier]
-                moving[carrier] = replace(base, inertia=base.inertia + link.inertia.seen_from(pose))
+                frames = *base.frames, *((name, pose @ inner) for name, inner in frames)
+                moving[carrier] = replace(base, inertia=base.inertia + link.inertia.seen_from(pose), frames=frames)
         else:
             if link.joint.kind == "free" and carrier >= 0:
                 raise SystemDefinitionError(
                     f"joint '{link.joint.name}' is free, but its parent moves: remove the joint"
                 )
             places.append((len(moving), Pose()))
-            moving.append(replace(link, parent=carrier, joint=replace(link.joint, pose=pose)))
+            moving.append(replace(link, parent=carrier, joint=replace(link.joint, pose=pose), frames=frames))
     if not moving:
         raise SystemDefinitionError(
             "no body has a joint that moves: add one, or free the base (from_urdf: floating=True, MJCF: <freejoint>)"
@@ -222,7 +229,8 @@ def aligned(links: Sequence[Link]) -> list[Link]:
         inertia = link.inertia.seen_from(Pose(rotation=turn.T))
         center, matrix = without_rounding(inertia.center), without_rounding(inertia.matrix)
         inertia = replace(inertia, center=center, matrix=matrix)
-        turned.append(Link(link.name, link.parent, replace(joint, pose=pose), inertia))
+        frames = tuple((name, Pose(rotation=turn.T) @ inner) for name, inner in link.frames)
+        turned.append(Link(link.name, link.parent, replace(joint, pose=pose), inertia, frames))
     return turned
 
 
@@ -269,9 +277,9 @@ def named(links: Sequence[Link]) -> list[Link]:
         joint = link.joint
         plain = identifier(joint.name)
         numbered = chain([plain], (f"{plain}_{k}" for k in count(2)))
-        name = next(name for name in numbered if taken.isdisjoint(_symbols(joint.kind, name)))
+        name = next(name for name in numbered if taken.isdisjoint(symbols_of(joint.kind, name)))
         if joint.kind != "fixed":
-            taken |= _symbols(joint.kind, name)
+            taken |= symbols_of(joint.kind, name)
             names.setdefault(joint.name, name)
         renamed.append(replace(joint, name=name, label=joint.name))
     for i, joint in enumerate(renamed):
@@ -280,7 +288,7 @@ def named(links: Sequence[Link]) -> list[Link]:
     return [replace(link, joint=joint) for link, joint in zip(links, renamed, strict=True)]
 
 
-def _symbols(kind: str, name: str) -> set[str]:
+def symbols_of(kind: str, name: str) -> set[str]:
     """Return the names of the symbols of a joint."""
     if kind in SINGLE:
         return {name, f"{name}{DOT}", f"p_{name}", f"tau_{name}"}

@@ -1,0 +1,103 @@
+"""Actuators of MJCF as inputs of systems: gains by class, clamped controls, and motions; forces: test_robots.py."""
+
+import re
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.runs.driver.segments import input_of
+
+LIFT = """<mujoco><option gravity="0 0 0"/><default><default class="a"><position kp="9"/></default></default>
+<worldbody><body><joint name="x" type="slide"/>
+<geom type="sphere" size=".1" mass="2"/></body></worldbody><actuator>{actuators}</actuator></mujoco>"""
+ARM = """<mujoco><option><flag contact="disable"/></option><default><geom type="capsule" size=".04"/>
+<joint axis="0 1 0" damping=".1"/></default><worldbody><body><joint name="shoulder"/><geom fromto="0 0 0 0 0 -.5"/>
+<body pos="0 0 -.5"><joint name="elbow"/><geom fromto="0 0 0 0 0 -.4"/></body></body></worldbody><actuator>
+<position name="servo" joint="elbow" kp="20" kv="1" ctrlrange="-.5 .5"/>
+<motor name="shoulder" joint="shoulder" ctrlrange="-4 4"/></actuator></mujoco>"""
+
+
+def written(folder, text, **parts):
+    file = folder / "model.xml"
+    file.write_text(text.format(**parts) if parts else text)
+    return file
+
+
+@pytest.mark.second
+def test_controls_are_clamped_inputs(tmp_path):
+    motor = '<motor name="x" joint="x" gear="2" ctrlrange="-1 .5"/>'
+    system = sc.LagrangianSystem.from_mjcf(written(tmp_path, LIFT, actuators=motor), actuators=True)
+    assert (system.actuators, *system.input_ranges) == ({"x": "ctrl_x"}, ("ctrl_x", -1.0, 0.5))
+    stepper = sc.compile_stepper(system, "svi:2")
+    ramp = {"ctrl_x": ([0, 1, 2], [0, 1, 1])}  # force 2 t until t = 1/2, then 1, on the mass 2
+    run = stepper.integrate([0.0], velocity=[0.0], inputs=ramp, h=0.1, t_end=1.5)
+    assert [piece.t[0] for piece in run.pieces] == [0, 0.5, 1]
+    assert run.q[-1, 0] == pytest.approx(1 / 48 + 1 / 8 + 1 / 4, rel=1e-14)  # t^3/6; then x + v s + s^2/4
+    both = stepper.integrate_ensemble([[0.0], [0.0]], [[0.0], [0.0]], inputs={"ctrl_x": [3, -9]}, h=0.1, t_end=1)
+    assert both.q[-1].ravel() == pytest.approx([0.25, -0.5], rel=1e-14)
+    (held := stepper.start([0.0], velocity=[0.0], h=0.1)).set_inputs(ctrl_x=7)
+    held.advance(10)
+    assert held.q[0] == pytest.approx(0.25, rel=1e-14)
+
+
+@pytest.mark.second
+def test_clamped_functions_are_those_of_numpy():
+    t = np.linspace(0, 3, 7)
+    values = np.array([0, 2, -3, 1, 0.2, 0.1, 4])
+    for kind in ("constant", "linear", "cubic"):
+        raw = input_of("u", (t, np.array([values, -values]), kind), 2)
+        clamped, times = raw.clamped(-0.7, 1.1), np.linspace(0.001, 2.999, 400)
+        for time in times:
+            found, plain = (
+                [np.polyval(row[3::-1], time - row[4]) for row in data.parameters(time)] for data in (clamped, raw)
+            )
+            assert found == pytest.approx(np.clip(plain, -0.7, 1.1), abs=1e-13)
+
+
+REFUSED = {
+    '<motor site="s"/>': "<motor> 'motor' acts on no hinge, slide or tendon",
+    '<muscle joint="x"/>': "is not read as an actuator: general, motor, position, velocity are",
+    '<damper joint="x" kv="1"/>': "is not read as an actuator",
+    '<cylinder joint="x"/>': "is not read as an actuator",
+    '<general joint="x" dyntype="filter"/>': "dyntype='filter', which changes the motion and is not read",
+    '<position joint="x" timeconst=".1"/>': "timeconst='.1', which changes the motion",
+    '<position joint="x" dampratio="1"/>': "dampratio='1', which changes",
+    '<position joint="x" inheritrange="1"/>': "inheritrange='1', which changes",
+    '<velocity joint="x" class="a"/>': "has gains of <position> by its class: write them out",
+    '<general joint="x" biasprm="0 -1 2" biastype="affine"/>': "biasprm='0 -1 2', a damping ratio of the mass matrix",
+    '<motor joint="y"/>': "<motor> 'motor' acts on no hinge, slide or tendon",
+    '<general joint="x" gaintype="affine" gainprm="1 0 2" forcerange="-1 1"/>': "a gain that depends on the velocity",
+}
+
+
+@pytest.mark.parametrize("actuator", REFUSED)
+def test_other_actuators_are_refused_by_name(actuator, tmp_path):
+    file = written(tmp_path, LIFT, actuators=actuator)
+    with pytest.raises(SystemDefinitionError, match=re.escape(REFUSED[actuator])):
+        sc.LagrangianSystem.from_mjcf(file, actuators=True)
+
+
+@pytest.mark.rotated
+def test_servo_of_an_arm_moves_as_by_mujoco(tmp_path):
+    mujoco = pytest.importorskip("mujoco", reason="pip install mujoco")
+    from scipy.integrate import solve_ivp
+
+    file, t, angles = written(tmp_path, ARM), np.linspace(0, 1, 3), [-1.0, 1.0, 0.0]
+    stepper = sc.compile_stepper(sc.LagrangianSystem.from_mjcf(file, actuators=True), "svi:3")
+    inputs = {"servo": (t, angles), "ctrl_shoulder": -7.0}
+    start = {"shoulder": 0.3, "elbow": 0.1}, {"shoulder": 0.0, "elbow": 0.0}
+    run = stepper.integrate(start[0], velocity=start[1], inputs=inputs, h=0.005, t_end=1.0)
+    model = mujoco.MjModel.from_xml_path(str(file))
+    data, state = mujoco.MjData(model), np.array([0.3, 0.1, 0.0, 0.0])
+
+    def field(time, state):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = state[:2], state[2:], (np.interp(time, t, angles), -7.0)
+        mujoco.mj_forward(model, data)
+        return [*state[2:], *data.qacc]
+
+    for span in pairwise([*(piece.t[0] for piece in run.pieces), 1.0]):
+        state = solve_ivp(field, span, state, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    assert run.q[-1] == pytest.approx(state[:2], abs=1e-11)
