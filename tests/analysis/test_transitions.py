@@ -62,8 +62,8 @@ def test_an_error_of_a_run_is_detected(name: str, before: float, q: float, p: fl
     system, stepper, start = made(name)
     run = run_of(stepper, start, start.h, steps=200)
     form = located_kinks(in_all_modes(system))[0].with_parameters(**stepper.parameters_by_name(run.parameters))
-    switches = tuple(replace(crossings, q=crossings.q + before) for crossings in run.switches)
-    run = replace(run, switches=switches, q=run.q + q, p=run.p + p)
+    transitions = tuple(replace(ends, q=ends.q + before) for ends in run.transitions)
+    run = replace(run, transitions=transitions, q=run.q + q, p=run.p + p)
     checks = transition_checks(SystemUnderTest(form, sc.SVI(2), stepper, None, start), run)
     found = {check.name for check in checks if check.outcome is Outcome.VIOLATED}
     assert violated in found if violated else not found
