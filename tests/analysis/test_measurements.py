@@ -45,10 +45,16 @@ class Midpoint:
     defaults = MappingProxyType[str, float]({})
     flags = ("-O2",)
     interface = SimpleNamespace(
-        title="", rotations=(), map_names=(), inputs=(), has_fallback=False, time_transformation=None
+        title="",
+        rotations=(),
+        map_names=(),
+        inputs=(),
+        mode_names=(),
+        has_fallback=False,
+        time_transformation=None,
     )
     source = SimpleNamespace(files={"a.h": "1", "a.c": "2"})
-    _input_size = 4
+    _input_size, mode_columns = 4, ()
 
     def __init__(self, errors: Any = (0.0, 0.0), sign: int = 0, forward: float = 0.0, back: float = 0.0) -> None:
         self.errors, self.sign, self.tangent_errors = 1.0 + np.array(errors), sign, (forward, back)

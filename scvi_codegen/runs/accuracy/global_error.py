@@ -251,10 +251,8 @@ def _alternative(trajectory: Any, result: GlobalError) -> str:
 
     The latter is for conservative motions.
     """
-    if (modes := trajectory.modes) is not None and modes.choices > 1:
-        return (
-            f"; but {modes.choices} modes of the contacts were consistent: other motions are as consistent as this one"
-        )
+    if trajectory.modes is not None and trajectory.modes.ambiguous:
+        return "; but several motions of the contacts were consistent: others are as consistent as this one"
     if math.isinf(result.estimate):
         return f"; or use a method of higher order: others took more than {FURTHER} times the steps of the first run"
     if kinks := trajectory.stepper.interface.kinks:
@@ -462,7 +460,7 @@ class Runs:
                 compared.lose()
             if not last and safety * compared.largest() > self.requested:
                 break
-        if trajectory.modes is not None and trajectory.modes.choices > 1:
+        if trajectory.modes is not None and trajectory.modes.ambiguous:
             compared.lose()  # all runs chose the same one of several motions
         differences, reached = compared.relative(lambda errors: np.maximum(safety * errors, floor) <= self.requested)
         largest = float(differences.max(initial=0.0))

@@ -220,7 +220,7 @@ class CrossingSearch:
         records = records[records["acted"] != 0]
         latest = np.array(list(self.watch.mode))
         values = np.concatenate([records["mode"], latest[np.newaxis]])
-        return ModeHistory(records["t"], values, getattr(self.watch, "ambiguous", 1))
+        return ModeHistory(records["t"], values, bool(getattr(self.watch, "ambiguous", 0)))
 
     def _joined(self, recorded: Sequence[NDArray[Any]]) -> Any:
         none = self.binding.records(self.binding.new("crossing[1]"), 0)
