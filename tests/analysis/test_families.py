@@ -39,6 +39,9 @@ def test_equilibria_have_the_frequencies_of_the_linear_motion(moon, pendulum):
     above = sc.equilibrium(pendulum, [3.0])
     assert above.q == pytest.approx([np.pi], abs=1e-14)
     assert above.eigenvalues.real == pytest.approx([-1, 1], abs=1e-13) or above.eigenvalues.real[0] > 0
+    slow = sc.equilibrium(pendulum, [0.5], parameters={"g": 1e-18})
+    assert abs(slow.q) < 1e-15
+    assert slow.frequencies == pytest.approx([1e-9], rel=1e-12)
 
 
 @pytest.mark.second
@@ -146,9 +149,11 @@ def test_starts_without_a_family_are_refused(pendulum):
         sc.family(pendulum, orbit, fixed_period=True, fixed=["q"])
     with pytest.raises(sc.OrbitError, match="is one of a family of 2 parameters: fix 1 more"):
         sc.family(pendulum, orbit, parameter="g")
-    falling = sc.compile_stepper(sc.LagrangianSystem.from_text("falling", ["q"], "q_dot**2/2 - exp(q)"), "svi:2")
-    with pytest.raises(sc.OrbitError, match="no equilibrium of 'falling"):
-        sc.equilibrium(falling, [0.0])
+    system = sc.LagrangianSystem.from_text("falling", ["q"], "q_dot**2/2 - exp(k*q)/k", parameters={"k": 1.0})
+    falling = sc.compile_stepper(system, "svi:2")
+    for k in (1.0, 1e-18):  # the latter is a uniform field
+        with pytest.raises(sc.OrbitError, match="no equilibrium of 'falling"):
+            sc.equilibrium(falling, [0.0], parameters={"k": k})
 
 
 @pytest.mark.second

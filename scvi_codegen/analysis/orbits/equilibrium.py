@@ -18,6 +18,7 @@ from scvi_codegen.analysis.estimation.fixed_steps import tangents_along
 from scvi_codegen.common.errors import OrbitError, StateError, StepFailedError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import checks_arguments
+from scvi_codegen.runs.accuracy.size import RESOLVED, roundoff
 from scvi_codegen.runs.states.reduction import Reduction
 from scvi_codegen.runs.states.validation import Array, Parameters, check_inputs_given
 from scvi_codegen.runs.stepper import STEPPER, Stepper
@@ -104,21 +105,37 @@ def equilibrium(stepper: Stepper, q: ArrayLike, *, t: float = 0.0, parameters: P
     reduction = Reduction(stepper.interface)
     motion = _Motion(stepper, reduction, t, values)
     motion = motion.of_short_steps(state)
-    factors, begun = np.full(reduction.size, math.inf), 0.0
+    factors, begun, largest = np.full(reduction.size, math.inf), 0.0, 0.0
     for _ in range(MOST_ITERATIONS):
         former, (defect, derivative) = factors, motion.step(state)
         factors = np.linalg.eigvals(derivative)
-        change = np.linalg.lstsq(derivative - np.eye(reduction.size), -defect, rcond=NULL)[0]
+        moving = derivative - np.eye(reduction.size)
+        units = _units(moving)
+        balanced = moving * units / units[:, np.newaxis]
+        change = units * np.linalg.lstsq(balanced, -defect / units, rcond=NULL)[0]
+        force = np.abs(balanced @ (change / units) + defect / units).max()  # in directions in which the system is free
+        largest = max(largest, np.abs(defect / units).max())
+        sizes = np.abs(reduction.outward(*np.split(state, 2))) @ np.abs(state) / units
+        at_rest = force <= max(SAME * largest, RESOLVED * roundoff(1) * sizes.max())
         state = np.ravel(reduction.normalised(*np.split(state + reduction.inward(*np.split(state, 2)) @ change, 2)))
         # The derivative of the step, which the change of the state hardly changes, gives the scale of a small change.
         strength = np.abs(factors - 1).max()
         begun = begun or strength
-        if np.abs(np.sort(factors) - np.sort(former)).max() <= SAME * strength and strength >= FLAT * begun:
+        converged = np.abs(np.sort(factors) - np.sort(former)).max() <= SAME * strength
+        if converged and at_rest and strength >= FLAT * begun:
             return motion.at_rest(state)
     raise OrbitError(
         f"no equilibrium of '{stepper.title}' was found near q = {np.asarray(q)}: {MOST_ITERATIONS} iterations did not "
         "converge. Give a better initial guess"
     )
+
+
+def _units(moving: Array) -> Array:
+    """Return the units of mass-weighted coordinates, 1/sqrt(m), and of momenta, by dq = h/m dp of a short step."""
+    half = len(moving) // 2
+    mobility = np.abs(np.diag(moving[:half, half:]))
+    roots = np.sqrt(np.where(mobility > 0.0, mobility, 1.0))
+    return np.concatenate([roots, 1.0 / roots])
 
 
 @dataclass(frozen=True, eq=False)
