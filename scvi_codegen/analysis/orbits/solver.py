@@ -190,6 +190,8 @@ NULL_SINGULAR_VALUE = 1e-9
 """Singular values below this fraction of the largest count as zero in the pseudoinverse."""
 CLOSED = 1e-11
 """Largest closing error, relative to the size of the motion and the norm of the monodromy matrix."""
+OPEN = 1e-3
+"""Closing error relative to the size of the motion above which no growth of rounding errors makes an orbit closed."""
 CONSERVED = 1e-3
 """Relative error of the transported gradient of an integral up to which the integral counts as conserved."""
 DIFFERENCE_INCREMENT = 1e-6
@@ -437,7 +439,7 @@ class OrbitSearch:
         sizes, reduced = equations.sizes, self._reduced(equations.sizes)
         rounding = RESOLVED * roundoff(1) * float((np.abs(z[:-1]) / sizes).max())
         scaled_norm = float(np.linalg.norm(equations.monodromy / reduced[:, np.newaxis] * reduced, 2))
-        allowed = (CLOSED + rounding) * max(1.0, scaled_norm)
+        allowed = min(OPEN, (CLOSED + rounding) * max(1.0, scaled_norm))
         if not equations.relative_error <= allowed:
             raise OrbitError(
                 f"no periodic orbit was found near the guess: after {iterations} iterations the closing error is "
