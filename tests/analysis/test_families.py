@@ -54,8 +54,18 @@ def test_periods_of_a_pendulum_are_elliptic_integrals(pendulum):
     expected = 4 * ellipk((family.energies + 1) / 2)
     assert family.periods == pytest.approx(expected, rel=1e-12)
     longer = family.more(2)
+    assert longer.ended == "it has as many orbits as were asked for"
     assert len(longer) == len(family) + 2
     assert longer[-1].period == pytest.approx(4 * ellipk((longer[-1].energy + 1) / 2), rel=1e-11)
+
+
+@pytest.mark.second
+def test_family_ends_where_rounding_errors_hide_the_orbit(pendulum):
+    """Near the separatrix runs of a period do not close: they pass the upper equilibrium."""
+    family = sc.family(pendulum, sc.equilibrium(pendulum, [0.0]), amplitude=0.1, step=1.0)
+    assert "no periodic orbit was found" in family.ended
+    assert max(orbit.residual for orbit in family) < 1e-2
+    assert not family.bifurcations
 
 
 @pytest.mark.second
@@ -143,6 +153,16 @@ def test_starts_without_a_family_are_refused(pendulum):
         sc.family(pendulum, rest)
     with pytest.raises(sc.StateError, match="has 1 oscillation, none with the number 1"):
         sc.family(pendulum, rest, amplitude=0.1, mode=1)
+    with pytest.raises(sc.StateError, match="mode must be a whole number"):
+        sc.family(pendulum, rest, amplitude=0.1, mode=0.5)
+    with pytest.raises(sc.StateError, match="backward= is for a start at an orbit"):
+        sc.family(pendulum, rest, amplitude=0.1, backward=True)
+    with pytest.raises(sc.StateError, match="start must be a periodic orbit or an equilibrium, not 3"):
+        sc.family(pendulum, 3)
+    with pytest.raises(sc.StateError, match="until must be a condition as text, or a function, not 3"):
+        sc.family(pendulum, orbit, until=3)
+    with pytest.raises(sc.StateError, match="period= is a formula of parameter=, which is missing"):
+        sc.family(pendulum, orbit, period="2*pi")
     with pytest.raises(sc.StateError, match="'h' is no parameter of"):
         sc.family(pendulum, orbit, parameter="h")
     with pytest.raises(sc.OrbitError, match="is isolated: vary a parameter of the system, parameter='g', or fix less"):

@@ -219,7 +219,7 @@ class Continuation:
             try:
                 prediction = self._moved(point.y, step * point.tangent * point.units)
                 following = self._corrected(prediction, prediction - point.y, point)
-            except (EventError, OrbitError, StepFailedError, np.linalg.LinAlgError) as error:
+            except (ArithmeticError, EventError, OrbitError, StepFailedError, np.linalg.LinAlgError) as error:
                 step, failure = step / 2.0, str(error)
                 continue
             turned = following.tangent * following.units / point.units

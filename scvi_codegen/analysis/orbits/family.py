@@ -26,7 +26,7 @@ from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.common.atomic import write_atomically
 from scvi_codegen.common.errors import AccuracyWarning, OrbitError, StateError, closest, warn
 from scvi_codegen.common.representation import counted, summary
-from scvi_codegen.common.validation import checked_count, checks_arguments
+from scvi_codegen.common.validation import WHOLE, ArgumentType, check_kind, checked_count, checks_arguments, of
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runs.states.reduction import Reduction
 from scvi_codegen.runs.states.validation import Array
@@ -170,7 +170,11 @@ Until = str | Callable[[PeriodicOrbit], bool] | None
 Progress = Callable[[int], None] | None
 
 
-@checks_arguments(StateError, stepper=STEPPER)
+START = of("a periodic orbit or an equilibrium", PeriodicOrbit, Equilibrium)
+UNTIL = ArgumentType("a condition as text, or a function", lambda value: isinstance(value, str) or callable(value))
+
+
+@checks_arguments(StateError, stepper=STEPPER, start=START, mode=WHOLE)
 def family(
     stepper: Stepper,
     start: PeriodicOrbit | Equilibrium,
@@ -230,6 +234,10 @@ def family(
     if parameter is not None and parameter not in stepper.parameters:
         raise StateError(f"'{parameter}' is no parameter of '{stepper.title}'{closest(parameter, stepper.parameters)}")
     first = _state_at(start, mode, amplitude)
+    if isinstance(start, Equilibrium) and backward:
+        raise StateError("backward= is for a start at an orbit: a family that begins at an equilibrium leaves it")
+    if period is not None and parameter is None:
+        raise StateError("period= is a formula of parameter=, which is missing: name it, or give fixed_period=True")
     sequence = getattr(start, "sequence", None)
     equal = sequence if sequence is not None and sequence.tolerance is None else None
     default = ERROR if equal is None else ERROR_OF_EQUAL_STEPS
@@ -283,6 +291,8 @@ def _state_at(start: PeriodicOrbit | Equilibrium, mode: int, amplitude: float | 
 
 def _condition(until: Until, stepper: Stepper) -> Callable[[PeriodicOrbit], bool]:
     """Return whether an orbit is the last one."""
+    if until is not None:
+        check_kind(UNTIL, until, "until", StateError)
     if not isinstance(until, str):
         return until or (lambda orbit: False)
     states = state_names(stepper)
@@ -300,7 +310,7 @@ def _continued(
 ) -> Family:
     """Return the family from the last of the points on, which are counted."""
     condition, bifurcations = _condition(until, continuation.search.stepper), list[Bifurcation]()
-    ended = f"it has the {counted(count, 'orbit')} that were asked for"
+    ended = "it has as many orbits as were asked for"
     try:
         while len(points) < count:
             following = continuation.following(points[-1])
