@@ -32,7 +32,7 @@ NULL = 1e-10
 SAME = 1e-6
 """Relative change of the eigenvalues by the last but one iterate; the last one is accurate to its square."""
 OSCILLATES = 1e-6
-"""Real part of an eigenvalue, relative to its modulus, below which it is the rounding error of one on the axis."""
+"""Real part of an eigenvalue, relative to its modulus, and modulus, relative to the largest, of rounding errors."""
 FLAT = 1e-3
 """Part of the eigenvalues at the guess below which the iteration leaves for infinity, where no force is left."""
 
@@ -62,8 +62,8 @@ class Equilibrium:
 
     @property
     def _oscillations(self) -> NDArray[np.bool_]:
-        values = self.eigenvalues
-        return (values.imag > 0) & (np.abs(values.real) <= OSCILLATES * np.abs(values))
+        values, sizes = self.eigenvalues, np.abs(self.eigenvalues)
+        return np.asarray((values.imag > OSCILLATES * sizes.max()) & (np.abs(values.real) <= OSCILLATES * sizes))
 
     @property
     def frequencies(self) -> Array:
