@@ -116,6 +116,24 @@ def test_resonance_curve_has_two_folds():
     assert below.parameters[2] == pytest.approx(1.097960, abs=1e-5)
 
 
+@pytest.mark.second
+def test_resonance_of_weak_damping_is_a_circle():
+    """The phasor F/(1 - w^2 + icw), of F = c = 1e-5, at w = 1 and beside it; energy is nearly conserved."""
+    system = sc.LagrangianSystem.from_text(
+        name="resonator",
+        coordinates=["x"],
+        lagrangian="x_dot**2/2 - x**2/2 + c*x*cos(w*t)",
+        parameters={"c": 1e-5, "w": 1.0},
+        dissipation="c*x_dot**2/2",
+    )
+    orbit = sc.periodic_orbit(sc.compile_stepper(system, "svi:4"), [0.1], [1.02], period=2 * np.pi, fixed_period=True)
+    curve = sc.family(orbit.stepper, orbit, parameter="w", period="2*pi/w", step=0.3, count=6)
+    for member in curve:
+        c, w = member.parameters
+        phasor = c / (1 - w**2 + 1j * c * w)
+        assert (*member.q, *member.p) == pytest.approx((phasor.real, -w * phasor.imag), abs=1e-8)
+
+
 @pytest.mark.rotated
 def test_gait_of_a_walker_doubles_its_period():
     """At the slopes of Garcia et al. (1998), .0151 and .0177."""

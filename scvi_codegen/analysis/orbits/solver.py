@@ -738,6 +738,7 @@ class OrbitSearch:
         and if events that change the state leave their values at the ends of steps unchanged.
         """
         conserved_masks, units = [], self._reduced(sizes)
+        accepted = CONSERVED if self.stepper.interface.conserves_energy else SAME  # weak damping is no conservation
         inward = [self.reduction.inward(*np.split(start, 2)) for start in starts]
         begins = [gradient @ own * units for gradient, own in zip(gradients, inward, strict=True)]
         for start, segment, begin, own in zip(starts, segments, begins, inward, strict=True):
@@ -747,7 +748,7 @@ class OrbitSearch:
             monodromy = self._leaving(segment) @ segment.monodromy @ own
             monodromy = monodromy / units[:, np.newaxis] * units
             largest = np.linalg.norm(end, axis=1) * np.linalg.norm(monodromy, 2)
-            conserved_masks.append(np.linalg.norm(end @ monodromy - begin, axis=1) <= CONSERVED * largest)
+            conserved_masks.append(np.linalg.norm(end @ monodromy - begin, axis=1) <= accepted * largest)
             if self.stepper.divides_steps:
                 states = np.vstack([start, segment.states])
                 values = self._integrals(states, np.linspace(segment.start_time, segment.end_time, len(states)))
