@@ -569,7 +569,7 @@ class ArraySources(Sources):
 
 def _modes_of(kinks: Iterable[Kink]) -> tuple[tuple[str, ...], ...]:
     """Return the modes of kinks in an interface."""
-    return tuple((kink.mode, str(kink.function), "jumps" * kink.is_wall, *map(str, kink.power_sides)) for kink in kinks)
+    return tuple((u.mode, str(u.function), "jumps" * u.is_wall, u.held, *map(str, u.power_sides)) for u in kinks)
 
 
 @checks_arguments(system=SYSTEM, symmetries=SYMMETRIES)

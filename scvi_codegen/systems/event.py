@@ -202,10 +202,12 @@ class Kink(Event):
     Attributes:
         mode: parameter that is added to u: 0, or a number beyond all values of u, whose sign then decides.
         power_sides: signs of u with powers of it that are not whole, so that motions there are not smooth at u = 0.
+        held: sum of the masks of contacts that keep u at 0, where it has no zeros.
     """
 
     mode: str = field(kw_only=True)
     power_sides: tuple[int, ...] = field(default=(), kw_only=True)
+    held: str = field(default="0", kw_only=True)
 
     @property
     def changes_state(self) -> bool:

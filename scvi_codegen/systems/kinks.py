@@ -71,7 +71,7 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
     sides = {switching_function(step.args[0]) for step in powers.values() if step in rules}
     return with_modes, tuple(
         (Refraction if u in jumps else Kink)(
-            system.text_of(u.xreplace(rules)), mode=mode.name, power_sides=_signs(u, sides)
+            system.text_of(u.xreplace(rules)), mode=mode.name, power_sides=_signs(u, sides), held=_held(u, system)
         )
         for u, mode in modes.items()
     )
@@ -89,6 +89,16 @@ def check_continuity(system: MechanicalSystem) -> None:
     """Raise :class:`MethodError` if L or H jumps at a surface without a mode, where steps do not refract momenta."""
     for jump in _jumps(system).items():
         raise MethodError(jump_message(f"the function of '{system.name}'", *jump))
+
+
+def _held(u: Expr, system: MechanicalSystem) -> str:
+    """Return the sum of the masks of contacts whose gap, its rate or slip is a multiple of u."""
+    held: set[str] = set()
+    for row, reaction in zip(system.constraints[-len(system.reactions) :], system.reactions, strict=False):
+        terms = (row.diff(q) * v for q, v in zip(system.coordinates, system.velocities, strict=True))
+        rate = sum(terms, row.diff(system.time))
+        held |= {str(reaction.active) for part in (row, rate) if switching_function(part)[0] == u}
+    return " + ".join(sorted(held)) or "0"
 
 
 def _signs(u: Expr, sides: Container[tuple[Expr, int]]) -> tuple[int, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from numbers import Real
 from typing import TYPE_CHECKING, Any, Literal
 
 from scvi_codegen.common.errors import SystemDefinitionError
@@ -29,6 +30,7 @@ JOINTS = ArgumentType(
     "a list of names of joints, or True for all", lambda value: value in (True, False) or NAMES.accepts(value)
 )
 PART = ArgumentType("'contact' or 'ignore'", lambda value: value in ("contact", "ignore"))
+RESTITUTION = ArgumentType("a number from 0 to 1", lambda value: isinstance(value, Real) and 0 <= float(value) <= 1)
 PLANES = ArgumentType("'planes' or 'ignore'", lambda value: value in ("planes", "ignore"))
 BODIES = ArgumentType("a System of sympy.physics.mechanics", lambda value: hasattr(value, "actuators"))
 
@@ -333,7 +335,9 @@ class LagrangianSystem(MechanicalSystem):
         return cls.from_sympy(name=name, parameters=parameters, inputs=inputs, **of_system(system).formulas())
 
     @classmethod
-    @checks_arguments(SystemDefinitionError, gravity=NUMBERS, actuated=JOINTS, limits=PART, friction=PART)
+    @checks_arguments(
+        SystemDefinitionError, gravity=NUMBERS, actuated=JOINTS, limits=PART, friction=PART, restitution=RESTITUTION
+    )
     def from_urdf(
         cls,
         path: str | PathLike[str],
@@ -378,7 +382,9 @@ class LagrangianSystem(MechanicalSystem):
         return cls._of_tree(path, name or robot, links, gravity, actuated, check_inertias, restitution)
 
     @classmethod
-    @checks_arguments(SystemDefinitionError, actuated=JOINTS, limits=PART, friction=PART, contacts=PLANES)
+    @checks_arguments(
+        SystemDefinitionError, actuated=JOINTS, limits=PART, friction=PART, contacts=PLANES, restitution=RESTITUTION
+    )
     def from_mjcf(
         cls,
         path: str | PathLike[str],

@@ -634,3 +634,45 @@ def test_modes_at_a_kink_are_those_of_its_side(steps: dict[str, float]) -> None:
     assert run.contact_modes == [(0, ("stick",)), (pytest.approx(first, abs=1e-14), ("slip",))]
     later = 1.1 - first
     assert run.q[-1, 0] == pytest.approx(0.1 + 0.7 * first * later + later**2 / 4, abs=1e-14)
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("steps", [{"h": 0.02}, {}])
+@pytest.mark.parametrize("by", ["contact", "impact"])
+def test_drag_turns_with_the_velocity_at_impacts(steps: dict[str, float], by: str) -> None:
+    """The side of a kink follows a velocity that jumps within a step: y_dot**2 = (g/c)(1 - exp(-2 c y)), fall."""
+    ball = sc.LagrangianSystem.from_text("ball", ["y"], "y_dot**2/2 - 10*y", forces={"y": "-0.3*y_dot*abs(y_dot)"})
+    wall = {"contacts": [sc.contact("y", restitution=0.6)]} if by == "contact" else {"events": sc.impact("y", 0.6)}
+    run = sc.compile_stepper(ball, "svi:3", **wall).integrate([1.0], velocity=[0.0], t_end=0.65, **steps)
+    vt = np.sqrt(10 / 0.3)
+    first = vt / 10 * np.arccosh(np.exp(10 / vt**2))
+    up = np.arctan(0.6 * np.tanh(10 * first / vt))
+    later = up - 10 * (0.65 - first) / vt
+    assert run.q[-1, 0] == pytest.approx(vt**2 / 10 * np.log(np.cos(later) / np.cos(up)), abs=1e-11)
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize("steps", [{"h": 0.05}, {}])
+def test_kinks_of_what_rests_have_no_zeros(steps: dict[str, float]) -> None:
+    """A stop where a spring begins; a block with drag that a force moves, which sticks before it turns."""
+    stop = [sc.contact("x", restitution=0.5)]
+    run = of("x_dot**2/2 - 10*x - 50*positive_part(-x)**2", "x", stop, "svi:3").integrate(
+        [1], velocity=[0], t_end=3, **steps
+    )
+    assert abs(run.q[-1, 0]) < 1e-15
+    block = sc.LagrangianSystem.from_text("block", ["x"], "x_dot**2/2", forces={"x": "-x_dot*abs(x_dot) + sin(t)"})
+    stepper = sc.compile_stepper(block, "svi:3", contacts=[sc.friction("x_dot", limit=0.8)])
+    run = stepper.integrate([0], velocity=[0], t_end=9, **steps)
+    assert [modes[0] for _, modes in run.contact_modes] == ["stick", "slip"] * 3
+    assert run.contact_modes[1][0] == pytest.approx(np.arcsin(0.8)) == run.contact_modes[3][0] - np.pi
+
+
+@pytest.mark.second
+def test_stribeck_friction_of_the_size_of_a_slip() -> None:
+    """Fixed and adaptive runs agree, slip begins at the limit of the spring force."""
+    friction = sc.friction("x_dot - 0.2", limit="1/2 + 3/10*exp(-10*abs(x_dot - 0.2))", static_limit=0.8)
+    stepper = of("x_dot**2/2 - x**2/2", "x", [friction], "svi:3")
+    runs = [stepper.integrate([0], velocity=[0.2], t_end=25, **steps) for steps in ({"h": 0.02}, {})]
+    assert runs[0].q[-1] == pytest.approx(runs[1].q[-1], abs=1e-11)
+    assert [t for t, _ in runs[0].contact_modes] == pytest.approx([t for t, _ in runs[1].contact_modes], abs=1e-11)
+    assert runs[1].contact_modes[1] == (pytest.approx(4, abs=1e-14), ("slip",))

@@ -103,6 +103,12 @@ def test_what_contacts_cannot_be_is_refused_by_name(ball, rest, message, tmp_pat
         robot(tmp_path, FLOOR + BALL.format(ball), rest)
 
 
+@pytest.mark.parametrize("restitution", [-0.1, 2, "e", float("nan")])
+def test_restitution_is_a_number_from_0_to_1(restitution, tmp_path):
+    with pytest.raises(SystemDefinitionError, match="restitution must be a number from 0 to 1"):
+        robot(tmp_path, FLOOR + BALL.format(""), restitution=restitution)
+
+
 def test_model_files_have_the_arguments_of_contacts(tmp_path):
     one = robot(tmp_path, FLOOR + BALL.format(""), contacts="planes", restitution=0.5)
     text = '[system]\nrobot = "robot.xml"\ncontacts = "planes"\nrestitution = 0.5\n'

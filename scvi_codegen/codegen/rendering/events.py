@@ -133,6 +133,8 @@ class EventFormulas:
             if isinstance(event, Transition):  # with coefficients of the mode of a step
                 steps = parts_of_type(unit_step, function)
                 self.functions[k] = function.xreplace(steps_on_sides(steps, sides))
+            elif isinstance(event, Kink):
+                self.functions[k] += self._read(event.held, f"masks of '{event.function}'")
             if interface.variables and event.restitution is not None:
                 raise EventError(f"'{interface.system}' is a first-order system without impacts: write them in then=")
             moving = sorted(free.name for free in function.free_symbols & {*self.p, *self.v, *self.multipliers})

@@ -388,7 +388,7 @@ class Interface:
             checks.
         words: number of doubles of each number of a state, 2 in double-double arithmetic.
         kinks: functions at whose zeros the equations are not smooth, for events.
-        modes: parameter, switching function, "jumps" or "", and sides of powers of each kink that runs locate
+        modes: parameter, switching function, "jumps" or "", masks of contacts, and sides of powers of located kinks
             (:mod:`scvi_codegen.systems.kinks`).
         contacts: places of each contact (:mod:`scvi_codegen.systems.contacts.modes`).
     """
@@ -454,8 +454,8 @@ class Interface:
             for kind, function, *where in contact.transitions
         )
         kinks = (
-            (Refraction if jumps else Kink)(function, mode=mode, power_sides=tuple(map(int, sides)))
-            for mode, function, jumps, *sides in self.modes
+            (Refraction if jumps else Kink)(function, mode=mode, held=held, power_sides=tuple(map(int, sides)))
+            for mode, function, jumps, held, *sides in self.modes
         )
         return *events, *transitions, *kinks
 

@@ -295,6 +295,35 @@ static int step_from_left(const event_step *step, const event_sample *left, real
       step->workspace);
 }
 
+#ifdef EVENT_KINKS
+/* Sides of kinks after other changes, at zeros those after a small part of a step, which the next step keeps. */
+static int renew_sides(const event_step *step, long long first, const event_sample *at)
+{
+  const real part = ldexp(step->whole, -KINK_LAST_PROBE);
+  event_sample next = {.t = at->t + part, .q = step->memory, .p = step->memory + M};
+  int changed = 0, status = OK;
+  for (long long i = first; i < *step->filled; i++)
+    changed |= step->watch->acts[step->found[i].function] && !is_kink(step->found[i].function);
+  if (changed)
+    status = values_of_kinks(step, at, values_at(step, 0));
+  if (changed && status == OK)
+    status = step_from_left(step, at, part, &next);
+  if (changed && status == OK)
+    status = values_of_kinks(step, &next, values_at(step, 1));
+  for (int k = 0; changed && status == OK && k < EVENT_KINKS; k++) {
+    const int e = EVENT_FIRST[FIRST_KINK + k];
+    const real g = values_at(step, 0)[e], change = values_at(step, 1)[e] - g;
+    const int is_zero = fabs(g) <= KINK_ZERO * fabs(change);
+    if (IS_OF_TIME(k) || IS_WALL(FIRST_KINK + k) || (g == 0.0 && change == 0.0))
+      continue;
+    set_side(step, k, (is_zero ? change : g) > 0.0 ? 1 : -1);
+    if (is_zero)
+      step->watch->history[e] = (NAME(event_history)){.last = step->watch->time, .slack = fabs(g), .hits = 1};
+  }
+  return status;
+}
+#endif
+
 #ifdef CONTACTS_IN_SPACE
 /* Cuts a part of a fixed step to one that resolves slips in space; the first part was taken by the run. */
 static int shorten_part(const event_step *step, const event_sample *left, event_sample *right, real end, int changes,
@@ -412,6 +441,10 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
 #ifdef EVENT_CONTACTS
     if (status == OK && !cut)
       status = change_contacts(step, group, &at);
+#endif
+#ifdef EVENT_KINKS
+    if (status == OK && !cut)
+      status = renew_sides(step, group, &at);
 #endif
     ends = fabs(length) <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->whole);
     if (status == OK)

@@ -28,6 +28,7 @@ enum {
 };
 
 #define KINK_MISSED 16.0 /* effects of rounding beyond which the sign of the other side shows a missed crossing */
+#define KINK_ZERO 0x1p-30 /* part of the change in a small part of a step below which u counts as 0 */
 #define KINK_FAR 2.0 /* a kink is far beyond so many times the change of its function in a step */
 #define KINK_FORGETS 0.97 /* factor of former rates of change for each step */
 #define GRADE 0.5 /* step size relative to the time from or to the zero of the base of a power */
