@@ -65,6 +65,8 @@ LOCATED = 1e-10
 """Accuracy of the location of a bifurcation between two orbits, relative to their distance."""
 BRANCHES = 1e-6
 """Singular values of the closing equations below which another family crosses."""
+FLAT = 1e-6
+"""Square of the change of period and parameter along a family below which they are stationary."""
 RANK = 1e-3
 """Part of the largest of some directions below which the others depend on them."""
 
@@ -223,7 +225,7 @@ class Continuation:
                 step, failure = step / 2.0, str(error)
                 continue
             turned = following.tangent * following.units / point.units
-            if turned @ point.tangent < math.cos(LARGEST_TURN) * np.linalg.norm(turned):
+            if not point.of_both and turned @ point.tangent < math.cos(LARGEST_TURN) * np.linalg.norm(turned):
                 step, failure = step / 2.0, "its tangent turns by more than 30 degrees"
                 continue
             wider = GROWTH if following.corrections <= FEW_CORRECTIONS else 1.0
@@ -268,7 +270,13 @@ class Continuation:
         both = doubled._corrected(y, None, point)
         kept = _smallest(both.jacobian, both.same.shape[1] + 2)
         others = _without(_without(kept, both.same), both.tangent[:, np.newaxis])
-        return doubled, replace(both, tangent=side * others[:, 0], step=self.step * FIRST, of_both=True)
+        # Where a period doubles and where a symmetry breaks, period and parameter are stationary along the branch.
+        tail, tangent = slice(self.search.reduction.size, None), both.tangent
+        branch = others[:, 0]
+        if (size_of_tail := tangent[tail] @ tangent[tail]) > FLAT:
+            branch = branch - tangent * (branch[tail] @ tangent[tail]) / size_of_tail
+        branch *= side / np.linalg.norm(branch)
+        return doubled, replace(both, tangent=branch, step=self.step * FIRST, of_both=True)
 
     def _corrected(self, prediction: Array, normal: Array | None, former: FamilyPoint | None = None) -> FamilyPoint:
         """Return the point of the family next to a prediction, with a discretisation error below the bound.

@@ -439,8 +439,10 @@ class OrbitSearch:
         sizes, reduced = equations.sizes, self._reduced(equations.sizes)
         rounding = RESOLVED * roundoff(1) * float((np.abs(z[:-1]) / sizes).max())
         scaled_norm = float(np.linalg.norm(equations.monodromy / reduced[:, np.newaxis] * reduced, 2))
-        allowed = min(OPEN, (CLOSED + rounding) * max(1.0, scaled_norm))
-        if not equations.relative_error <= allowed:
+        allowed = (CLOSED + rounding) * max(1.0, scaled_norm)
+        if OPEN < equations.relative_error <= allowed:
+            self._check_motion(z, motion, guess)
+        if not equations.relative_error <= min(OPEN, allowed):
             raise OrbitError(
                 f"no periodic orbit was found near the guess: after {iterations} iterations the closing error is "
                 f"{equations.error:.1e}, for q = {_listed(z[:m])}, p = {_listed(z[m:-1])}, period {z[-1]:.6g}. "

@@ -122,7 +122,9 @@ def _surfaces(formula: Expr, moving: Set[Symbol]) -> Iterator[tuple[Expr, Expr, 
 
     At most ``MOST_SURFACES``. Surfaces with the mode of a kink were examined without it.
     """
-    kinks = {term: kinks_of([term]) for term in sympy.Add.make_args(formula) if term.has(unit_step, rint)}
+    terms = sympy.Add.make_args(formula)
+    steep = [term for term in terms if any(isinstance(part, unit_step | rint) for part in parts(term))]
+    kinks = {term: kinks_of([term]) for term in steep}
     for surface in sorted(set().union(*kinks.values()), key=str)[:MOST_SURFACES]:
         if not surface.free_symbols & moving or any(isinstance(free, Mode) for free in surface.free_symbols):
             continue

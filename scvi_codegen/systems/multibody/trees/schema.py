@@ -143,7 +143,11 @@ MJCF = {
         "actuator",
     ),
     "contact": Kind(children="pair* exclude~"),
-    "pair": Kind("name class geom1 geom2 condim friction", f"{SOFTNESS} solreffriction margin gap", defaults="pair"),
+    "pair": Kind(
+        "name class geom1 geom2 condim friction",
+        f"{SOFTNESS} adhesion solreffriction surfacevel margin gap",
+        defaults="pair",
+    ),
     "keyframe": Kind(children="key*"),
     "key": Kind("name qpos qvel ctrl", "act mpos mquat plastic time"),
 }
