@@ -33,6 +33,8 @@ SAME = 1e-6
 """Relative change of the eigenvalues by the last but one iterate; the last one is accurate to its square."""
 OSCILLATES = 1e-6
 """Real part of an eigenvalue, relative to its modulus, and modulus, relative to the largest, of rounding errors."""
+ACCURATE = 1e-13
+"""Relative error of eigenvalues at which the step is not halved further."""
 FLAT = 1e-3
 """Part of the eigenvalues at the guess below which the iteration leaves for infinity, where no force is left."""
 
@@ -45,6 +47,7 @@ class Equilibrium:
         q, p: (m,) positions and momenta.
         t: time at which it was determined.
         eigenvalues: (2m,) those of the linear motion, in descending order of their imaginary parts.
+        error: difference of the eigenvalues from those of half the step, relative to the largest one.
         vectors: (2m, 2m) their eigenvectors (changes of q and p), in columns.
         parameters: (k,) in the order of ``stepper.parameters``.
         stepper: the compiled integrator.
@@ -55,6 +58,7 @@ class Equilibrium:
     t: float
     eigenvalues: NDArray[np.complex128]
     vectors: NDArray[np.complex128] = field(repr=False)
+    error: float
     parameters: Array
     stepper: Stepper = field(repr=False)
 
@@ -167,17 +171,31 @@ class _Motion:
         end = self.reduction.aligned(states[-1], state)
         return outward @ (end - state), outward @ vectors[-1].T @ inward
 
-    def at_rest(self, state: Array) -> Equilibrium:
-        """Return the equilibrium at a state."""
+    def _spectrum(self, state: Array) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+        """Return the eigenvalues of the linear motion by the derivative of the step, and their vectors."""
         factors, vectors = np.linalg.eig(self.step(state)[1].astype(complex))
-        order = np.argsort(-np.angle(factors), kind="stable")
+        return np.log(factors) / self.h, vectors
+
+    def at_rest(self, state: Array) -> Equilibrium:
+        """Return the equilibrium at a state; the step is halved while its eigenvalues approach those of half of it."""
+        motion, error, (values, vectors) = self, math.inf, self._spectrum(state)
+        while error > ACCURATE:
+            motion = replace(motion, h=motion.h / 2.0)
+            finer, finer_vectors = motion._spectrum(state)
+            difference = float(np.abs(values[:, np.newaxis] - finer).min(axis=1).max())
+            difference /= float(np.abs(finer).max()) or 1.0  # free in all directions
+            if difference > error / 2.0:
+                break
+            error, values, vectors = difference, finer, finer_vectors
+        order = np.argsort(-values.imag, kind="stable")
         q, p = np.split(state, 2)
         return Equilibrium(
             q=q,
             p=p,
             t=self.t,
-            eigenvalues=np.log(factors[order]) / self.h,
+            eigenvalues=values[order],
             vectors=self.reduction.inward(q, p) @ vectors[:, order],
+            error=error,
             parameters=self.parameters,
             stepper=self.stepper,
         )
