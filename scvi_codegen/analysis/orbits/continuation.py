@@ -447,7 +447,7 @@ class Continuation:
 
     def _energy_by_parameter(self, search: OrbitSearch, start: Array, parameter: int) -> float:
         """Return the derivative of the energy of a state by a parameter, by central differences."""
-        width = DIFFERENCE_INCREMENT * (abs(search.parameters[parameter]) or 1.0)
+        width = DIFFERENCE_INCREMENT * self.parameter_unit
         changed = np.repeat(search.parameters[np.newaxis], 2, axis=0)
         changed[:, parameter] += -width, width
         q, p = start
@@ -457,7 +457,8 @@ class Continuation:
     def _with_unit(self, z: Array) -> Continuation:
         """Return the continuation with the unit of its parameter."""
         assert self.parameter is not None
-        search = self._search_at(np.append(z, self.search.parameters[self.parameter]), TOLERANCES[0] * self.bound)
+        y = np.append(z, self.search.parameters[self.parameter])
+        search = replace(self._search_at(y, TOLERANCES[0] * self.bound), energy=None)
         closing = search._closing(z)
         starts = z[:-1].reshape(1, 2, -1)
         column = self._by_parameter(search, closing, starts, float(z[-1])) / search._row_units(closing)

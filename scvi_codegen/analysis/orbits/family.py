@@ -22,6 +22,7 @@ from scvi_codegen.analysis.orbits.solver import (
     gains_of,
     momenta_at_rest,
 )
+from scvi_codegen.analysis.orbits.step_sequence import StepSequence
 from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.common.atomic import write_atomically
 from scvi_codegen.common.errors import AccuracyWarning, OrbitError, StateError, closest, warn
@@ -75,7 +76,11 @@ class Bifurcation:
             raise OrbitError(f"no other family of periodic orbits begins at a {self.kind}: the family itself passes it")
         if side not in (1, -1):
             raise StateError(f"side must be 1 or -1, one of the two sides of a branch, not {side!r}")
-        continuation = self._continuation if step is None else replace(self._continuation, step=_checked_step(step))
+        continuation = (
+            self._continuation
+            if step is None
+            else replace(self._continuation, step=_checked_part("step", step, "relative to the size of the motion"))
+        )
         continuation, start = continuation.branching(self._at, periods, side)
         return _continued(continuation, [start], checked_count(count, "count", least=2), until, progress)
 
@@ -141,7 +146,7 @@ class Family:
             self._continuation, [self._last], checked_count(count, "count", least=1) + 1, until, progress
         )
         own = len(self) - 1
-        later = (replace(found, after=found.after + own) for found in longer.bifurcations)
+        later = (replace(bifurcation, after=bifurcation.after + own) for bifurcation in longer.bifurcations)
         return replace(longer, orbits=self.orbits[:-1] + longer.orbits, bifurcations=(*self.bifurcations, *later))
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -151,8 +156,8 @@ class Family:
         """
         names = ("q", "p", "period", "energy", "parameters", "error", "multipliers", "stable")
         arrays: dict[str, Any] = {name: np.array([getattr(orbit, name) for orbit in self.orbits]) for name in names}
-        arrays["bifurcations"] = np.array([found.after for found in self.bifurcations], dtype=np.intp)
-        arrays["kinds"] = np.array([found.kind for found in self.bifurcations], dtype=np.str_)
+        arrays["bifurcations"] = np.array([bifurcation.after for bifurcation in self.bifurcations], dtype=np.intp)
+        arrays["kinds"] = np.array([bifurcation.kind for bifurcation in self.bifurcations], dtype=np.str_)
         write_atomically(path, lambda file: np.savez(file, **arrays))
 
     def plot(self, path: str | os.PathLike[str] | None = None) -> Any:
@@ -227,7 +232,7 @@ def family(
     require(stepper, "periodic_orbit")
     if start.stepper.interface != stepper.interface:
         raise StateError(f"the start is one of '{start.stepper.title}', not of '{stepper.title}'")
-    names, options = state_names(stepper), getattr(start, "options", None)
+    names = state_names(stepper)
     for name in fixed:
         if name not in names:
             raise StateError(f"fixed names '{name}', which is no coordinate or momentum{closest(name, names)}")
@@ -238,38 +243,48 @@ def family(
         raise StateError("backward= is for a start at an orbit: a family that begins at an equilibrium leaves it")
     if period is not None and parameter is None:
         raise StateError("period= is a formula of parameter=, which is missing: name it, or give fixed_period=True")
-    sequence = getattr(start, "sequence", None)
-    equal = sequence if sequence is not None and sequence.tolerance is None else None
-    default = ERROR if equal is None else ERROR_OF_EQUAL_STEPS
     search = OrbitSearch(
         stepper=stepper,
         at_rest=momenta_at_rest(stepper, start.q, start.t, start.parameters),
         reduction=Reduction(stepper.interface),
         period=float(first[-1]),
-        sequence=equal,
+        sequence=_equal_steps_of(start),
         max_step=math.inf,
         fixed_indices=(*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else [])),
         energy=None if energy is None else checked_number(energy, "the energy"),
         **gains_of(stepper, gain),
         t=start.t,
         parameters=np.array(start.parameters),
-        options=options,
+        options=start.options if isinstance(start, PeriodicOrbit) else None,
     )
     continuation = Continuation(
         search=search,
         parameter=None if parameter is None else stepper.parameters.index(parameter),
-        step=_checked_step(step),
-        bound=default if error is None else checked_number(error, "error"),
+        step=_checked_part("step", step, "relative to the size of the motion"),
+        bound=_bound(search, error),
         period_of=None if period is None else Formula.of(period, stepper.parameters),
     )
     continuation, point = continuation.begun(first, start, backward=backward)
     return _continued(continuation, [point], checked_count(count, "count", least=1), until, progress)
 
 
-def _checked_step(step: float) -> float:
-    if not 0.0 < (step := checked_number(step, "step")) <= 1.0:
-        raise StateError(f"step must be between 0 and 1, relative to the size of the motion, not {step:g}")
-    return step
+def _equal_steps_of(start: PeriodicOrbit | Equilibrium) -> StepSequence | None:
+    """Return the steps that the user of an orbit chose; ``None`` for adaptive ones."""
+    if isinstance(start, Equilibrium) or start.sequence.tolerance is not None:
+        return None
+    return start.sequence
+
+
+def _bound(search: OrbitSearch, error: float | None) -> float:
+    if error is None:
+        return ERROR if search.sequence is None else ERROR_OF_EQUAL_STEPS
+    return _checked_part("error", error, "a bound of the relative discretisation error")
+
+
+def _checked_part(name: str, value: float, meaning: str) -> float:
+    if not 0.0 < (value := checked_number(value, name)) <= 1.0:
+        raise StateError(f"{name} must be between 0 and 1, {meaning}, not {value:g}")
+    return value
 
 
 def _state_at(start: PeriodicOrbit | Equilibrium, mode: int, amplitude: float | None) -> Array:
@@ -300,7 +315,10 @@ def _condition(until: Until, stepper: Stepper) -> Callable[[PeriodicOrbit], bool
 
     def condition(orbit: PeriodicOrbit) -> bool:
         numbers = (*orbit.q, *orbit.p, *orbit.parameters, orbit.energy, orbit.period)
-        return holds(dict(zip(holds.symbols, numbers, strict=True))) == 1.0
+        try:
+            return holds(dict(zip(holds.symbols, numbers, strict=True))) == 1.0
+        except (ArithmeticError, ValueError) as error:
+            raise FamilyEndsError(f"until={until!r} is undefined at the last orbit: {error}") from error
 
     return condition
 
