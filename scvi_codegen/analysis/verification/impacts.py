@@ -280,14 +280,14 @@ class RunInModes:
     @cached_property
     def changes(self) -> list[tuple[float, int, Numbers, Numbers, tuple[Array, Array]]]:
         """Some of the transitions that are alone at their time: it, number, x before and after, parameters there."""
-        run, found = self.run, []
+        run, changes = self.run, []
         for crossings, rows in changes_by_events(replace(run, events=())):
             for t, q, p, row in zip(crossings.t.tolist(), crossings.q, crossings.p, rows.tolist(), strict=True):
                 sides = parameters_on_sides(run, run.t.item(max(row - 1, 0))), parameters_on_sides(run, t)
                 ends = numbers([*q, *p, t]), numbers([*run.q[row], *run.p[row], t])
-                found.append((t, run.stepper.searched.index(crossings.event), *ends, sides))
-        times = [change[0] for change in found]
-        alone = sorted((change for change in found if times.count(change[0]) == 1), key=lambda change: change[0])
+                changes.append((t, run.stepper.searched.index(crossings.event), *ends, sides))
+        times = [change[0] for change in changes]
+        alone = sorted((change for change in changes if times.count(change[0]) == 1), key=lambda change: change[0])
         return alone[:: -(-len(alone) // SAMPLED_CHANGES) or 1]
 
     def states(self) -> Iterator[tuple[Numbers, Array]]:
@@ -315,8 +315,8 @@ def transition_checks(tested: SystemUnderTest, run: Trajectory) -> Iterator[Chec
         ("friction", "it is in its cone, and opposite to slip (60 digits)", ("stops", "forward", "backward", "begins")),
         ("closed contacts", "gaps, their rates, and slips that stick are 0 (60 digits)", ("constraint",)),
     ):
-        if chosen := [k for k, kind in enumerate(kinds) if kind in ends]:
-            yield from checked(name, statement, partial(_conditions, of, chosen))
+        if rows_of_kinds := [k for k, kind in enumerate(kinds) if kind in ends]:
+            yield from checked(name, statement, partial(_conditions, of, rows_of_kinds))
     statement = "continuous; where L jumps p+ - p- = lambda u_q and H+ - H- = -lambda u_t (60 digits)"
     yield from checked("states at kinks", statement, partial(_states_at_kinks, of))
     statement = f"order {tested.method.order} in h of the end of a run, and of its balance H - W"
@@ -330,9 +330,13 @@ def _zeros(of: RunInModes) -> Finding:
     return Finding(max(values), ROUNDED, f"relative to its terms, {len(values)} transitions")
 
 
-def _conditions(of: RunInModes, chosen: list[int]) -> Finding:
+def _conditions(of: RunInModes, rows_of_kinds: list[int]) -> Finding:
     """Return how far below 0 functions are at states of the run, relative to their terms."""
-    low = [float(-of.relative(*state)[chosen].min()) for state in of.states() if min(of.values(*state)[chosen]) < 0]
+    low = [
+        float(-of.relative(*state)[rows_of_kinds].min())
+        for state in of.states()
+        if min(of.values(*state)[rows_of_kinds]) < 0
+    ]
     return Finding(max(low, default=0.0), ROUNDED, "relative to their terms")
 
 

@@ -52,10 +52,10 @@ def plot_family(family: Family, path: str | os.PathLike[str] | None = None) -> F
         heights = [height(orbit, run) for orbit, run in zip(family, runs, strict=True)]
         curve.plot(family.values, heights, color=COLORS[-1], linewidth=0.8)
         curve.scatter(family.values, heights, s=6, c=[_color(orbit) for orbit in family])
-        for found in family.bifurcations:
-            place = (family.value_of(found.orbit), height(found.orbit, found.orbit.run()))
+        for bifurcation in family.bifurcations:
+            place = (family.value_of(bifurcation.orbit), height(bifurcation.orbit, bifurcation.orbit.run()))
             curve.plot(*place, "o", color=COLORS[1])
-            curve.annotate(found.kind, place, fontsize=8)
+            curve.annotate(bifurcation.kind, place, fontsize=8)
         curve.set(xlabel=parameter or "energy", ylabel="period" if parameter is None else f"largest {coordinate}")
         if path is not None:
             save(figure, path)

@@ -58,7 +58,7 @@ def family(model_name: str, output: str | None, plot: str | None, **choices: Any
     stepper, vary = model.stepper(), choices["vary"]
     period = None if choices["period"] is None else Formula.of(choices["period"], stepper.parameters)
     varies = period is not None and vary in map(str, period.expression.free_symbols)
-    found = families.family(
+    members = families.family(
         stepper,
         _start(model, stepper, choices["amplitude"], period, fixed_period=varies),
         parameter=vary,
@@ -72,8 +72,8 @@ def family(model_name: str, output: str | None, plot: str | None, **choices: Any
         amplitude=choices["amplitude"],
         progress=None if is_quiet() or not sys.stderr.isatty() else _show_progress,
     )
-    tell(_described(found), **_numbers(found))
-    for target, write in ((output, found.save), (plot, found.plot)):
+    tell(_described(members), **_numbers(members))
+    for target, write in ((output, members.save), (plot, members.plot)):
         if target is not None:
             write(target)
             tell(f"wrote {target}")
@@ -101,27 +101,27 @@ def _show_progress(count: int) -> None:
     click.echo(f"\r{counted(count, 'orbit')}", nl=False, err=True)
 
 
-def _described(found: families.Family) -> str:
-    name, stepper = found.parameter or "energy", found[0].stepper
-    first, last = found.values[[0, -1]]
+def _described(members: families.Family) -> str:
+    name, stepper = members.parameter or "energy", members[0].stepper
+    first, last = members.values[[0, -1]]
     lines = [
-        f"{stepper.title}: {counted(len(found), 'periodic orbit')}",
-        f"{name} {first:.12g} to {last:.12g}, period {found.periods[0]:.12g} to {found.periods[-1]:.12g}",
-        f"discretisation errors up to {max(orbit.error for orbit in found):.1e}",
-        f"{sum(orbit.stable for orbit in found)} are stable",
+        f"{stepper.title}: {counted(len(members), 'periodic orbit')}",
+        f"{name} {first:.12g} to {last:.12g}, period {members.periods[0]:.12g} to {members.periods[-1]:.12g}",
+        f"discretisation errors up to {max(orbit.error for orbit in members):.1e}",
+        f"{sum(orbit.stable for orbit in members)} are stable",
         *(
-            f"{at.kind} at {name} {found.value_of(at.orbit):.12g}, period {at.orbit.period:.12g}"
-            for at in found.bifurcations
+            f"{at.kind} at {name} {members.value_of(at.orbit):.12g}, period {at.orbit.period:.12g}"
+            for at in members.bifurcations
         ),
-        f"ended: {found.ended}",
+        f"ended: {members.ended}",
     ]
     return "\n".join(lines)
 
 
-def _numbers(found: families.Family) -> dict[str, Any]:
+def _numbers(members: families.Family) -> dict[str, Any]:
     def numbers(orbit: PeriodicOrbit) -> dict[str, Any]:
         return {
-            "value": found.value_of(orbit),
+            "value": members.value_of(orbit),
             "period": orbit.period,
             "energy": orbit.energy,
             "error": orbit.error,
@@ -130,8 +130,8 @@ def _numbers(found: families.Family) -> dict[str, Any]:
         }
 
     return {
-        "parameter": found.parameter,
-        "ended": found.ended,
-        "orbits": [numbers(orbit) for orbit in found],
-        "bifurcations": [{"kind": at.kind, "after": at.after, **numbers(at.orbit)} for at in found.bifurcations],
+        "parameter": members.parameter,
+        "ended": members.ended,
+        "orbits": [numbers(orbit) for orbit in members],
+        "bifurcations": [{"kind": at.kind, "after": at.after, **numbers(at.orbit)} for at in members.bifurcations],
     }
