@@ -3,7 +3,7 @@
     python benchmarks/robot_files.py FOLDER
 
 MJCF files are compared with MuJoCo, if it is installed, at a random state: energy, power and equations of motion. URDF
-files are loaded, those without a fixed base with a free one.
+files are loaded, and not compared.
 """
 
 import sys

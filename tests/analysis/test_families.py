@@ -164,6 +164,13 @@ def test_gait_of_a_walker_doubles_its_period():
     assert again.orbit.parameters[0] == pytest.approx(0.0176694, abs=1e-6)
 
 
+@pytest.mark.second
+@pytest.mark.parametrize(("method", "error"), [("stoermer-verlet", 1e-8), ("svi:2", 1e-11), ("svi:8", 1e-13)])
+def test_eigenvalues_have_their_error(method, error):
+    rest = sc.equilibrium(sc.compile_stepper(PENDULUM, method), [0.1])
+    assert abs(rest.frequencies[0] - 1) <= rest.error < error
+
+
 def test_starts_without_a_family_are_refused(pendulum):
     rest = sc.equilibrium(pendulum, [0.0])
     orbit = sc.periodic_orbit(pendulum, [0.5], [0.0], period=6.3)
@@ -181,6 +188,11 @@ def test_starts_without_a_family_are_refused(pendulum):
         sc.family(pendulum, orbit, until=3)
     with pytest.raises(sc.StateError, match="period= is a formula of parameter=, which is missing"):
         sc.family(pendulum, orbit, period="2*pi")
+    with pytest.raises(sc.StateError, match="error must be between 0 and 1"):
+        sc.family(pendulum, orbit, error=2)
+    undefined = sc.family(pendulum, orbit, count=3, until="log(energy - 100) > 0")
+    assert len(undefined) == 2
+    assert undefined.ended.startswith("until='log(energy - 100) > 0' is undefined")
     with pytest.raises(sc.StateError, match="'h' is no parameter of"):
         sc.family(pendulum, orbit, parameter="h")
     with pytest.raises(sc.OrbitError, match="is isolated: vary a parameter of the system, parameter='g', or fix less"):

@@ -1,6 +1,9 @@
 """Robots from URDF and MJCF: what is read, and errors of malformed files; energies: test_random_robots.py."""
 
 import re
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -561,3 +564,17 @@ def test_robot_in_which_nothing_moves_is_refused(tmp_path):
         sc.LagrangianSystem.from_urdf(ROBOTS / "arm.urdf", actuated=["elbow"])
     with pytest.raises(SystemDefinitionError, match="cannot be read"):
         sc.LagrangianSystem.from_urdf(tmp_path / "none.urdf")
+
+
+@pytest.mark.second
+def test_robots_of_a_folder_are_listed_with_their_outcome(tmp_path):
+    """By the script of the benchmarks; with MuJoCo, those of MJCF are equal."""
+    script = Path(__file__).parents[2] / "benchmarks" / "robot_files.py"
+    shutil.copytree(ROBOTS, tmp_path / "robots")
+    (tmp_path / "robots" / "wrong.xml").write_text("<mujoco><worldbody><body><jiont/></body></worldbody></mujoco>")
+    words = [sys.executable, str(script), str(tmp_path / "robots")]
+    listed = subprocess.run(words, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert len(listed) == 5
+    assert sum("loaded" in line for line in listed[:-1]) == 3
+    assert sum("wrong.xml: refused" in line and "jiont" in line for line in listed) == 1
+    assert "error of" not in "".join(listed)
