@@ -79,9 +79,9 @@ static int turn_slips(const event_step *step, const event_sample *at, const cont
   memcpy(in.role, mode, sizeof in.role);
   relax(&in, 0.0, CONTACT_SWEEPS, force);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const real *const tau = force + CONTACTS[k].tangential;
-    for (int i = 0; begins[k] && i < 2; i++)
-      mode[k].direction[i] = -tau[i] / length_of(tau, 2);
+    const real *const tau = force + CONTACTS[k].tangential, size = length_of(tau, 2);
+    for (int i = 0; begins[k] && size > 0.0 && i < 2; i++) /* without a force any direction is right */
+      mode[k].direction[i] = -tau[i] / size;
   }
   return status;
 }
