@@ -29,7 +29,7 @@ exclude_patterns = ["_extensions", "motions"]
 html_theme = "furo"
 html_title = f"scvi_codegen {release}"
 html_copy_source = html_show_sourcelink = False
-html_static_path = ["_static"]
+html_static_path = ["_static", "../templates/mathematics"]
 html_css_files = ["site.css"]
 html_search_scorer = str(Path(__file__).parent / "_extensions" / "search_scorer.js")
 

@@ -10,10 +10,21 @@ from sphinx.application import Sphinx
 __all__ = ["setup"]
 
 DOTTED = re.compile(
-    r"<munderover>\s*<mi>(\w)</mi>\s*(.*?)\s*(<mo stretchy=\"false\">˙</mo>)\s*</munderover>",
+    r"<munderover>\s*<mi>(\w)</mi>\s*((?:(?!</?munderover>).)*?)\s*"
+    r"(<mo stretchy=\"false\">[˙¨ˆ~ˉ]</mo>)\s*</munderover>",
     re.DOTALL,
 )
-"""Dotted letter with a subscript, which docutils translates with the subscript below the letter."""
+"""Accented letter with a subscript, which docutils translates with the subscript below the letter."""
+SPACED = r'\1<mspace width="0.167em"/>'
+FUNCTION = r'<mi(?: mathvariant="normal")?>[a-z]{2,}</mi>'
+AFTER_FACTOR = re.compile(
+    rf"(</m(?:i|n|sup|sub|subsup|frac|over)>|\)</mo>)(?=\s*(?:<msup>\s*)?{FUNCTION})"
+)
+"""End of a factor before the name of a function: TeX sets a thin space between them."""
+BEFORE_ARGUMENT = re.compile(
+    rf"(<mo>&ApplyFunction;</mo>|<msup>\s*{FUNCTION}\s*<mn>\d</mn>\s*</msup>)(?=\s*<m)(?!\s*<mo[^>]*>\()"
+)
+"""End of the name of a function before an argument without brackets, where TeX sets one, too."""
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
@@ -24,11 +35,12 @@ def setup(app: Sphinx) -> dict[str, Any]:
 
 
 def _mathml(latex: str, *, as_block: bool) -> str:
-    """Return MathML in which the index of a dotted letter is a subscript."""
-    translated = tex2mathml(latex, as_block=as_block)
-    return DOTTED.sub(
-        r'<msub><mover accent="true"><mi>\1</mi>\3</mover>\2</msub>', translated
+    """Return MathML in which the index of a dotted letter is a subscript, and functions stand apart."""
+    translated = DOTTED.sub(
+        r'<msub><mover accent="true"><mi>\1</mi>\3</mover>\2</msub>',
+        tex2mathml(latex, as_block=as_block),
     )
+    return AFTER_FACTOR.sub(SPACED, BEFORE_ARGUMENT.sub(SPACED, translated))
 
 
 def _inline(writer: Any, node: nodes.math) -> None:

@@ -1,7 +1,11 @@
 """MathML equals the expression, symbol by symbol, and browsers can read it."""
 
+import importlib
+import io
 import math
 import re
+import sys
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -12,6 +16,7 @@ from sympy import Float, Function, Matrix, Mul, Pow, Rational, Symbol, cos, exp,
 
 from scvi_codegen import SCVI, SVI, Gauss, SpectralCollocation, derive, problem
 from scvi_codegen.common.display.mathml import latex_name, mathml, mathml_terms
+from scvi_codegen.common.display.page import mathematics_font
 
 x, y, h = symbols("x y h")
 
@@ -184,3 +189,62 @@ def test_round_trip_detects_a_wrong_sign():
 )
 def test_latex_names_are_parsed_like_mathml_names(name, latex):
     assert latex_name(name) == latex
+
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+@pytest.mark.second
+class TestInABrowser:
+    """Formulas in the font that pages bring along, whatever the machine has: ink is counted in a screenshot."""
+
+    @pytest.fixture
+    def pieces(self, browser):
+        """Return a function from a formula to the number of its rows of ink, and the widths of its gaps in em."""
+        image = pytest.importorskip("PIL.Image")
+        view = browser.new_page(viewport={"width": 1200, "height": 300})
+
+        def look(formula: str, font: str = str(mathematics_font())) -> tuple[int, list[float]]:
+            style = f'{font} math {{ font: 100px "STIX Two Math", serif }} body {{ margin: 60px }}'
+            view.set_content(f"<!DOCTYPE html><style>{style}</style><math>{formula}</math>")
+            view.evaluate("document.fonts.ready")
+            assert view.evaluate("[...document.fonts].map(f => f.status)") == ["loaded"]
+            dark = np.asarray(image.open(io.BytesIO(view.screenshot())).convert("L")) < 128
+            rows, columns = dark.any(axis=1), np.flatnonzero(dark.any(axis=0))
+            gaps = np.diff(columns)
+            return int((np.diff(rows.astype(int)) == 1).sum()), (gaps[gaps > 1] / 100).tolist()
+
+        yield look
+        view.close()
+
+    def test_dots_of_velocities_are_visible(self, pieces):
+        for name in ("q", "x", "theta", "m"):
+            assert pieces(mathml(Symbol(name)))[0] == 1
+            assert pieces(mathml(Symbol(f"{name}_dot")))[0] == 2
+
+    def test_letters_come_from_the_font(self, browser, pieces):
+        view = browser.new_page()
+        view.set_content(f'<!DOCTYPE html><style>{mathematics_font()} b {{ font: 100px "STIX Two Math" }}</style>')
+        width = """text => {
+            const pen = document.createElement('canvas').getContext('2d');
+            const shape = family => { pen.font = `100px ${family}`; const m = pen.measureText(text);
+                return [m.width, m.actualBoundingBoxAscent, m.actualBoundingBoxDescent].join(); };
+            const loaded = document.fonts.load('100px "STIX Two Math"', text);
+            return loaded.then(() => shape('"STIX Two Math", serif') !== shape('serif'));
+        }"""
+        letters = [*"axyLθμωφλ∑∫∂√∞≤−·ℒ", *map(chr, range(0x1D44E, 0x1D454)), *map(chr, range(0x1D6FC, 0x1D714))]
+        assert [letter for letter in letters if not view.evaluate(width, letter)] == []
+        view.close()
+
+    def test_functions_stand_apart_from_factors(self, pieces):
+        close = pieces("<mi>r</mi><mi>cos</mi>")[1]
+        apart = pieces(mathml(Symbol("r") * cos(Symbol("a")))[6:-7])[1]
+        assert apart[0] > close[0] + 0.14
+
+    @pytest.mark.parametrize(("latex", "rows"), [(r"\dot q", 2), (r"\ddot q_1", 2), (r"\dot\theta_k", 2), (r"q_1", 1)])
+    def test_formulas_of_the_site_do_as_well(self, pieces, monkeypatch, latex, rows):
+        pytest.importorskip("sphinx", reason="the site is made by the extra docs")
+        monkeypatch.syspath_prepend(str(DOCS / "_extensions"))
+        monkeypatch.delitem(sys.modules, "mathml", raising=False)
+        translated = importlib.import_module("mathml")._mathml(latex, as_block=False)
+        assert pieces(translated)[0] == rows

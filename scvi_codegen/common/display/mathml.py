@@ -116,6 +116,8 @@ DOT = {"style": "font-weight:bold;padding-bottom:0.12em"}
 """Style of dots above a letter, which fonts without a table for mathematics would set onto the letter."""
 DIGIT = re.compile("(<mrow>|<msup>)*<mn>")
 """Beginning of a factor that needs a visible sign of the product before it."""
+FUNCTION = re.compile("(<mrow>|<msup>)*<mi>[a-z]{2,}</mi>")
+"""Beginning of a factor that is a function, before which TeX sets a thin space."""
 GREEK = re.compile("[\u0370-\u03ff]")
 UPRIGHT = {"mathvariant": "normal", "style": "font-style:italic"}
 """Style of Greek letters: the slanted ones that browsers would substitute are missing in most fonts."""
@@ -236,8 +238,12 @@ def _finish(node: Any) -> None:
             _finish(child)
             continue
         child.data = html.escape(html.unescape(child.data).translate(TYPESET), quote=False)
-        if child.data == "\u2062" and DIGIT.match(node.nextSibling.toxml()):
-            child.data = "·"
+        if child.data == "\u2062":
+            following = node.nextSibling.toxml()
+            if DIGIT.match(following):
+                child.data = "·"
+            elif FUNCTION.match(following):
+                node.setAttribute("rspace", "0.167em")
         if node.nodeName == "mi" and GREEK.fullmatch(child.data):
             for name, value in UPRIGHT.items():
                 node.setAttribute(name, value)

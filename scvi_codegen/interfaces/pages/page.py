@@ -25,6 +25,7 @@ from scvi_codegen.codegen.rendering.environment import template_environment
 from scvi_codegen.codegen.rendering.source import Interface, Source
 from scvi_codegen.common.atomic import write_text
 from scvi_codegen.common.display.mathml import mathml_terms
+from scvi_codegen.common.display.page import mathematics_font
 from scvi_codegen.common.errors import ArgumentError, ExpressionError, MethodError, StateError, closest
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import ArgumentType, checks_arguments, keyword_hint
@@ -229,7 +230,7 @@ class Page:
         description = _description(self, interface, initial=bool(initial))
         text = template_environment().get_template("page/page.html.jinja").render(
             title=html.escape(interface.system), method=html.escape(interface.title.split(": ", 1)[-1]),
-            version=__version__, licences=LICENCES, lagrangian=_lagrangian(document, model),
+            version=__version__, licences=LICENCES, lagrangian=_lagrangian(document, model), font=mathematics_font(),
             description=json.dumps(description, separators=(",", ":")).replace("<", "\\u003c"), wasm=code,
         )  # fmt: skip
         return INDENTED.sub("", text)
