@@ -15,6 +15,8 @@ DOTTED = re.compile(
     re.DOTALL,
 )
 """Accented letter with a subscript, which docutils translates with the subscript below the letter."""
+DOT = '<mo stretchy="false" style="padding-bottom:0.08em">'
+"""Dot that does not touch a tall letter, such as theta."""
 SPACED = r'\1<mspace width="0.167em"/>'
 FUNCTION = r'<mi(?: mathvariant="normal")?>[a-z]{2,}</mi>'
 AFTER_FACTOR = re.compile(
@@ -40,7 +42,8 @@ def _mathml(latex: str, *, as_block: bool) -> str:
         r'<msub><mover accent="true"><mi>\1</mi>\3</mover>\2</msub>',
         tex2mathml(latex, as_block=as_block),
     )
-    return AFTER_FACTOR.sub(SPACED, BEFORE_ARGUMENT.sub(SPACED, translated))
+    apart = re.sub(r'<mo stretchy="false">(?=[˙¨])', DOT, translated)
+    return AFTER_FACTOR.sub(SPACED, BEFORE_ARGUMENT.sub(SPACED, apart))
 
 
 def _inline(writer: Any, node: nodes.math) -> None:
