@@ -30,7 +30,7 @@ def additions() -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
         re.findall(rf"^`([\w/.]+)`\n\n```{kind}\n(.*?)^```$", PAGE.read_text(), re.M | re.S)
         for kind in ("python", "diff")
     )
-    return new, changes
+    return new, [(path, hunk) for path, change in changes for hunk in change.split("@@\n")]
 
 
 def changed(text: str, change: str) -> str:
