@@ -1,7 +1,7 @@
 /* Order of search results (html_search_scorer): pages with the words of the query in their title come first, then those
  * with the words in headings and index entries, guides before the glossary, and last pages that only use the terms: API
  * entries, theory and examples. */
-const supporting = {reference: -10, gallery: -8, notebooks: -8, coming_from: -8, theory: -4, glossary: -2};
+const supporting = {reference: -10, faq: -8, gallery: -8, notebooks: -8, coming_from: -8, theory: -4, glossary: -2};
 const stems = (text) => {
   const words = text.toLowerCase().split(/[^\p{L}\p{N}]+/u).filter((word) => word && !stopwords.has(word));
   return new Set(words.map((word) => new Stemmer().stemWord(word)));
@@ -23,7 +23,7 @@ var Scorer = {
     headings ??= headings_of_pages(Search._index);
     const in_title = [...query].filter((word) => heading.has(word)).length;
     const in_headings = [...query].filter((word) => headings[docname].has(word)).length;
-    const group = docname === "reference/index" ? "" : docname.split(/[/_]/)[0];
+    const group = docname.split(/[/_]/)[0];
     const section = docname.startsWith("coming_from") ? "coming_from" : group;
     return score + (10 * (in_title + in_headings)) / Math.max(query.size, 1) + (supporting[section] || 0);
   },
