@@ -43,7 +43,8 @@ about.parameters.forEach(({ place, value }) => { view(0, place + 1)[place] = val
 view(1, m).set(about.q); view(about.from_momenta ? 2 : 3, m).set(about.v);
 const statuses = [code.start(about.t, about.step.value), code.advance(about.steps, 1)], stored = code.stored();
 const [q, p] = [1, 2].map((k) => Array.from(view(k, m)));
-console.log(JSON.stringify({ statuses, stored, t: code.time(), q, p, energy: code.energy() }));
+const [t, energy] = [code.time(), code.energy()], turned = about.causes[code.turn(-about.step.value)];
+console.log(JSON.stringify({ statuses, stored, t, q, p, energy, turned }));
 """
 BOX = (
     OSCILLATOR.replace("[parameters]", 'inputs = ["F"]\n[forces]\nx = "F"\n[inputs]\nF = 0.5\n[parameters]')
@@ -69,6 +70,61 @@ span = 6.0
 [[events]]
 function = "x + y"
 terminal = true
+"""
+
+STICK_SLIP = """[system]
+name = "mass on a belt"
+coordinates = ["x"]
+lagrangian = "x_dot**2/2 - x**2/2"
+[[contacts]]
+slip = "x_dot - 3/10"
+limit = "F"
+static_limit = 0.4
+[parameters]
+F = 0.25
+[initial]
+q = [0.0]
+q_dot = [0.3]
+[method]
+method = "svi"
+degree = 3
+[run]
+step = 0.05
+span = 30.0
+"""
+BALL = """[system]
+name = "ball with friction"
+coordinates = ["x", "y", "a"]
+lagrangian = "(x_dot**2 + y_dot**2)/2 + a_dot**2/20 - y"
+[[contacts]]
+gap = "y - 1/2"
+slip = "x_dot - a_dot/2"
+friction = 0.2
+restitution = 0.5
+[initial]
+q = [0.0, 1.5, 0.0]
+q_dot = [1.0, 0.0, 0.0]
+[method]
+method = "svi"
+degree = 3
+[run]
+tolerance = 1e-10
+max_step = 0.5
+span = 8.0
+[[events]]
+function = "x - 4"
+terminal = true
+"""
+STIFF_FLOOR = """[system]
+name = "ball on a stiff floor"
+coordinates = ["y"]
+lagrangian = "y_dot**2/2 - 10*y - 50000*positive_part(-y)**2"
+[initial]
+q = [1.0]
+q_dot = [0.0]
+[run]
+step = 0.1
+span = 20.0
 """
 
 
@@ -340,6 +396,9 @@ def computed(text, steps):
         pytest.param(BOX, 200, [0, 0], id="impacts and inputs"),
         pytest.param(TRANSFORMED, 200, [0, 0], id="transformed time"),
         pytest.param(FIRST_ORDER, 100, [0, 100], id="first order, adaptive, until an event"),
+        pytest.param(STICK_SLIP, 200, [0, 0], id="dry friction"),
+        pytest.param(BALL, 60, [0, 100], id="a contact with friction, adaptive"),
+        pytest.param(STIFF_FLOOR, 200, [0, 0], id="a kink"),
     ],
 )
 def test_the_webassembly_computes_the_bits_of_python_within_200_kilobytes(tmp_path, text, steps, statuses):
@@ -353,13 +412,23 @@ def test_the_webassembly_computes_the_bits_of_python_within_200_kilobytes(tmp_pa
     model = sc.load_model(path)
     stepper = sc.compile_stepper(model.system, model.method, flags=PORTABLE_FLAGS, events=page.model.events or None)
     known = {"inputs": model.inputs} if model.inputs else {}
-    h = {"h": model.h, "steps": steps} if model.h else {"tolerance": model.tolerance, "t_end": model.end}
+    adaptive = {"tolerance": model.tolerance, "max_step": model.max_step, "t_end": model.end}
+    h = {"h": model.h, "steps": steps} if model.h else adaptive
     run = stepper.integrate(model.q, model.momenta(stepper), parameters=model.parameters, **h, **known)
     assert state["t"] == run.t[-1]
     assert np.array_equal(state["q"], run.q[-1])
     assert np.array_equal(state["p"], run.p[-1])
     assert state["energy"] == run.energy()[-1]
     assert state["stored"] == len(run.t) - 1
+    assert ("forward only" in state["turned"]) == bool(stepper.interface.contacts)
+
+
+@pytest.mark.second
+@pytest.mark.parametrize(("text", "shown"), [(STICK_SLIP, (["F"], False)), (STIFF_FLOOR, ([], True))])
+@pytest.mark.usefixtures("without_compiler")
+def test_modes_have_no_sliders_and_kinks_conserve_energy(tmp_path, text, shown):
+    about = described(sc.page(written(tmp_path, text)).html)
+    assert ([each["name"] for each in about["parameters"]], about["energy"]["conserved"]) == shown
 
 
 @pytest.mark.full

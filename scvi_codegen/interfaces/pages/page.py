@@ -62,6 +62,9 @@ CAUSES = (
     "The step failed: the changes of the state by events do not end. Use other initial values.",
     "The initial state is behind a wall. Use other initial values.",
     "The step failed: it has too many events. Use a smaller step size.",
+    "The contacts have no motion, as in Painlevé's paradox: use less friction, or other initial values.",
+    "With contacts time goes forward only: restart.",
+    "The motion slides on a surface where a force jumps: use dry friction of a contact instead.",
 )
 """Text of each status of the generated C, then of ``entry.c.jinja``."""
 PREFIX = "motion"
@@ -172,7 +175,8 @@ def page_of(model: Model, document: Mapping[str, Any], settings: Mapping[str, An
     adaptive = model.h is None or model.time_transformation is not None
     acting = tuple(event for event in model.events if event.changes_state or event.terminal)
     model = replace(model, events=acting)  # others do not affect the motion
-    result = Page(model.with_known_sizes() if adaptive or acting else model, document, adaptive=adaptive)
+    known = adaptive or acting or model.system.has_contacts
+    result = Page(model.with_known_sizes() if known else model, document, adaptive=adaptive)
     result.html  # noqa: B018  (reports errors here)
     return result
 
@@ -183,8 +187,6 @@ def _check(model: Model, ranges: Mapping[str, tuple[float, float]]) -> None:
     for input_name, value in model.inputs.items():
         if isinstance(value, tuple):
             raise MethodError(f"a slider sets the input {input_name} of {name}, which is a table: give a number")
-    if model.system.has_contacts:
-        raise MethodError(f"a page has no contacts, unlike {name}: use runs and films, a generated program or an FMU")
     if model.h is None and model.tolerance is None:
         raise MethodError(f"a page requires a step size or tolerance; {name} has neither: give [run] step or tolerance")
     if model.h is None and model.has_time_transformation:
@@ -267,6 +269,7 @@ def _entry(model: Model, interface: Interface, initial: Sequence[str], adaptive:
         sizes = [arrays.sizes[name] for name in interface.layout.sizes]
         numbers += [x for values in arrays.fields.values() for x in values.ravel().tolist()]
         tables = {name: places.ravel().tolist() for name, places in arrays.places.items()}
+    events = interface.searched(model.events)
     axes = {name: np.ravel(nodes).tolist() for name, nodes in model.mesh.points.items()} if model.mesh else {}
     return (
         template_environment()
@@ -275,10 +278,12 @@ def _entry(model: Model, interface: Interface, initial: Sequence[str], adaptive:
             array=model.array_system is not None, m=size, capacity=256 if size < 64 else 16,
             maps=len(interface.map_names), values=map(repr, numbers), sizes=sizes, tables=tables,
             constraints=interface.constraints, adaptive=adaptive, initial=initial,
-            transformed=model.time_transformation is not None, max_step=model.max_step,
+            transformed=model.time_transformation is not None,
+            max_step=model.max_step or abs(float(model.end - model.t)),
             first_step=model.first_step,
-            absolute_tolerances=absolute_tolerances_of(model, interface), events=model.events,
-            acting=any(event.changes_state for event in model.events), velocities=not starts_from_momenta(model),
+            absolute_tolerances=absolute_tolerances_of(model, interface), events=events,
+            acting=any(event.changes_state for event in events), contacts=interface.contacts, modes=interface.modes,
+            velocities=not starts_from_momenta(model),
             level=interface.energy_index if interface.in_tau else None,
             axes={f"at_{name}": nodes for name, nodes in axes.items()},
             names={f"at_{name}": k for k, name in enumerate(interface.parameters)},
@@ -382,7 +387,7 @@ def _description(shown: Page, interface: Interface, *, initial: bool) -> dict[st
         kind: [ranges.get(name, [-limit, limit]) for name in names_of_kind]
         for kind, names_of_kind, limit in zip("qv", (names, rates or names), limits, strict=True)
     }
-    conserved = all(event.restitution == 1.0 for event in model.events if event.changes_state)
+    conserved = not interface.contacts and all(e.restitution == 1.0 for e in model.events if e.changes_state)
     variables = _variables(interface, shape, len(q))
     plots = [[_variable(name, variables) for name in reversed(pair)] for pair in model.page.get("plots", ())]
     return {
@@ -391,7 +396,7 @@ def _description(shown: Page, interface: Interface, *, initial: bool) -> dict[st
         "momenta": interface.momentum_names, "parameters": _parameter_sliders(model, interface),
         "quantities": interface.map_names,
         "energy": {"label": "Energy", "conserved": bool(interface.conserves_energy) and conserved}, "plots": plots,
-        "causes": CAUSES, "events": [str(event.function) for event in model.events],
+        "causes": CAUSES, "events": [str(event.function) for event in interface.searched(model.events)],
         "from_momenta": starts_from_momenta(model), "values": len(interface.parameters),
         "initial": initial, "whole": WHOLE,
         "step": {"adaptive": adaptive or model.has_time_transformation, **_step_slider(model)},
@@ -403,7 +408,7 @@ def _description(shown: Page, interface: Interface, *, initial: bool) -> dict[st
 def _parameter_sliders(model: Model, interface: Interface) -> list[dict[str, Any]]:
     """Return name, value, range and index of each parameter that a slider sets; an input is its first coefficient."""
     inputs, ranges = {f"{name}_0": name for name in interface.inputs}, model.page.get("ranges", {})
-    unchanged = {interface.energy_parameter, *input_parameters(interface.inputs)} - inputs.keys()
+    unchanged = {interface.energy_parameter, *input_parameters(interface.inputs), *interface.mode_names} - inputs.keys()
     sliders: list[dict[str, Any]] = []
     for index, (name, value) in enumerate(_values(model, interface).items()):
         if name in unchanged:
