@@ -110,8 +110,8 @@ _named_folders: ContextVar[tuple[Path, ...]] = ContextVar("named_folders", defau
 
 @contextmanager
 def naming_folders(folders: Iterable[str | os.PathLike[str]]) -> Iterator[None]:
-    """Allow documents to name files in these folders, which a user named."""
-    token = _named_folders.set(tuple(Path(folder).resolve() for folder in folders))
+    """Allow documents to name files in these folders as well, which a user named."""
+    token = _named_folders.set((*_named_folders.get(), *(Path(folder).resolve() for folder in folders)))
     try:
         yield
     finally:

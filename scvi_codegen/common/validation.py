@@ -174,6 +174,7 @@ SWITCH = of("True or False", bool, np.bool_)
 WHOLE = ArgumentType("a whole number", lambda value: hasattr(value, "__index__") and not isinstance(value, bool))
 REAL = of("a number", numbers.Real)
 PATH = of("a path", str, os.PathLike)
+PATHS = ArgumentType("a list of paths", lambda value: not isinstance(value, str | os.PathLike))
 TABLES = ArgumentType(
     "a list of declarations, as ['bonds[B, 2]'], or a mapping from them to arrays",
     lambda value: (_is_sequence(value) or isinstance(value, Mapping)) and all(isinstance(text, str) for text in value),
@@ -195,6 +196,7 @@ KINDS = {
     r"bool": SWITCH,
     r"str \| float": FORMULA,
     r"str \| (os\.)?PathLike\[str\]": PATH,
+    r"Iterable\[str \| (os\.)?PathLike\[str\]\]": PATHS,
     r"Sequence\[str\]": NAMES,
     r"Sequence\[str\] \| Mapping\[str, Any\]": TABLES,
     r"Sequence\[Mapping\[str, Any\]\]": MAPPINGS,

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from numbers import Real
 from typing import TYPE_CHECKING, Any, Literal
 
+from scvi_codegen.common.atomic import naming_folders
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import FORMULAS, MAPPED, NAMES, NUMBERS, TEXTS, ArgumentType, checks_arguments
@@ -32,6 +33,7 @@ JOINTS = ArgumentType(
 PART = ArgumentType("'contact' or 'ignore'", lambda value: value in ("contact", "ignore"))
 RESTITUTION = ArgumentType("a number from 0 to 1", lambda value: isinstance(value, Real) and 0 <= float(value) <= 1)
 PLANES = ArgumentType("'planes' or 'ignore'", lambda value: value in ("planes", "ignore"))
+ROBOT = {"actuated": JOINTS, "limits": PART, "friction": PART, "restitution": RESTITUTION}
 BODIES = ArgumentType("a System of sympy.physics.mechanics", lambda value: hasattr(value, "actuators"))
 
 
@@ -335,9 +337,7 @@ class LagrangianSystem(MechanicalSystem):
         return cls.from_sympy(name=name, parameters=parameters, inputs=inputs, **of_system(system).formulas())
 
     @classmethod
-    @checks_arguments(
-        SystemDefinitionError, gravity=NUMBERS, actuated=JOINTS, limits=PART, friction=PART, restitution=RESTITUTION
-    )
+    @checks_arguments(SystemDefinitionError, gravity=NUMBERS, **ROBOT)
     def from_urdf(
         cls,
         path: str | PathLike[str],
@@ -382,9 +382,7 @@ class LagrangianSystem(MechanicalSystem):
         return cls._of_tree(path, name or robot, links, gravity, actuated, check_inertias, restitution)
 
     @classmethod
-    @checks_arguments(
-        SystemDefinitionError, actuated=JOINTS, limits=PART, friction=PART, contacts=PLANES, restitution=RESTITUTION
-    )
+    @checks_arguments(SystemDefinitionError, contacts=PLANES, **ROBOT)
     def from_mjcf(
         cls,
         path: str | PathLike[str],
@@ -396,6 +394,7 @@ class LagrangianSystem(MechanicalSystem):
         restitution: float = 0.0,
         actuators: bool = False,
         check_inertias: bool = True,
+        folders: Iterable[str | PathLike[str]] = (),
         name: str | None = None,
     ) -> LagrangianSystem:
         """Create the system from an MJCF file of MuJoCo: kinetic energy, gravity, springs and damping of joints.
@@ -412,16 +411,19 @@ class LagrangianSystem(MechanicalSystem):
                 friction; the warning has the number of other pairs of geoms that may touch. ``"ignore"``: none.
             restitution: coefficient of impacts of limits and geoms, 0 to 1.
             actuators: whether motors and servos act; their controls are inputs of their names, or ``ctrl_NAME``.
+            folders: those with files that the file may name (meshes, includes, models), besides its own.
             name: name of the system; by default that of the model.
 
         Raises:
             SystemDefinitionError: naming file and element, if something is malformed or unknown, or changes the motion
-                and is not read: equalities of tendons, tendons around geoms, drag of ellipsoids.
+                and is not read: equalities of tendons, tendons around geoms; or if it names a file that is neither in
+                its folder nor in ``folders``.
         """
         from scvi_codegen.systems.multibody.trees.mjcf import links_of_mjcf
 
         parts = _read_parts(limits=limits, friction=friction, contacts=contacts)
-        model, links, gravity, *others = links_of_mjcf(path, [*parts, *["actuators"] * actuators])
+        with naming_folders(folders):
+            model, links, gravity, *others = links_of_mjcf(path, [*parts, *["actuators"] * actuators])
         return cls._of_tree(path, name or model, links, gravity, actuated, check_inertias, restitution, *others)
 
     @classmethod

@@ -92,8 +92,16 @@ def test_includes_outside_the_folder_of_a_robot_are_refused(folders, file):
     (own / "link").symlink_to(other)
     robot = own / "robot.xml"
     robot.write_text(f'<mujoco><include file="{file}"/></mujoco>')
-    with pytest.raises(sc.SystemDefinitionError, match=f"names '{file}' outside the folder"):
+    with pytest.raises(
+        sc.SystemDefinitionError, match=rf"names '{file}' outside the .* folders=\['{other}'\]\), --folder"
+    ):
         sc.LagrangianSystem.from_mjcf(robot)
+    with pytest.raises(sc.SystemDefinitionError, match=f"names '{file}' outside the folder"):
+        sc.LagrangianSystem.from_mjcf(robot, folders=[own / "below"])
+    assert sc.LagrangianSystem.from_mjcf(robot, folders=[other]).dimension == 1
+    for read in (sc.LagrangianSystem.from_mjcf, load_model):
+        with pytest.raises(sc.ScviCodegenError, match="folders must be a list of paths, not"):
+            read(robot, folders=str(other))
     robot.write_text('<mujoco><include file="below/arm.xml"/></mujoco>')
     assert sc.LagrangianSystem.from_mjcf(robot).dimension == 1
 

@@ -1,9 +1,11 @@
 """Robots' files as models: default motion, partial states, keys beside them, and their pages' sections."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import output_of
 
 import scvi_codegen as sc
 from scvi_codegen.common.errors import ModelFileError
@@ -72,6 +74,24 @@ def test_impossible_inertias_are_integrated_if_the_file_says_so(tmp_path):
         parse_model('[system]\nrobot = "arm.urdf"\ncheck_inertias = false\n', folder=tmp_path)
 
 
+SERVO = """<mujoco><worldbody><body><joint name="j" axis="0 1 0" range="0 30"/><geom size=".1" pos="0 0 -1"/></body>
+</worldbody><actuator><position name="servo" joint="j"/></actuator><keyframe><key qpos=".3" ctrl=".2"/></keyframe>
+</mujoco>"""
+
+
+@pytest.mark.second
+def test_flags_of_the_command_line_are_keys_of_robots(tmp_path):
+    (tmp_path / "servo.xml").write_text(SERVO)
+    flags = ["--limits", "contact", "--friction", "ignore", "--contacts", "ignore", "--actuators", "--keyframe", "0"]
+    printed = json.loads(output_of("run", str(tmp_path / "servo.xml"), *flags, "--steps", "5", "--json"))
+    keys = 'limits = "contact"\nactuators = true\nkeyframe = "0"\n'
+    model = parse_model(f'[system]\nrobot = "servo.xml"\n{keys}[run]\nsteps = 5\n', folder=tmp_path)
+    assert (model.q, model.inputs, len(model.system.contacts)) == ((0.3,), {"servo": 0.2}, 2)
+    assert printed["final"]["q"]["j"] == pytest.approx(model.integrate().q[-1, 0], rel=1e-12)
+    with pytest.warns(sc.SystemDefinitionWarning, match="without limits of joints j; actuators servo"):
+        assert load_model(tmp_path / "servo.xml", {"system": {"keyframe": "0"}}).q == (0.3,)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -85,6 +105,9 @@ def test_impossible_inertias_are_integrated_if_the_file_says_so(tmp_path):
         (BALL + "actuated = 3\n", "actuated"),
         (BALL + "check_inertias = 0\n", "check_inertias must be true or false, not 0"),
         (BALL + 'contacts = "contact"\n', "contacts must be 'planes' or 'ignore', not 'contact'"),
+        (BALL + "actuators = 1\n", "actuators must be true or false, not 1"),
+        (BALL + 'keyframe = "qpos"\n', "there is no keyframe 'qpos' in ball.xml; did you mean 'qpos0'?"),
+        ('[system]\nname = "x"\nlimits = "contact"\n', r"\[system\] limits belongs to files of robots: write robot"),
     ],
 )
 def test_mistakes_in_the_section_of_a_robot_are_named(text, message):

@@ -57,6 +57,13 @@ def test_clamped_functions_are_those_of_numpy():
             assert found == pytest.approx(np.clip(plain, -0.7, 1.1), abs=1e-13)
 
 
+def test_actuators_of_one_joint_have_different_names(tmp_path):
+    three = "".join(f'<motor joint="x" {name}/>' for name in ('gear="2"', "", 'name="x" gear="3"'))
+    system = sc.LagrangianSystem.from_mjcf(written(tmp_path, LIFT, actuators=three), actuators=True)
+    assert system.actuators == {"x_2": "x_2", "x_3": "x_3", "x": "ctrl_x"}
+    assert system.inputs == ("x_2", "x_3", "ctrl_x")
+
+
 REFUSED = {
     '<motor site="s"/>': "<motor> 'motor' acts on no hinge, slide or tendon",
     '<muscle joint="x"/>': "is not read as an actuator: general, motor, position, velocity are",
@@ -69,6 +76,7 @@ REFUSED = {
     '<velocity joint="x" class="a"/>': "has gains of <position> by its class: write them out",
     '<general joint="x" biasprm="0 -1 2" biastype="affine"/>': "biasprm='0 -1 2', a damping ratio of the mass matrix",
     '<motor joint="y"/>': "<motor> 'motor' acts on no hinge, slide or tendon",
+    '<motor joint="x" name="m"/><motor joint="x" name="m"/>': "<motor> 'm' is the second actuator of this name",
     '<general joint="x" gaintype="affine" gainprm="1 0 2" forcerange="-1 1"/>': "a gain that depends on the velocity",
 }
 

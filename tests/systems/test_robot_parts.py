@@ -36,6 +36,12 @@ def test_macros_are_written_out(tmp_path):
 
 
 WRONG = {
+    "many": ('count="2"', 'count="1e9"', "makes more than 10000 elements, with other macros: reduce its count"),
+    "keys": (
+        "</mujoco>",
+        '<keyframe><key name="k"/><key name="k"/></keyframe></mujoco>',
+        "second keyframe of this name",
+    ),
     "count": ('count="2"', 'count="2.5"', "count='2.5', which must be a whole number"),
     "model": ('model="leg" body', 'model="lge" body', "names the model 'lge', which is not in <asset>"),
     "part": ('body="thigh"', 'body="thihg"', "names the body 'thihg', which does not exist; did you mean 'thigh'?"),

@@ -164,7 +164,7 @@ MUJOCO_CHANGES = {
     "axes": ('eulerseq="zyx"', 'eulerseq="zy"', "is not three of the letters"),
     "name": ('name="slip"', 'name="flex"', "<joint> 'flex' is the second joint of this name"),
     "include": ("<option", '<include file="none.xml"/><option', "none.xml cannot be read"),
-    "include of a device": ("<option", '<include file="/dev/zero"/><option', "must have only file, a path relative to"),
+    "include of a device": ("<option", '<include file="/dev/zero"/><option', "names '/dev/zero' outside the folder"),
     "include of a folder": ("<option", '<include file="."/><option', "it is no regular file"),
     "include of itself": ("<option", '<include file="figure.xml"/><option', "is included already"),
     "unknown attribute": ('damping="0.1"', 'dampnig="0.1"', "'dampnig'; did you mean 'damping'?"),

@@ -275,6 +275,11 @@ _TABLE: dict[str, Option] = {
         brief="velocity (q_dot)",
         determines=VELOCITY,
     ),
+    "limits": Option("system", CHOICE, "", "Robots: limits of joints [ignore].", choices=("contact", "ignore")),
+    "friction": Option("system", CHOICE, "", "Robots: dry friction of joints [ignore].", choices=("contact", "ignore")),
+    "contacts": Option("system", CHOICE, "", "MJCF: contacts with planes [ignore].", choices=("planes", "ignore")),
+    "actuators": Option("system", SWITCH, "", "MJCF: actuators act; their controls are inputs, 0 by default."),
+    "keyframe": Option("system", TEXT, "NAME", "MJCF: initial state and controls of a keyframe [qpos0]."),
     **{entry.name: entry.metadata["option"] for entry in fields(RunOptions)},
     "advise": Option(
         *("", NUMBER, "X"),

@@ -182,7 +182,7 @@ def _written(model: Model, stem: str | None) -> dict[str, str]:
 
 
 def _read_model(document: Document, changes: Document, folder: str | os.PathLike[str] = ".") -> Model:
-    entry = read_entry(document.get("system", {}), folder)
+    entry = read_entry({**document.get("system", {}), **changes.get("system", {})}, folder)
     for name in ARRAY_SECTIONS:
         if (name in document or name in changes) and not has_arrays(document):
             raise ModelFileError(f'[{name}] belongs to coordinates that are arrays, coordinates = ["q[N]"]')

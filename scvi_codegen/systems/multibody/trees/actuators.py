@@ -5,7 +5,8 @@ along l, f = -dD/dv by the Rayleigh function D = -(a l_dot + b l_dot^2/2). If F 
 Q(a))/b with its integral Q. https://mujoco.readthedocs.io/en/stable/computation/index.html#actuation-model
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import chain
 
 from sympy import Add, Expr
 
@@ -15,7 +16,7 @@ from scvi_codegen.systems.multibody.trees.document import Element
 from scvi_codegen.systems.multibody.trees.energies import exact_number
 from scvi_codegen.systems.multibody.trees.schema import Kind
 from scvi_codegen.systems.multibody.trees.tendons import Tendon, length_of, rate_of
-from scvi_codegen.systems.multibody.trees.tree import Link, identifier, symbols_of
+from scvi_codegen.systems.multibody.trees.tree import Link, identifier, numbered, symbols_of
 
 Range = tuple[float, float] | None
 Actuator = tuple[str, str, Range, Expr]  # name in the file, name and range of the input, Rayleigh function
@@ -23,8 +24,13 @@ NONE = (0.0, 0.0, 0.0)
 ABSENT = Kind(refused={"dyntype": "none", "timeconst": "0", "delay": "0", "dampratio": "0", "inheritrange": "0"})
 
 
-def actuator_of(links: Sequence[Link], element: Element, tendon: Tendon, controls: Range, forces: Range) -> Actuator:
-    """Return the actuator of an element, with these ranges, on a tendon; a joint is a tendon with one factor, 1."""
+def actuator_of(
+    links: Sequence[Link], element: Element, tendon: Tendon, others: Mapping[str, str], controls: Range, forces: Range
+) -> Actuator:
+    """Return the actuator of an element, with these ranges, on a tendon; a joint is a tendon with one factor, 1.
+
+    ``others``: inputs of the actuators before it by name, and no text by the names of those after it.
+    """
     gear = float(element.vector("gear", (1,), range(1, 7))[0])
     gain, bias = _coefficients(element)
     forces = _clamped(forces, tendon.pull, gear)
@@ -32,9 +38,14 @@ def actuator_of(links: Sequence[Link], element: Element, tendon: Tendon, control
         controls, forces = _clamped(controls, forces, gain[0]), None
     if forces is not None and gain[2]:
         element.refuse("has a gain that depends on the velocity, and a range of the force: omit one")
-    label = element.node.get("name") or element.text("joint", element.text("jointinparent", element.text("tendon", "")))
-    taken, name = {x for link in links for x in symbols_of(link.joint.kind, link.joint.name)}, identifier(label)
-    name = name if taken.isdisjoint({name, *input_parameters([name])}) else f"ctrl_{name}"
+    if others.get(label := element.node.get("name", "")):
+        element.refuse("is the second actuator of this name: rename one")
+    part = element.text("joint", element.text("jointinparent", element.text("tendon", "")))
+    label = label or next(x for x in numbered(part) if x not in others)
+    taken = {x for link in links for x in symbols_of(link.joint.kind, link.joint.name)}
+    taken |= {*(inputs := [*filter(None, others.values())]), *input_parameters(inputs)}
+    names = chain([identifier(label)], numbered(f"ctrl_{identifier(label)}"))
+    name = next(x for x in names if taken.isdisjoint({x, *input_parameters([x])}))
     length = exact_number(gear) * length_of(links, tendon)
     a, b, c = (exact_number(g) * symbol(name) + exact_number(b) for g, b in zip(gain, bias, strict=True))
     return label, name, controls, _dissipation(a + b * length, c, rate_of(links, length), forces)

@@ -15,7 +15,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from scvi_codegen.common.atomic import FOLDERS, is_inside
+from scvi_codegen.common.atomic import is_inside
 from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
 from scvi_codegen.systems.multibody.trees.schema import Kind
 from scvi_codegen.systems.multibody.trees.tree import Vector
@@ -116,11 +116,12 @@ class Element:
         return [Element(child, self.places) for child in self.node if not tags or child.tag in tags]
 
     def path(self, name: str) -> Path:
-        """Return the path of a file that is named relative to the folder of the document, which must contain it."""
-        if not is_inside(folder := Path(self.document.file).parent, folder / name):
-            where = f"copy it there, or name its folder ({FOLDERS})"
-            self.refuse(f"names '{self.text('file')}' outside the folder of the document: {where}")
-        return folder / name
+        """Return the path of a file in the folder of the document, or in one that the user names."""
+        if not is_inside(folder := Path(self.document.file).parent, path := folder / name):
+            place = path.resolve().parent
+            remedy = f"copy it there, or name its folder: from_mjcf(.., folders=['{place}']), --folder {place}"
+            self.refuse(f"names '{self.text('file')}' outside the folder of the document: {remedy}")
+        return path
 
     def child(self, tag: str) -> Element | None:
         """Return the first child with a tag."""

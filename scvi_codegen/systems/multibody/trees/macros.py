@@ -17,6 +17,8 @@ from scvi_codegen.systems.multibody.trees.document import Element
 from scvi_codegen.systems.multibody.trees.tree import Pose
 
 MACROS, SECTIONS = ("replicate", "attach"), ("tendon", "equality", "actuator", "contact")
+MOST = 10_000
+"""Largest number of elements that the macros of a document make."""
 AFFIXES = re.compile(r"^(ref|slider|crank|side)(?=site)|inparent$|[12]$")
 """What attributes are called beside the kind of element that they name: ``jointinparent``, ``body1``."""
 Pair = tuple[str, str]
@@ -33,7 +35,7 @@ class Macros:
     """
 
     def __init__(self, root: Element, models: Mapping[str, Element], pose: Callable[[Element], Pose]) -> None:
-        self.root, self.models, self.pose = root, models, pose
+        self.root, self.models, self.pose, self.size = root, models, pose, 0
         for macro, outer in [*self.macros()]:
             frames = self.replicas(macro) if macro.tag == "replicate" else [self.attached(macro)]
             at = [*outer].index(macro.node)
@@ -55,10 +57,10 @@ class Macros:
         count, euler, position = macro.number("count", least=1), macro.vector("euler", (0, 0, 0)), np.zeros(3)
         if count % 1:
             macro.refuse(f"has count='{macro.text('count')}', which must be a whole number")
-        frames, inside = list[Element](), set[Pair]()
+        frames, inside, referring = list[Element](), set[Pair](), self.referring(self.root)
         for i in range(int(count)):
             affix = "", f"{macro.text('sep', '')}{i:0{len(str(int(count)))}}"
-            frames.append(self.copies(macro, macro.children(), affix, inside, pos=position, euler=i * euler))
+            frames.append(self.copies(macro, macro.children(), affix, inside, referring, pos=position, euler=i * euler))
             position = position + self.pose(frames[-1]).rotation @ macro.vector("offset", (0, 0, 0))
         for section in self.root.children(*SECTIONS):
             for element in section.children():
@@ -80,23 +82,36 @@ class Macros:
             if (name := macro.text(kind)) not in nodes:
                 macro.refuse(f"names the {kind} '{name}', which does not exist{closest(name, nodes)}")
             parts = [Element(nodes[name], models[key].places)]
-        return self.copies(macro, parts, (macro.text("prefix"), ""), set())
+        return self.copies(macro, parts, (macro.text("prefix"), ""), set(), self.referring(models[key]))
+
+    def referring(self, source: Element) -> list[tuple[str, bool, Element]]:
+        """Return the section of each element outside of the tree, whether one inner reference suffices, the element."""
+        sections = [section for tag in SECTIONS for section in source.children(tag)]
+        own = source.node is self.root.node
+        return [(part.tag, own and part.tag == "tendon", element) for part in sections for element in part.children()]
 
     def copies(
-        self, macro: Element, parts: list[Element], affix: Pair, inside: set[Pair], **at: Iterable[float]
+        self,
+        macro: Element,
+        parts: list[Element],
+        affix: Pair,
+        inside: set[Pair],
+        referring: list[tuple[str, bool, Element]],
+        **at: Iterable[float],
     ) -> Element:
         """Return a frame with copies of parts, and add their names to ``inside``; copy what refers to them."""
         node = Node("frame", {key: " ".join(map(repr, map(float, x))) for key, x in at.items()})
         self.root.places[node] = self.root.places[macro.node]
         inside |= {(old.tag.removeprefix("free"), old.get("name", "")) for part in parts for old in part.node.iter()}
+        self.size += 1 + sum(1 for part in parts for _ in part.node.iter())
+        if self.size > MOST:
+            macro.refuse(f"makes more than {MOST} elements, with other macros: reduce its count")
         node.extend([self.copied(part, affix, inside) for part in parts])
-        source = parts[0].document if parts else self.root
-        for section in (section for tag in SECTIONS for section in source.children(tag)):
-            for element in section.children():
-                within = [name in inside for name in _references(element)]
-                if any(within) and (all(within) or (section.tag == "tendon" and source.node is self.root.node)):
-                    SubElement(self.root.node, section.tag).append(self.copied(element, affix, inside))
-                    inside.add((section.tag, element.node.get("name", "")))
+        for section, loose, element in referring:
+            within = [name in inside for name in _references(element)]
+            if any(within) and (loose or all(within)):
+                SubElement(self.root.node, section).append(self.copied(element, affix, inside))
+                inside.add((section, element.node.get("name", "")))
         return Element(node, self.root.places)
 
     def copied(self, element: Element, affix: Pair, inside: set[Pair]) -> Node:

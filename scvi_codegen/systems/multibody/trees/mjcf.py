@@ -322,6 +322,7 @@ class _MujocoModel:
         """Yield the actuators, if they are read; ``actuatorfrcrange`` is that of the only one of a joint or tendon."""
         elements = [*self.entries("actuator")] if "actuators" in self.parts and "actuation" not in self.disabled else []
         parts = {("tendon", tendon.name): tendon for tendon in tendons}
+        names = {name: "" for element in elements if (name := element.node.get("name"))}
         for label, joint in self.singles.items() if elements else ():
             own = Tendon(((joint.name, 1.0),), pull=self.bounds(self.joints[label], "actuatorfrc"))
             parts |= {("joint", label): own, ("jointinparent", label): own}
@@ -332,16 +333,24 @@ class _MujocoModel:
             if any(part.pull for part in parts.values()) and (target[0] == "tendon" or targets.count(target) > 1):
                 element.refuse("is one of several on a part with actuatorfrcrange, which is read of single ones only")
             controls = None if "clampctrl" in self.disabled else self.bounds(element, "ctrl")
-            yield actuator_of(self.links, element, parts[target], controls, self.bounds(element, "force"))
+            ranges = controls, self.bounds(element, "force")
+            actuator = actuator_of(self.links, element, parts[target], names, *ranges)
+            names[actuator[0]] = actuator[1]
+            yield actuator
 
     def keyframes(self, controls: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield names and numbers of keyframes; positions outside limits are listed."""
         sizes = [{"free": 7, "ball": 4, "fixed": 0}.get(link.joint.kind, 1) for link in self.links]
         lengths = {"qpos": sum(sizes), "qvel": sum(size - (size > 1) for size in sizes)}
+        names = set[str]()
         for number, key in enumerate(self.entries("keyframe")):
+            if (name := key.node.get("name") or str(number)) in names:
+                key.refuse("is the second keyframe of this name: rename one")
+            names.add(name)
             values: dict[str, Any] = {x: key.vector(x, (), [size]).tolist() for x, size in lengths.items()}
-            values |= zip(controls, key.vector("ctrl", (0,) * len(controls), [len(controls)]).tolist(), strict=True)
-            yield key.node.get("name") or str(number), values
+            if controls:
+                values |= zip(controls, key.vector("ctrl", (0,) * len(controls), [len(controls)]).tolist(), strict=True)
+            yield name, values
             for joint, place in zip((link.joint for link in self.links), np.cumsum([0, *sizes]), strict=False):
                 if (
                     joint.limits
@@ -620,8 +629,8 @@ def _include(root: Element) -> None:
                 nodes.append(child)
                 continue
             name = Path(child.text("file"))
-            if name.is_absolute() or set(child.node.attrib) != {"file"} or len(child.node):
-                child.refuse(f"must have only file, a path relative to the folder of the document: '{name}'")
+            if set(child.node.attrib) != {"file"} or len(child.node):
+                child.refuse("must have the attribute file, and nothing else")
             folders = [Path(file).parent for file in (root.file, child.file)]
             path = next((folder / name for folder in folders if (folder / name).exists()), folders[0] / name)
             child.path(str(path.resolve()))

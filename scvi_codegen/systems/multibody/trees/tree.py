@@ -276,8 +276,7 @@ def named(links: Sequence[Link]) -> list[Link]:
     for link in links:
         joint = link.joint
         plain = identifier(joint.name)
-        numbered = chain([plain], (f"{plain}_{k}" for k in count(2)))
-        name = next(name for name in numbered if taken.isdisjoint(symbols_of(joint.kind, name)))
+        name = next(name for name in numbered(plain) if taken.isdisjoint(symbols_of(joint.kind, name)))
         if joint.kind != "fixed":
             taken |= symbols_of(joint.kind, name)
             names.setdefault(joint.name, name)
@@ -286,6 +285,11 @@ def named(links: Sequence[Link]) -> list[Link]:
         if joint.follows:
             renamed[i] = replace(joint, follows=(names.get(joint.follows[0], joint.follows[0]), *joint.follows[1:]))
     return [replace(link, joint=joint) for link, joint in zip(links, renamed, strict=True)]
+
+
+def numbered(name: str) -> Iterator[str]:
+    """Yield NAME, NAME_2, NAME_3, .."""
+    return chain([name], (f"{name}_{k}" for k in count(2)))
 
 
 def symbols_of(kind: str, name: str) -> set[str]:
