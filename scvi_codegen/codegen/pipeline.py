@@ -78,7 +78,8 @@ from scvi_codegen.methods.discretise import discretise, discretised_form
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import tables_in_two_words
 from scvi_codegen.systems.arrays.symmetry import momentum_maps
-from scvi_codegen.systems.contacts.modes import ContactRows, bound_contacts
+from scvi_codegen.systems.contacts.modes import bound_contacts
+from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.derived_systems import with_tangent_vectors
 from scvi_codegen.systems.event import EventLike, Kink, as_events

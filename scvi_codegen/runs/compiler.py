@@ -35,7 +35,7 @@ from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
 from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.runs.stepping.features import warn_of_formulas
 from scvi_codegen.systems.contact import ContactLike
-from scvi_codegen.systems.contacts.modes import ContactRows, bound_contacts
+from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.event import Event, EventLike, as_events
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
 from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS, MechanicalSystem
@@ -152,7 +152,7 @@ def compile_stepper(
     source, interface = sources.integrator()
     interface = replace(interface, layout=replace(interface.layout, **shape), contacts=rows)
     if located and not interface.modes:
-        warn_of_formulas(interface, f"the stepper of '{system.name}'")
+        warn_of_formulas(interface, f"the stepper of '{interface.system}'")
     system.store_key()
     stepper = partial(Stepper, source, interface, variants=sources.variants, flags=flags)
     if precision == DOUBLE_DOUBLE:
@@ -178,6 +178,8 @@ def _with_contacts(
         return system, ()
     if passed := [name for name, value in others.items() if value not in (None, "auto", "double")]:
         raise MethodError(f"{passed[0]}={others[passed[0]]!r} is not available with contacts: omit it")
+    from scvi_codegen.systems.contacts.modes import bound_contacts
+
     return bound_contacts(system, (*system.contacts, *contacts))
 
 
@@ -208,7 +210,7 @@ def _compile_arrays(
     if system.constraints and isinstance(discretisation, StoermerVerlet):
         method = SVI(1, "gauss-lobatto:2")  # the name of RATTLE for known sizes
     if kinks == "located":
-        warn_of_formulas(interface, f"the stepper of '{system.name}' with sizes of each run")
+        warn_of_formulas(interface, f"the stepper of '{interface.system}' with sizes of each run")
     of_sizes = partial(compile_stepper, system, method, **common, kinks=kinks)
     arguments: dict[str, Any] = {"variants": sources.variants, "flags": common["flags"], "events": events}
     return StepperOfRunTimeSizes(source, interface, **arguments, of_sizes=of_sizes, reason=reason)

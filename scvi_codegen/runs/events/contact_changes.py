@@ -16,7 +16,7 @@ from scvi_codegen.common.errors import StateError
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.projection import projected, roots_of_masses
-from scvi_codegen.systems.contacts.modes import ContactRows
+from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.event import Transition
 
 ROUNDING = 1e-9

@@ -11,7 +11,7 @@ from scvi_codegen.common.errors import ContactError, EventWarning, MethodError, 
 from scvi_codegen.runs.results.saved_states import Array, SavedStates, parameters_on_sides
 from scvi_codegen.runs.states.validation import Parameters, States
 from scvi_codegen.runs.stepping.integrator import Integrator
-from scvi_codegen.systems.contacts.modes import ContactRows
+from scvi_codegen.systems.contacts.rows import ContactRows
 
 REFUSALS = {
     1: "the run starts at t = {t:.17g} with the gap of contact {k} at {value:.6g}, which must not be negative: correct "

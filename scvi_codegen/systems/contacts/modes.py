@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.systems.contact import Contact, ContactLike, Friction, slips_of, static_limit
+from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.event import LOOPS, Formula
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
 from scvi_codegen.systems.formulas.indices import Array, Size
@@ -29,41 +30,6 @@ MOST_CONTACTS = 64
 """Contacts of a system."""
 LEAST_SLIP = 10**200
 """Inverse fourth power of a slip that is no direction: formulas of a vector that may be 0 are finite."""
-
-
-class ContactRows(NamedTuple):
-    """Places of a contact among the masked rows and the parameters of a system; ``None`` for what it does not have.
-
-    Attributes:
-        normal, tangential: numbers of its row of the gap and of the first of its slips among the masked constraints.
-        slips: number of slips: 1 in a plane, 2 in space, 0 without friction.
-        closed, sticks: names of the masks of its mode, of each slip.
-        directions: of slip: d in a plane; in space whether it slips, and vectors of two components each (contacts.h).
-        held: name of the mask that is 1 where the gap or slip stays 0 by other contacts, and has no transitions.
-        title: its name or formula, for messages.
-        transitions: kinds, functions and conditions of its transitions
-            (:class:`~scvi_codegen.systems.event.Transition`).
-    """
-
-    normal: int | None
-    tangential: int | None
-    slips: int
-    closed: str | None
-    sticks: tuple[str, ...]
-    directions: tuple[str, ...]
-    held: str
-    title: str
-    transitions: tuple[tuple[str, ...], ...]
-
-    @property
-    def masks(self) -> tuple[str, ...]:
-        """Names of the parameters of its mode."""
-        return *self.imposing, *self.directions, self.held
-
-    @property
-    def imposing(self) -> tuple[str, ...]:
-        """Names of the masks of its rows."""
-        return *(() if self.closed is None else (self.closed,)), *self.sticks
 
 
 class Slipping(NamedTuple):

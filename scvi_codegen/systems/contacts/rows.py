@@ -1,0 +1,40 @@
+"""Places of contacts in a compiled step: read from stored programs, without symbolic libraries."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class ContactRows(NamedTuple):
+    """Places of a contact among the masked rows and the parameters of a system; ``None`` for what it does not have.
+
+    Attributes:
+        normal, tangential: numbers of its row of the gap and of the first of its slips among the masked constraints.
+        slips: number of slips: 1 in a plane, 2 in space, 0 without friction.
+        closed, sticks: names of the masks of its mode, of each slip.
+        directions: of slip: d in a plane; in space whether it slips, and vectors of two components each (contacts.h).
+        held: name of the mask that is 1 where the gap or slip stays 0 by other contacts, and has no transitions.
+        title: its name or formula, for messages.
+        transitions: kinds, functions and conditions of its transitions
+            (:class:`~scvi_codegen.systems.event.Transition`).
+    """
+
+    normal: int | None
+    tangential: int | None
+    slips: int
+    closed: str | None
+    sticks: tuple[str, ...]
+    directions: tuple[str, ...]
+    held: str
+    title: str
+    transitions: tuple[tuple[str, ...], ...]
+
+    @property
+    def masks(self) -> tuple[str, ...]:
+        """Names of the parameters of its mode."""
+        return *self.imposing, *self.directions, self.held
+
+    @property
+    def imposing(self) -> tuple[str, ...]:
+        """Names of the masks of its rows."""
+        return *(() if self.closed is None else (self.closed,)), *self.sticks
