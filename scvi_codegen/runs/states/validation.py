@@ -152,7 +152,7 @@ def _declared(declaration: str) -> tuple[str, tuple[int, ...]]:
 BINARY64, FEW = np.dtype(np.float64), 64
 SEQUENCES, NUMBERS = (list, tuple), frozenset((float, int, np.float64))
 """Types of short vectors, and of their entries, that are converted without NumPy."""
-States = ArrayLike | Mapping[str, ArrayLike]
+States = ArrayLike | Mapping[str, Any]
 """Positions, momenta or velocities: numbers in order, or arrays by name."""
 Parameters = Mapping[str, Any] | Sequence[float] | Array | None
 """Parameters, also arrays of known sizes, by name (others have their defaults), or all in order."""
