@@ -15,10 +15,12 @@ from os.path import normpath
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from browsing import UNREADABLE, VIEWS, looked_at
 from docutils.utils.math.latex2mathml import tex2mathml
 from pages import BLOCK, ROOT, Part, agree, run_command, run_page, runnable
+from scipy import signal, special
 
 import scvi_codegen
 from scvi_codegen.systems.formulas.expressions import CONSTANTS, FUNCTIONS
@@ -117,6 +119,25 @@ def test_a_page_runs_from_top_to_bottom(name, tmp_path, monkeypatch):
     assert [picture for picture in PICTURE.findall(PAGES[name]) if not (tmp_path / picture).is_file()] == []
 
 
+_TASKS = tomllib.loads((ROOT / "tests/corpus/tasks.toml").read_text(encoding="utf-8"))
+TASKS = [task | {"page": page} for page, tasks in _TASKS.items() for task in tasks]
+"""Problems from public threads, each with the page whose code solves it."""
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize("name", sorted({task["page"] for task in TASKS}))
+def test_pages_solve_the_problems_of_public_threads(name, here, monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    names: dict[str, Any] = {"signal": signal, "special": special}
+    for part in runnable(PAGES[f"{name}.md"]):
+        if part.kind == "python":
+            exec(compile(part.text, name, "exec"), names)
+    for task in TASKS:
+        if task["page"] == name:
+            value, expected = (eval(task[key], names) for key in ("value", "expected"))
+            np.testing.assert_allclose(value, expected, 0, task.get("within", 1e-12), err_msg=task["query"])
+
+
 @pytest.mark.full
 def test_the_reproduction_of_the_paper_runs(here):
     [command] = [part.text for part in runnable(PAGES["paper.md"]) if part.text.startswith(MINUTES)]
@@ -129,6 +150,8 @@ QUERIES: dict[str, set[str]] = {}
 for _page, _queries in tomllib.loads((ROOT / "tests/corpus/queries.toml").read_text(encoding="utf-8")).items():
     for _query in _queries:
         QUERIES.setdefault(_query, set()).add(_page)
+for _task in TASKS:
+    QUERIES.setdefault(_task["query"], set()).add(_task["page"])
 SEARCH = """query => {
     history.replaceState(null, '', '?q=' + encodeURIComponent(query));
     return Search._performSearch(...Search._parseQuery(query)).reverse().map(result => result[0]);
@@ -164,6 +187,9 @@ def test_the_search_finds_the_page_first_or_second(site, browser):
         view.wait_for_function("Search.hasIndex()")
         found = {query: view.evaluate(SEARCH, query)[:2] for query in QUERIES}
     assert len(found) > 300
+    assert {task["query"]: task["page"] for task in TASKS}.items() <= {
+        q: pages[0] for q, pages in found.items()
+    }.items()
     assert {query: pages for query, pages in found.items() if not QUERIES[query] & {*pages}} == {}
 
 
