@@ -87,7 +87,7 @@ def test_lyapunov_orbits_branch_to_halo_orbits(moon):
     assert halo.kind == "branch"
     assert -2 * halo.orbit.energy == pytest.approx(3.174351954, abs=1e-9)
     assert halo.orbit.period == pytest.approx(2.742994069, abs=1e-9)
-    north, south = (halo.switch(side=side, count=3)[-1] for side in (1, -1))
+    north, south = (halo.switch(backward=side, count=3)[-1] for side in (False, True))
     assert max(abs(north.run().q[:, 2])) > 1e-4
     assert north.period == pytest.approx(south.period, abs=1e-9)
     assert north.energy == pytest.approx(south.energy, abs=1e-9)

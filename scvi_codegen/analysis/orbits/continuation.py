@@ -13,21 +13,23 @@ steps of an orbit are adaptive and frozen while it is corrected, and its discret
 `periodic_orbit`.
 
 Bifurcations are zeros of functions of the orbit, by its stability indices s (or multipliers m) but the trivial ones:
-fold: the derivative of the parameter, or else of the energy, along the family; branch: prod (s - 1); period doubling:
-prod (s + 1); Krein collision: the discriminant of the indices; torus, of steps that are not symplectic:
-prod (m_j m_k - 1).
+fold: the derivative of the parameter, or else of the energy, along the family; branch: prod (s - 1), times that
+derivative, as an index passes through 1 at a fold; period doubling: prod (s + 1); Krein collision: the discriminant of
+the indices; torus, of steps that are not symplectic: prod (m_j m_k - 1), if it changes the number of |m| > 1. Of
+several real indices that pass the same value between two orbits, each is located by its rank.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scvi_codegen.analysis.estimation.fixed_steps import tangents_along
 from scvi_codegen.analysis.orbits.equilibrium import Equilibrium
@@ -35,6 +37,7 @@ from scvi_codegen.analysis.orbits.solver import (
     DIFFERENCE_INCREMENT,
     EASY,
     NULL_SINGULAR_VALUE,
+    SAME,
     SYMPLECTIC,
     TOLERANCES,
     ClosingEquations,
@@ -43,6 +46,8 @@ from scvi_codegen.analysis.orbits.solver import (
 )
 from scvi_codegen.analysis.orbits.step_sequence import StepSequence
 from scvi_codegen.common.errors import EventError, OrbitError, StepFailedError
+from scvi_codegen.runs.accuracy.size import RESOLVED, roundoff
+from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.systems.formulas.expressions import evaluate
 from scvi_codegen.systems.formulas.grammar import parse_expression
@@ -64,11 +69,25 @@ NULL = 1e-7
 LOCATED = 1e-10
 """Accuracy of the location of a bifurcation between two orbits, relative to their distance."""
 BRANCHES = 1e-6
-"""Singular values of the closing equations below which another family crosses."""
+"""Singular values of the closing equations below which another family crosses: between a bifurcation that is located to
+1e-10, where it is the error of the derivatives, 1e-9, and the next orbit, where it is the step."""
 FLAT = 1e-6
-"""Square of the change of period and parameter along a family below which they are stationary."""
+"""Square of the change of period and parameter along a family below which they are stationary: that of the energy, in
+units of the motion, has the error 1e-9 of the orbit."""
 RANK = 1e-3
-"""Part of the largest of some directions below which the others depend on them."""
+"""Part of the largest of some directions below which the others depend on them: gradients by differences have errors
+of 1e-6, and independent ones in units of the motion differ by their size."""
+BEYOND = {"branch": 1.0, "period doubling": -1.0}
+"""Values that real indices pass at bifurcations."""
+PHASES = 128
+"""Number of states along an orbit among which the nearest to another state is sought, before its time is refined."""
+BEND = math.tan(LARGEST_TURN / 4.0) / 2.0
+"""Largest distance of a family from the chord of a step, relative to the chord: of an arc that turns by 30 degrees."""
+REST, COLLISION = 1e-2, 1e-4
+"""Least speed relative to the mean one, and shortest step relative to the longest, of an orbit whose family ends at a
+homoclinic orbit and at a collision."""
+NEAR_START = 0.05
+"""Time between start and nearest impact, relative to the period, below which the start is moved along the orbit."""
 
 
 class FamilyEndsError(OrbitError):
@@ -81,12 +100,13 @@ class Formula:
 
     expression: Any
     symbols: Mapping[str, Any]
+    text: str = ""
 
     @classmethod
     def of(cls, text: str, names: Sequence[str]) -> Formula:
         """Return the formula that a text states."""
         symbols = {name: symbol(name) for name in names}
-        return cls(parse_expression(text, symbols), symbols)
+        return cls(parse_expression(text, symbols), symbols, text)
 
     def __call__(self, values: Mapping[str, float]) -> float:
         """Return its value."""
@@ -124,6 +144,7 @@ class FamilyPoint:
         corrections: number of Newton iterations.
         accuracy: index of the local tolerance in ``TOLERANCES`` that met the bound.
         step: step to the next prediction.
+        largest: size of the positions on the largest orbit so far.
         of_both: whether the point belongs to another family, too, from which this one branches off.
     """
 
@@ -139,6 +160,7 @@ class FamilyPoint:
     corrections: int
     accuracy: int
     step: float
+    largest: float
     of_both: bool = False
 
     @property
@@ -146,22 +168,57 @@ class FamilyPoint:
         """Derivative of the parameter, or else of the energy, along the family."""
         return float(self.tangent[-1] if self.by_parameter else self.energy_gradient @ self.tangent)
 
+    @property
+    def symplectic(self) -> bool:
+        """Return whether the steps of the orbit are symplectic."""
+        return self.orbit.symplectic_error <= SYMPLECTIC
+
+    @cached_property
+    def others(self) -> NDArray[np.complex128]:
+        """Stability indices, or multipliers, but those at 1 of motions that are shifted in time or by a symmetry."""
+        orbit, autonomous = self.orbit, not math.isnan(self.orbit.trivial_error)
+        values = orbit.stability_indices if self.symplectic else orbit.multipliers
+        trivial = self.conserved if self.symplectic else max(self.conserved, int(autonomous))
+        return values[np.argsort(np.abs(values - 1.0))][trivial:]
+
     @cached_property
     def tests(self) -> dict[str, float]:
         """Test functions of the bifurcations by kind; see the top of the module."""
-        orbit, autonomous = self.orbit, not math.isnan(self.orbit.trivial_error)
-        symplectic = orbit.symplectic_error <= SYMPLECTIC
-        values = orbit.stability_indices if symplectic else orbit.multipliers
-        trivial = self.conserved if symplectic else max(self.conserved, int(autonomous))
-        others = values[np.argsort(np.abs(values - 1.0))][trivial:]
+        others, symplectic = self.others, self.symplectic
         pairs = np.array(list(combinations(others, 2)), dtype=complex).reshape(-1, 2).T
         collision = np.prod((pairs[0] - pairs[1]) ** 2 if symplectic else pairs[0] * pairs[1] - 1.0)
         return {
             "fold": self.slope,
-            "branch": float(np.prod(others - 1.0).real),
+            "branch": float(np.prod(others - 1.0).real) * (self.slope or 1.0),
             "period doubling": float(np.prod(others + 1.0).real),
             "Krein collision" if symplectic else "torus": float(collision.real),
         }
+
+    def test(self, kind: str, rank: int | None = None) -> float:
+        """Return a test function, or by how much the real index of a rank is beyond 1 or -1, -1 for complex ones."""
+        if rank is None:
+            return self.tests[kind]
+        real = np.abs(self.others.imag) <= SAME
+        return float(np.sort(np.where(real, BEYOND[kind] * self.others.real - 1.0, -1.0))[-1 - rank])
+
+    @property
+    def complex_values(self) -> tuple[int, int]:
+        """Number of the complex indices or multipliers, and of those with a modulus above 1."""
+        values = self.others[np.abs(self.others.imag) > SAME]
+        return len(values), int(np.count_nonzero(np.abs(values) > 1.0))
+
+    def crossings(self, after: FamilyPoint) -> Iterator[tuple[str, int | None]]:
+        """Yield kind and rank of the test functions that change their sign between this orbit and the next one."""
+        changed = {kind for kind, value in self.tests.items() if value * after.tests.get(kind, value) < 0.0}
+        if self.complex_values[1] == after.complex_values[1]:
+            changed -= {"torus"}
+        yield from ((kind, None) for kind in self.tests if kind in changed)
+        if "fold" in changed or self.complex_values != after.complex_values:
+            return
+        for kind in BEYOND.keys() - changed:
+            ranks = range(len(self.others))
+            passes = [self.test(kind, rank) * after.test(kind, rank) < 0.0 for rank in ranks]
+            yield from ((kind, rank) for rank in ranks if passes[rank])
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +250,12 @@ class Continuation:
             continuation, y = self._with_unit(z), np.append(z, start.parameters[self.parameter])
         if isinstance(start, Equilibrium):
             growth = np.concatenate([z[:-1] - np.concatenate([start.q, start.p]), np.zeros(len(y) - len(z) + 1)])
-        point = continuation._corrected(y, growth)
+        try:
+            point = continuation.corrected(y, growth)
+        except OrbitError as error:
+            if growth is None:
+                raise
+            raise OrbitError(f"no orbit has this amplitude= beside the equilibrium; reduce it ({error})") from error
         sizes = np.linalg.svd(point.jacobian, compute_uv=False)
         rank = int(np.count_nonzero(sizes > NULL * sizes[0]))
         freedom = len(point.units) - rank - point.same.shape[1]
@@ -220,7 +282,7 @@ class Continuation:
         while step >= SMALLEST_STEP * self.step:
             try:
                 prediction = self._moved(point.y, step * point.tangent * point.units)
-                following = self._corrected(prediction, prediction - point.y, point)
+                following = self.corrected(prediction, prediction - point.y, point)
             except (ArithmeticError, EventError, OrbitError, StepFailedError, np.linalg.LinAlgError) as error:
                 step, failure = step / 2.0, str(error)
                 continue
@@ -230,22 +292,93 @@ class Continuation:
                 continue
             wider = GROWTH if following.corrections <= FEW_CORRECTIONS else 1.0
             return replace(following, step=min(self.step, wider * step))
-        raise FamilyEndsError(f"no orbit follows at {SMALLEST_STEP:.0e} of the step: {failure}")
+        raise FamilyEndsError(f"{self._last_orbit(point)} at {SMALLEST_STEP:.0e} of the step: {failure}")
 
-    def returns(self, points: Sequence[FamilyPoint]) -> bool:
-        """Return whether the last step leads past the first orbit, by quantities that no start on the orbit changes."""
-        first, before, last = (self._invariants(points[k]) for k in (0, -2, -1))
-        step = np.abs(last - before)
-        return bool((np.minimum(np.abs(last - first), np.abs(before - first)) <= step).all())
+    def _last_orbit(self, point: FamilyPoint) -> str:
+        """Return a description of an orbit that no other follows."""
+        orbit, widths = point.orbit, point.orbit.sequence.widths
+        speeds = np.linalg.norm(np.diff(self._states_along(point), axis=0), axis=1)
+        if speeds.min() <= REST * speeds.mean():
+            return f"the orbit of the period {orbit.period:.6g} nearly rests at an equilibrium (homoclinic orbit)"
+        if widths.min() <= COLLISION * widths.max():
+            return f"the orbit of the period {orbit.period:.6g} approaches a collision, and no other one follows"
+        return "no orbit follows"
 
-    def _invariants(self, point: FamilyPoint) -> Array:
-        rest = point.y[2 * self.search.stepper.dimension + 1 :]
-        index = np.sort_complex(point.orbit.multipliers)[-1]
-        return np.array([point.orbit.energy, point.orbit.period, abs(index), *point.units[[0, -2]], *rest])
+    def change_along(self, point: FamilyPoint) -> Array:
+        """Return the change of the unknowns along the tangent of a point."""
+        return self._moved(point.y, point.tangent * point.units) - point.y
 
-    def located(self, before: FamilyPoint, after: FamilyPoint, kind: str) -> FamilyPoint:
+    def end_at(self, first: FamilyPoint, before: FamilyPoint, after: FamilyPoint) -> str:
+        """Return why a family ends at an orbit, or ``""``: it shrinks to a point, or passes its first orbit."""
+        size = after.units[0]
+        # Terms that are not linear have the relative size of the square of the amplitude, here below the bound.
+        if size < math.sqrt(self.bound) * after.largest and size < before.units[0]:
+            return f"it shrinks to the equilibrium near q = {np.array2string(after.orbit.q, precision=6)}"
+        length = np.linalg.norm(self._away(before, after.y))
+        tail = slice(self.search.reduction.size, None)
+        if before is first or (np.abs(self._away(before, first.y)[tail]) > (1.0 + BEND) * length).any():
+            return ""
+        near = [self._nearest_state(point, first) for point in (before, after)]
+        chord = near[1] - near[0]
+        part = -(near[0] @ chord) / (chord @ chord)
+        if 0.0 <= part < 1.0 and np.linalg.norm(near[0] + part * chord) <= BEND * np.linalg.norm(chord):
+            return "it is closed: the next orbit is the first one"
+        return ""
+
+    def _away(self, point: FamilyPoint, y: Array) -> Array:
+        """Return the change from a point to other unknowns, in units of the motion."""
+        size = 2 * self.search.stepper.dimension
+        change = np.append(self.search.reduction.aligned(y[:size], point.y[:size]), y[size:]) - point.y
+        return self._reduced(self.search, point.y, change) / point.units
+
+    def _states_along(self, point: FamilyPoint) -> Array:
+        """Return (n, 2m) states at equal times along an orbit, in units of the motion."""
+        with without_accuracy_warnings():
+            run = point.orbit.run()
+        states = np.hstack(run.at(np.linspace(run.t[0], run.t[-1], PHASES)))
+        return np.asarray(states / np.ptp(states, axis=0).reshape(2, -1).max(axis=1).repeat(states.shape[1] // 2))
+
+    def _nearest_state(self, point: FamilyPoint, first: FamilyPoint) -> Array:
+        """Return the change from an orbit to the nearest start on another one, but along the former."""
+        from scipy.optimize import minimize_scalar  # here: slow to import
+
+        with without_accuracy_warnings():
+            run = point.orbit.run()
+
+        def change(t: float) -> Array:
+            return self._away(first, np.concatenate([*run.at(t), point.y[2 * self.search.stepper.dimension :]]))
+
+        if math.isnan(first.orbit.trivial_error):  # time is no matter of choice
+            return change(run.t[0])
+        times = np.linspace(run.t[0], run.t[-1], PHASES)
+        rest = np.tile(point.y[2 * self.search.stepper.dimension :], (PHASES, 1))
+        states = np.column_stack([*run.at(times), rest])
+        nearest = int(np.argmin([np.linalg.norm(self._away(first, state)) for state in states]))
+        bounds = times[max(0, nearest - 1)], times[min(PHASES - 1, nearest + 1)]
+        away = change(minimize_scalar(lambda t: np.linalg.norm(change(t)), bounds=bounds).x)
+        return away - first.same @ (first.same.T @ away)
+
+    def shifted(self, before: FamilyPoint, after: FamilyPoint) -> FamilyPoint:
+        """Return a point with its start in the middle between impacts, if one is near the start."""
+        stepper, orbit, size = self.search.stepper, after.orbit, 2 * self.search.stepper.dimension
+        if not stepper.divides_steps or self.search.fixed_indices or math.isnan(orbit.trivial_error):
+            return after
+        runs = [point.orbit.run() for point in (before, after)]
+        ends = np.concatenate([*(event.t for event in runs[1].events), *(kind.t for kind in runs[1].transitions)])
+        times = np.sort((ends - orbit.t) / orbit.period)
+        if not len(times) or min(times[0], 1.0 - times[-1]) > NEAR_START:
+            return after
+        gaps = np.diff(times, append=times[0] + 1.0)
+        part = float(times[gaps.argmax()] + gaps.max() / 2.0) % 1.0
+        starts = [
+            np.concatenate([*run.at(run.t[0] + part * point.orbit.period), point.y[size:]])
+            for run, point in zip(runs, (before, after), strict=True)
+        ]
+        return replace(self.corrected(starts[1], starts[1] - starts[0]), step=after.step, largest=after.largest)
+
+    def located(self, before: FamilyPoint, after: FamilyPoint, kind: str, rank: int | None) -> FamilyPoint:
         """Return the point between two others where a test function vanishes, by Brent's method along their chord."""
-        from scipy.optimize import brentq
+        from scipy.optimize import brentq  # here: slow to import
 
         size, points = 2 * self.search.stepper.dimension, {0.0: before, 1.0: after}
         chord = after.y - before.y
@@ -253,12 +386,12 @@ class Continuation:
 
         def value(part: float) -> float:
             if part not in points:
-                points[part] = self._corrected(before.y + part * chord, chord, before)
-            return points[part].tests[kind]
+                points[part] = self.corrected(before.y + part * chord, chord, before)
+            return points[part].test(kind, rank)
 
         return points[float(brentq(value, 0.0, 1.0, xtol=LOCATED))]
 
-    def branching(self, point: FamilyPoint, periods: int, side: int) -> tuple[Continuation, FamilyPoint]:
+    def branching(self, point: FamilyPoint, periods: int, *, backward: bool) -> tuple[Continuation, FamilyPoint]:
         """Return the point of a bifurcation with the tangent of the other family, whose period is a multiple."""
         size = 2 * self.search.stepper.dimension
         y = point.y.copy()
@@ -267,18 +400,20 @@ class Continuation:
         if periods > 1 and self.search.sequence is not None:
             equal = StepSequence.equal(periods * len(self.search.sequence))
             doubled = replace(doubled, search=replace(doubled.search, sequence=equal))
-        both = doubled._corrected(y, None, point)
+        both = doubled.corrected(y, None, point)
         kept = _smallest(both.jacobian, both.same.shape[1] + 2)
         others = _without(_without(kept, both.same), both.tangent[:, np.newaxis])
+        inward = self.search.reduction.inward(*np.split(y[:size], 2)) * both.units[: self.search.reduction.size]
         # Where a period doubles and where a symmetry breaks, period and parameter are stationary along the branch.
         tail, tangent = slice(self.search.reduction.size, None), both.tangent
         branch = others[:, 0]
         if (size_of_tail := tangent[tail] @ tangent[tail]) > FLAT:
             branch = branch - tangent * (branch[tail] @ tangent[tail]) / size_of_tail
-        branch *= side / np.linalg.norm(branch)
+        start = inward @ branch[: self.search.reduction.size]
+        branch *= (-1.0 if backward else 1.0) * np.sign(start[np.abs(start).argmax()]) / np.linalg.norm(branch)
         return doubled, replace(both, tangent=branch, step=self.step * FIRST, of_both=True)
 
-    def _corrected(self, prediction: Array, normal: Array | None, former: FamilyPoint | None = None) -> FamilyPoint:
+    def corrected(self, prediction: Array, normal: Array | None, former: FamilyPoint | None = None) -> FamilyPoint:
         """Return the point of the family next to a prediction, with a discretisation error below the bound.
 
         Args:
@@ -292,22 +427,19 @@ class Continuation:
             y, further = self._solved(search, prediction, self._in_segments(search, y, former), normal, former)
             linear = self._linearised(search, y)
             corrections = max(corrections, further)
-            orbit = self._found(search, y)._described(y[:end], linear.closing, corrections, guess=y[:end])
+            orbit = self._found(search, y).described(y[:end], linear.closing, corrections, guess=y[:end])
             if orbit.error <= self.bound or self.search.sequence is not None:
                 break
         inward = search.reduction.inward(*np.split(y[: end - 1], 2))
-        gradient = search._integral_gradients(y[: end - 1], search.t, linear.closing.sizes)[0] @ inward
+        gradient = search.integral_gradients(y[: end - 1], search.t, linear.closing.sizes)[0] @ inward
         same, conserved = self._same_orbit(search, linear)
         tangents = _without(_smallest(linear.jacobian, same.shape[1] + 1, BRANCHES), same)
-        tangent, before = tangents[:, 0], None
-        if former is not None:
-            before = former.tangent * former.units / linear.units
-            tangent = tangents @ (tangents.T @ before)  # the family's, where another one crosses it
+        tangent = tangents[:, 0]
+        along = None if normal is None else self._reduced(search, y, normal)
+        along = along if former is None else former.tangent * former.units
+        if along is not None:  # the family's, where another one crosses it
+            tangent = tangents @ (tangents.T @ (along / linear.units))
             tangent /= np.linalg.norm(tangent)
-        elif normal is not None:
-            before = self._reduced(search, y, normal) / linear.units
-        if before is not None and tangent @ before < 0.0:
-            tangent = -tangent
         return FamilyPoint(
             y=y,
             orbit=orbit,
@@ -321,13 +453,14 @@ class Continuation:
             corrections=corrections,
             accuracy=accuracy,
             step=self.step * FIRST if former is None else former.step,
+            largest=max(linear.units[0], 0.0 if former is None else former.largest),
         )
 
     def _search_at(self, y: Array, tolerance: float) -> OrbitSearch:
         """Return the closing equations next to some unknowns, with the steps of a run there."""
         end = 2 * self.search.stepper.dimension + 1
         search = self._with_parameter(replace(self.search, period=float(y[end - 1])), y)
-        return search if search.sequence is not None else search._adapted(y[:end], tolerance)
+        return search if search.sequence is not None else search.adapted(y[:end], tolerance)
 
     def _found(self, search: OrbitSearch, y: Array) -> OrbitSearch:
         """Return the closing equations of an orbit that was found, whose period is prescribed if a formula does so."""
@@ -346,7 +479,7 @@ class Continuation:
         end = 2 * search.stepper.dimension + 1
         if former is not None and np.abs(former.orbit.multipliers[0]) <= EASY:
             return y
-        nodes = search._nodes(y[:end], smoothed=False)
+        nodes = search.nodes(y[:end], smoothed=False)
         return y if nodes is None else np.concatenate([nodes, y[end:]])
 
     def _solved(
@@ -397,11 +530,11 @@ class Continuation:
         """Return the closing equations at some unknowns, and their Jacobian by the reduced unknowns, in units."""
         tail, search = 1 + (self.parameter is not None), self._with_parameter(search, y)
         states, period = y[:-tail], y[len(y) - tail]
-        closing = search._closing(np.append(states, period))
-        rows = search._row_units(closing)
+        closing = search.closing_equations(np.append(states, period))
+        rows = search.row_units(closing)
         starts = states.reshape(-1, 2, search.stepper.dimension)
         inward = _block_diagonal([search.reduction.inward(*start) for start in starts])
-        units = np.append(np.tile(search._reduced(closing.sizes), len(starts)), period / (2.0 * math.pi))
+        units = np.append(np.tile(search.reduced_sizes(closing.sizes), len(starts)), period / (2.0 * math.pi))
         columns, defects = [closing.partials[:, :-1] @ inward, closing.partials[:, -1:]], closing.defects
         into = _block_diagonal([inward, np.eye(tail)])
         if self.parameter is not None:
@@ -430,7 +563,7 @@ class Continuation:
     def _by_parameter(self, search: OrbitSearch, closing: ClosingEquations, starts: Array, period: float) -> Array:
         """Return the derivatives of the closing equations by the parameter."""
         assert self.parameter is not None
-        steps, bounds = search._steps, search._bounds(len(starts))
+        steps, bounds = search.steps, search.bounds(len(starts))
         tangent = np.zeros((1, search.stepper._input_size))
         tangent[0, starts[0].size + self.parameter] = 1.0
         column = []
@@ -438,7 +571,7 @@ class Continuation:
             part = slice(bounds[k], bounds[k + 1])
             times, sizes = search.t + period * steps.ends[:-1][part], period * steps.widths[part]
             at = times, sizes, tangent, search.parameters, search.options, np.zeros((len(sizes), 1))
-            column.append(search._leaving(segment) @ tangents_along(search.stepper, starts[k].ravel(), *at)[1][-1][0])
+            column.append(search.leaving(segment) @ tangents_along(search.stepper, starts[k].ravel(), *at)[1][-1][0])
         column[-1][np.flatnonzero(search.drifts)] = 0.0
         column[-1] = closing.independent @ column[-1]
         if search.energy is not None:
@@ -459,15 +592,14 @@ class Continuation:
         assert self.parameter is not None
         y = np.append(z, self.search.parameters[self.parameter])
         search = replace(self._search_at(y, TOLERANCES[0] * self.bound), energy=None)
-        closing = search._closing(z)
+        closing = search.closing_equations(z)
         starts = z[:-1].reshape(1, 2, -1)
-        column = self._by_parameter(search, closing, starts, float(z[-1])) / search._row_units(closing)
-        effect = float(np.linalg.norm(column))
+        column = self._by_parameter(search, closing, starts, float(z[-1])) / search.row_units(closing)
+        effect, parameter = float(np.linalg.norm(column)), abs(float(y[-1]))
         if self.period_of is not None:
             effect += abs(self._period(search)[1]) * 2.0 * math.pi / float(z[-1])
-        if not effect > 0.0:
-            name = search.stepper.parameters[self.parameter]
-            raise OrbitError(f"the parameter '{name}' does not change this orbit: vary another one")
+        if effect * max(parameter, 1.0) <= RESOLVED * roundoff(1):  # the orbit stays, its stability may not
+            effect = 1.0 / (parameter or 1.0)
         return replace(self, parameter_unit=1.0 / effect)
 
     def _same_orbit(self, search: OrbitSearch, linear: _Linearised) -> tuple[Array, int]:
@@ -481,7 +613,7 @@ class Continuation:
         gradients = kept[:, strengths < 0.5]
         fields = np.vstack([gradients[size // 2 :], -gradients[: size // 2]])
         if not closing.motion.by_time.any():
-            flow = search._leaving(closing.motion) @ closing.motion.by_period / units[:size]
+            flow = search.leaving(closing.motion) @ closing.motion.by_period / units[:size]
             fields = np.column_stack([flow / np.linalg.norm(flow), fields])
         fields = np.vstack([fields, np.zeros((len(units) - size, fields.shape[1]))])
         fields = _range(fields)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from scvi_codegen.analysis.orbits.solver import (
 )
 from scvi_codegen.analysis.orbits.step_sequence import StepSequence
 from scvi_codegen.codegen.native.arguments import checked_number
+from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.atomic import write_atomically
 from scvi_codegen.common.errors import AccuracyWarning, OrbitError, StateError, closest, warn
 from scvi_codegen.common.representation import counted, summary
@@ -34,8 +36,13 @@ from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import STEPPER, Stepper
 from scvi_codegen.runs.stepping.features import require
 
-CLOSING = 10
-"""Least number of orbits of a family that ends where it began."""
+SAME_ORBIT = 1e-6
+"""Relative distance, far above errors of orbits, from which an orbit of a file is another one than the recomputed."""
+OF_ORBITS = tuple(name for name in PeriodicOrbit.__dataclass_fields__ if name not in ("stepper", "sequence", "options"))
+"""Fields of orbits that are saved as they are."""
+OF_SEARCHES = ("fixed_indices", "energy", "gain", "drifts")
+OF_CONTINUATIONS = ("parameter", "step", "bound", "parameter_unit")
+"""Settings that are saved."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,13 +67,16 @@ class Bifurcation:
     def switch(
         self,
         *,
-        side: int = 1,
+        backward: bool = False,
         step: float | None = None,
         count: int = 100,
         until: Until = None,
         progress: Progress = None,
     ) -> Family:
-        """Return the family that begins here, on one of its two sides, ``side`` 1 or -1; arguments of :func:`family`.
+        """Return the family that begins here; arguments of :func:`family`.
+
+        A branch has two sides. The coordinate or momentum of the initial state that changes most increases along the
+        family, or decreases with ``backward``.
 
         Raises:
             OrbitError: if no other family of periodic orbits begins here.
@@ -74,15 +84,13 @@ class Bifurcation:
         periods = {"branch": 1, "period doubling": 2}.get(self.kind)
         if periods is None:
             raise OrbitError(f"no other family of periodic orbits begins at a {self.kind}: the family itself passes it")
-        if side not in (1, -1):
-            raise StateError(f"side must be 1 or -1, one of the two sides of a branch, not {side!r}")
         continuation = (
             self._continuation
             if step is None
             else replace(self._continuation, step=_checked_part("step", step, "relative to the size of the motion"))
         )
-        continuation, start = continuation.branching(self._at, periods, side)
-        return _continued(continuation, [start], checked_count(count, "count", least=2), until, progress)
+        continuation, start = continuation.branching(self._at, periods, backward=backward)
+        return _Growing.at(continuation, start).grown(checked_count(count, "count", least=2), until, progress)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -92,14 +100,13 @@ class Family:
     Attributes:
         orbits: in their order along the family.
         bifurcations: between them.
-        parameter: name of the parameter of the system that varies; ``None`` if none does.
         ended: why the family has no further orbit here.
     """
 
     orbits: tuple[PeriodicOrbit, ...]
     bifurcations: tuple[Bifurcation, ...]
-    parameter: str | None
     ended: str
+    _first: FamilyPoint = field(repr=False)
     _last: FamilyPoint = field(repr=False)
     _continuation: Continuation = field(repr=False)
 
@@ -113,6 +120,12 @@ class Family:
 
     def __getitem__(self, k: int) -> PeriodicOrbit:
         return self.orbits[k]
+
+    @property
+    def parameter(self) -> str | None:
+        """Name of the parameter of the system that varies; ``None`` if none does."""
+        index = self._continuation.parameter
+        return None if index is None else self[0].stepper.parameters[index]
 
     @property
     def periods(self) -> Array:
@@ -142,23 +155,72 @@ class Family:
 
     def more(self, count: int = 100, *, until: Until = None, progress: Progress = None) -> Family:
         """Return the family with up to ``count`` further orbits."""
-        longer = _continued(
-            self._continuation, [self._last], checked_count(count, "count", least=1) + 1, until, progress
-        )
-        own = len(self) - 1
-        later = (replace(bifurcation, after=bifurcation.after + own) for bifurcation in longer.bifurcations)
-        return replace(longer, orbits=self.orbits[:-1] + longer.orbits, bifurcations=(*self.bifurcations, *later))
+        known = _Growing(self._continuation, self._first, self._last, self.orbits, self.bifurcations)
+        return known.grown(len(self) + checked_count(count, "count", least=1), until, progress)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the orbits to a .npz file: q, p, period, energy, parameters, error, multipliers, stable, bifurcations.
 
-        ``bifurcations`` are the numbers of the orbits before them, ``kinds`` their kinds.
+        ``bifurcations`` are the numbers of the orbits before them, ``kinds`` their kinds. Further arrays are those that
+        :meth:`load` needs.
         """
-        names = ("q", "p", "period", "energy", "parameters", "error", "multipliers", "stable")
+        names, continuation = (*OF_ORBITS, "energy", "multipliers", "stable"), self._continuation
         arrays: dict[str, Any] = {name: np.array([getattr(orbit, name) for orbit in self.orbits]) for name in names}
+        arrays["ends"] = np.concatenate([orbit.sequence.ends for orbit in self.orbits])
+        arrays["tolerance"] = np.array([orbit.sequence.tolerance for orbit in self.orbits], dtype=float)
         arrays["bifurcations"] = np.array([bifurcation.after for bifurcation in self.bifurcations], dtype=np.intp)
         arrays["kinds"] = np.array([bifurcation.kind for bifurcation in self.bifurcations], dtype=np.str_)
+        points = [self._first, self._last, *(bifurcation._at for bifurcation in self.bifurcations)]
+        arrays["points"] = np.array([[point.y, continuation.change_along(point)] for point in points])
+        options, period = continuation.search.options, continuation.period_of
+        settings = {name: getattr(continuation, name) for name in OF_CONTINUATIONS}
+        settings |= {name: np.asarray(getattr(continuation.search, name)).tolist() for name in OF_SEARCHES}
+        settings |= {"system": self[0].stepper.title, "ended": self.ended, "largest": self._last.largest}
+        settings |= {
+            "next step": self._last.step,
+            "period": period and period.text,
+            "options": options and asdict(options),
+        }
+        arrays["settings"] = np.array(json.dumps(settings))
         write_atomically(path, lambda file: np.savez(file, **arrays))
+
+    @classmethod
+    def load(cls, stepper: Stepper, path: str | os.PathLike[str]) -> Family:
+        """Return the family of a file that :meth:`save` wrote, which :meth:`more` continues.
+
+        The first and the last orbit and the bifurcations are computed again.
+
+        Raises:
+            StateError: if the file contains no family of this system and method.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = dict(file)
+            settings = json.loads(str(arrays["settings"]))
+        except (KeyError, OSError, ValueError) as error:
+            raise StateError(f"'{os.fspath(path)}' has no family of Family.save: {error}") from error
+        if settings["system"] != stepper.title:
+            raise StateError(f"'{os.fspath(path)}' is a family of '{settings['system']}', not of '{stepper.title}'")
+        options = settings["options"] and SolverOptions(**settings["options"])
+        orbits = list(_orbits_of(arrays, stepper, options))
+        search = _search_at(orbits[-1], orbits[-1].period, **{name: settings[name] for name in OF_SEARCHES})
+        continuation = Continuation(
+            search=search,
+            period_of=settings["period"] and Formula.of(settings["period"], stepper.parameters),
+            **{name: settings[name] for name in OF_CONTINUATIONS},
+        )
+        first, last, *others = (continuation.corrected(*point) for point in arrays["points"])
+        if not np.abs(first.y - arrays["points"][0, 0]).max() <= SAME_ORBIT * np.abs(first.y).max():
+            raise StateError(f"the orbits of '{os.fspath(path)}' are none of '{stepper.title}', another system")
+        found = zip(arrays["kinds"], arrays["bifurcations"], others, strict=True)
+        return cls(
+            orbits=tuple(orbits),
+            bifurcations=tuple(_located(str(kind), int(k), at, continuation) for kind, k, at in found),
+            ended=settings["ended"],
+            _first=first,
+            _last=replace(last, step=settings["next step"], largest=settings["largest"]),
+            _continuation=continuation,
+        )
 
     def plot(self, path: str | os.PathLike[str] | None = None) -> Any:
         """Draw the orbits, their stability, and energy (or parameter) against period with the bifurcations.
@@ -243,20 +305,9 @@ def family(
         raise StateError("backward= is for a start at an orbit: a family that begins at an equilibrium leaves it")
     if period is not None and parameter is None:
         raise StateError("period= is a formula of parameter=, which is missing: name it, or give fixed_period=True")
-    search = OrbitSearch(
-        stepper=stepper,
-        at_rest=momenta_at_rest(stepper, start.q, start.t, start.parameters),
-        reduction=Reduction(stepper.interface),
-        period=float(first[-1]),
-        sequence=_equal_steps_of(start),
-        max_step=math.inf,
-        fixed_indices=(*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else [])),
-        energy=None if energy is None else checked_number(energy, "the energy"),
-        **gains_of(stepper, gain),
-        t=start.t,
-        parameters=np.array(start.parameters),
-        options=start.options if isinstance(start, PeriodicOrbit) else None,
-    )
+    prescribed = None if energy is None else checked_number(energy, "the energy")
+    indices = (*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else []))
+    search = _search_at(start, float(first[-1]), fixed_indices=indices, energy=prescribed, **gains_of(stepper, gain))
     continuation = Continuation(
         search=search,
         parameter=None if parameter is None else stepper.parameters.index(parameter),
@@ -265,7 +316,44 @@ def family(
         period_of=None if period is None else Formula.of(period, stepper.parameters),
     )
     continuation, point = continuation.begun(first, start, backward=backward)
-    return _continued(continuation, [point], checked_count(count, "count", least=1), until, progress)
+    return _Growing.at(continuation, point).grown(checked_count(count, "count", least=1), until, progress)
+
+
+def _search_at(
+    start: PeriodicOrbit | Equilibrium,
+    period: float,
+    *,
+    fixed_indices: Sequence[int],
+    energy: float | None,
+    gain: ArrayLike,
+    drifts: ArrayLike,
+) -> OrbitSearch:
+    """Return the closing equations next to a start."""
+    return OrbitSearch(
+        stepper=start.stepper,
+        at_rest=momenta_at_rest(start.stepper, start.q, start.t, start.parameters),
+        reduction=Reduction(start.stepper.interface),
+        period=period,
+        sequence=_equal_steps_of(start),
+        max_step=math.inf,
+        fixed_indices=tuple(fixed_indices),
+        energy=energy,
+        gain=np.asarray(gain, dtype=float),
+        drifts=np.asarray(drifts, dtype=bool),
+        t=start.t,
+        parameters=np.array(start.parameters),
+        options=start.options if isinstance(start, PeriodicOrbit) else None,
+    )
+
+
+def _orbits_of(arrays: Mapping[str, Any], stepper: Stepper, options: SolverOptions | None) -> Iterator[PeriodicOrbit]:
+    """Yield the orbits of a file."""
+    parts = np.split(arrays["ends"], np.cumsum(arrays["steps"] + 1)[:-1])
+    for k, (ends, tolerance) in enumerate(zip(parts, arrays["tolerance"], strict=True)):
+        sequence = StepSequence(ends, None if math.isnan(tolerance) else float(tolerance))
+        values = {name: arrays[name][k] for name in OF_ORBITS}
+        numbers = {name: value if value.ndim else value.item() for name, value in values.items()}
+        yield PeriodicOrbit(stepper=stepper, sequence=sequence, options=options, **numbers)
 
 
 def _equal_steps_of(start: PeriodicOrbit | Equilibrium) -> StepSequence | None:
@@ -304,64 +392,73 @@ def _state_at(start: PeriodicOrbit | Equilibrium, mode: int, amplitude: float | 
     return np.append(state, 2.0 * math.pi / frequencies[mode])
 
 
-def _condition(until: Until, stepper: Stepper) -> Callable[[PeriodicOrbit], bool]:
-    """Return whether an orbit is the last one."""
+def _reason(until: Until, stepper: Stepper) -> Callable[[PeriodicOrbit], str]:
+    """Return why an orbit is the last one by a condition, ``""`` for others."""
     if until is not None:
         check_kind(UNTIL, until, "until", StateError)
     if not isinstance(until, str):
-        return until or (lambda orbit: False)
+        return lambda orbit: "the condition of until holds" if until is not None and until(orbit) else ""
     states = state_names(stepper)
     holds = Formula.of(f"where({until}, 1, 0)", (*states, *stepper.parameters, "energy", "period"))
 
-    def condition(orbit: PeriodicOrbit) -> bool:
+    def reason(orbit: PeriodicOrbit) -> str:
         numbers = (*orbit.q, *orbit.p, *orbit.parameters, orbit.energy, orbit.period)
         try:
-            return holds(dict(zip(holds.symbols, numbers, strict=True))) == 1.0
+            return f"{until} holds" if holds(dict(zip(holds.symbols, numbers, strict=True))) == 1.0 else ""
         except (ArithmeticError, ValueError) as error:
-            raise FamilyEndsError(f"until={until!r} is undefined at the last orbit: {error}") from error
+            return f"until={until!r} is undefined at the last orbit: {error}"
 
-    return condition
+    return reason
 
 
-def _continued(
-    continuation: Continuation, points: list[FamilyPoint], count: int, until: Until, progress: Progress
-) -> Family:
-    """Return the family from the last of the points on, which are counted."""
-    condition, bifurcations = _condition(until, continuation.search.stepper), list[Bifurcation]()
-    ended = "it has as many orbits as were asked for"
-    try:
-        while len(points) < count:
-            following = continuation.following(points[-1])
-            try:
-                if not points[-1].of_both:
-                    bifurcations += tuple(_bifurcations(continuation, points[-1], following, len(points) - 1))
-            except OrbitError:  # the orbits between them are none of the chord: go on in smaller steps
-                points[-1] = replace(points[-1], step=points[-1].step / 4.0)
-                continue
-            points.append(following)
-            if progress is not None:
-                progress(len(points))
-            if condition(following.orbit):
-                ended = f"{until} holds" if isinstance(until, str) else "the condition of until holds"
-                break
-            if len(points) > CLOSING and continuation.returns(points):
-                ended = "it is closed: the next orbit is the first one"
-                break
-    except FamilyEndsError as reason:
-        ended = str(reason)
-    except KeyboardInterrupt:
-        ended = "it was interrupted"
-    orbits = tuple(point.orbit for point in points)
-    _warn_of_errors(orbits, continuation.bound)
-    stepper, parameter = continuation.search.stepper, continuation.parameter
-    return Family(
-        orbits=orbits,
-        bifurcations=tuple(bifurcations),
-        parameter=None if parameter is None else stepper.parameters[parameter],
-        ended=ended,
-        _last=points[-1],
-        _continuation=continuation,
-    )
+@dataclass(frozen=True, eq=False)
+class _Growing:
+    """Orbits of a family, of which the last one is continued."""
+
+    continuation: Continuation
+    first: FamilyPoint
+    last: FamilyPoint
+    orbits: Sequence[PeriodicOrbit]
+    bifurcations: Sequence[Bifurcation] = ()
+
+    @classmethod
+    def at(cls, continuation: Continuation, point: FamilyPoint) -> _Growing:
+        """Return a family of one orbit."""
+        return cls(continuation, point, point, [point.orbit])
+
+    def grown(self, count: int, until: Until, progress: Progress) -> Family:
+        """Return the family with up to ``count`` orbits."""
+        continuation, orbits, stepper = self.continuation, list(self.orbits), self.continuation.search.stepper
+        last, ended, bifurcations = self.last, "", list(self.bifurcations)
+        try:
+            reason = _reason(until, stepper)
+            while len(orbits) < count and not ended:
+                following = continuation.following(last)
+                try:
+                    between = (
+                        [] if last.of_both else list(_bifurcations(continuation, last, following, len(orbits) - 1))
+                    )
+                except OrbitError:  # the orbits between them are none of the chord: go on in smaller steps
+                    last = replace(last, step=last.step / 4.0)
+                    continue
+                before, last = last, continuation.shifted(last, following)
+                orbits, bifurcations = [*orbits, last.orbit], bifurcations + between
+                if progress is not None:
+                    progress(len(orbits))
+                ended = reason(last.orbit) or continuation.end_at(self.first, before, last)
+        except FamilyEndsError as reason:
+            ended = str(reason)
+        except KeyboardInterrupt:
+            ended = "it was interrupted"
+        _warn_of_errors(orbits[len(self.orbits) - 1 :], continuation.bound)
+        return Family(
+            orbits=tuple(orbits),
+            bifurcations=tuple(bifurcations),
+            ended=ended or "it has as many orbits as were asked for",
+            _first=self.first,
+            _last=last,
+            _continuation=continuation,
+        )
 
 
 def _warn_of_errors(orbits: Sequence[PeriodicOrbit], bound: float) -> None:
@@ -378,9 +475,10 @@ def _bifurcations(
     continuation: Continuation, before: FamilyPoint, after: FamilyPoint, number: int
 ) -> Iterator[Bifurcation]:
     """Locate the bifurcations between two points of the family."""
-    kinds = [kind for kind, value in before.tests.items() if value * after.tests.get(kind, value) < 0.0]
-    for kind in kinds:
-        if kind == "branch" and "fold" in kinds:  # an index passes through 1 at a fold
-            continue
-        at = continuation.located(before, after, kind)
-        yield Bifurcation(kind=kind, orbit=at.orbit, after=number, _at=at, _continuation=continuation)
+    for kind, rank in before.crossings(after):
+        at = continuation.located(before, after, kind, rank)
+        yield _located(kind, number, at, continuation)
+
+
+def _located(kind: str, number: int, at: FamilyPoint, continuation: Continuation) -> Bifurcation:
+    return Bifurcation(kind=kind, orbit=at.orbit, after=number, _at=at, _continuation=continuation)

@@ -378,10 +378,10 @@ class OrbitSearch:
         if self.sequence is not None:
             orbit = self._nearest(guess)
         else:
-            orbit = self._adapted(guess, TOLERANCES[0] * bound)._nearest(guess)
+            orbit = self.adapted(guess, TOLERANCES[0] * bound)._nearest(guess)
             for part in TOLERANCES:  # the first sequence of steps is that of the guess, a different motion
                 near = np.concatenate([orbit.q, orbit.p, [orbit.period]])
-                refreshed = self._adapted(near, part * bound)._refreshed(near)
+                refreshed = self.adapted(near, part * bound)._refreshed(near)
                 orbit = replace(refreshed, iterations=orbit.iterations + refreshed.iterations)
                 if orbit.error <= bound:
                     break
@@ -389,7 +389,7 @@ class OrbitSearch:
         _warn_of_discretisation(orbit, bound)
         return orbit
 
-    def _adapted(self, z: Array, tolerance: float) -> OrbitSearch:
+    def adapted(self, z: Array, tolerance: float) -> OrbitSearch:
         """Return the search with the steps of an adaptive run along z."""
         at = self.max_step, self.t, self.parameters, self.options
         return replace(self, sequence=StepSequence.adaptive(self.stepper, z[:-1], float(z[-1]), tolerance, *at))
@@ -397,7 +397,7 @@ class OrbitSearch:
     def _refreshed(self, z: Array) -> PeriodicOrbit:
         """Return the orbit of the steps of this search next to one of other steps."""
         try:
-            return self._described(*self._iterated(z, self._closing(z), 0), guess=z)
+            return self.described(*self._iterated(z, self.closing_equations(z), 0), guess=z)
         except OrbitError:
             return self._nearest(z)
 
@@ -417,7 +417,7 @@ class OrbitSearch:
         for search, smoothed in attempts:
             try:
                 iterated = search._iterated(*search._by_segments(guess, smoothed=smoothed))
-                orbit = search._described(*iterated, guess=guess)
+                orbit = search.described(*iterated, guess=guess)
                 if _is_near(orbit, guess, iterated[1].motion.states):
                     return orbit
                 far.append(orbit)
@@ -428,15 +428,15 @@ class OrbitSearch:
         raise next((failure for failure in failures if isinstance(failure, OrbitError)), failures[0])
 
     @property
-    def _steps(self) -> StepSequence:
+    def steps(self) -> StepSequence:
         """Steps of the search, after they are known."""
         assert self.sequence is not None
         return self.sequence
 
-    def _described(self, z: Array, equations: ClosingEquations, iterations: int, *, guess: Array) -> PeriodicOrbit:
+    def described(self, z: Array, equations: ClosingEquations, iterations: int, *, guess: Array) -> PeriodicOrbit:
         """Return the orbit at the end of the iteration, after all checks; raise OrbitError if there is none."""
         m, motion = self.stepper.dimension, equations.motion
-        sizes, reduced = equations.sizes, self._reduced(equations.sizes)
+        sizes, reduced = equations.sizes, self.reduced_sizes(equations.sizes)
         rounding = RESOLVED * roundoff(1) * float((np.abs(z[:-1]) / sizes).max())
         scaled_norm = float(np.linalg.norm(equations.monodromy / reduced[:, np.newaxis] * reduced, 2))
         allowed = (CLOSED + rounding) * max(1.0, scaled_norm)
@@ -458,8 +458,8 @@ class OrbitSearch:
             p=z[m:-1],
             t=self.t,
             period=float(z[-1]),
-            steps=len(self._steps),
-            sequence=self._steps,
+            steps=len(self.steps),
+            sequence=self.steps,
             monodromy=equations.monodromy,
             residual=equations.error,
             error=self._discretisation_error(z, equations),
@@ -490,7 +490,7 @@ class OrbitSearch:
             raise MethodError(
                 f"'{system}' depends on time: give the period of this dependence as period, with fixed_period=True"
             )
-        later = replace(self, t=self.t + period)._closing(z)
+        later = replace(self, t=self.t + period).closing_equations(z)
         apart = np.abs(later.motion.states[-1] - equations.motion.states[-1]) / equations.sizes
         error = max(float(apart.max()), later.relative_error)
         if not error <= allowed:
@@ -505,20 +505,20 @@ class OrbitSearch:
         States at the ends of segments are further unknowns, and continuity there further equations (Stoer & Bulirsch,
         *Introduction to Numerical Analysis*, 7.3.5).
         """
-        nodes = self._nodes(guess, smoothed=smoothed)
+        nodes = self.nodes(guess, smoothed=smoothed)
         if nodes is None:
-            return guess, self._closing(guess), 0
-        z, _, iterations = self._iterated(nodes, self._closing(nodes), 0)
+            return guess, self.closing_equations(guess), 0
+        z, _, iterations = self._iterated(nodes, self.closing_equations(nodes), 0)
         nearer = np.append(z[: len(guess) - 1], z[-1])
-        return nearer, self._closing(nearer), iterations
+        return nearer, self.closing_equations(nearer), iterations
 
-    def _nodes(self, guess: Array, *, smoothed: bool) -> Array | None:
+    def nodes(self, guess: Array, *, smoothed: bool) -> Array | None:
         """Return the starts of the segments of a guess and its period; ``None`` if one segment is enough.
 
         The first nodes are those of half a period forward and half a period backward from the guess: an error of the
         guess grows by the square root of the growth in a period.
         """
-        start, count = guess[:-1], len(self._steps)
+        start, count = guess[:-1], len(self.steps)
         earlier, later, monodromy = self._halves(start, float(guess[-1]))
         growth = float(np.abs(np.linalg.eigvals(monodromy)).max())
         if growth <= EASY:
@@ -531,30 +531,30 @@ class OrbitSearch:
             k = np.arange(len(path))
             share = np.minimum(k / middle, (count - k) / len(later))
             path += np.outer(np.where(k <= middle, 0.5, -0.5) * share**2, later[-1] - earlier[middle - 1])
-        return np.append(path[self._bounds(segments)[:-1]], guess[-1])
+        return np.append(path[self.bounds(segments)[:-1]], guess[-1])
 
     def _halves(self, start: Array, period: float) -> tuple[Array, Array, Array]:
         """Return the states forward and backward from a start, the latter a period later, and the monodromy matrix."""
-        steps = self._steps
+        steps = self.steps
         half, count = steps.middle, len(steps)
         inward = self.reduction.inward(*np.split(start, 2))
         if self.stepper.divides_steps:  # derivatives through events require runs forward in time
             forward = self._segment(start, steps, 0, count, period)
-            later, monodromy = self._states_before(start, period), self._leaving(forward) @ forward.monodromy @ inward
+            later, monodromy = self._states_before(start, period), self.leaving(forward) @ forward.monodromy @ inward
         else:
             forward = self._segment(start, steps, 0, half, period)
             backward = self._segment(start, steps.reversed, 0, count - half, -period)
-            forth, back = (self._leaving(part) @ part.monodromy @ inward for part in (forward, backward))
+            forth, back = (self.leaving(part) @ part.monodromy @ inward for part in (forward, backward))
             later, monodromy = backward.states, np.asarray(np.linalg.solve(back.T, forth.T).T)  # forth back^-1
         return forward.states, later + np.append(self.gain, np.zeros(len(self.gain))), monodromy
 
     def _states_before(self, start: Array, period: float) -> Array:
         """Return the states before a state, in equal steps back over half a period, of impacts that can be undone."""
-        count = len(self._steps)
+        count = len(self.steps)
         plan, steps = Fixed(-period / count), count - count // 2
         q, p = np.split(start, 2)
         forward_only = self.stepper.interface.contacts or any(event.changes for event in self.stepper.events)
-        if self._steps.tolerance is None and not forward_only:
+        if self.steps.tolerance is None and not forward_only:
             initial = InitialData(q, p, None, self.t, self.parameters, self.options)
             run = self.stepper._started(initial, plan)
             with suppress(EventError, StepFailedError):
@@ -563,9 +563,9 @@ class OrbitSearch:
                 return np.concatenate([motion.q, motion.p], axis=1)[rows]
         return start[np.newaxis]
 
-    def _bounds(self, count: int) -> NDArray[np.intp]:
+    def bounds(self, count: int) -> NDArray[np.intp]:
         """Return the (count + 1,) numbers of the steps at which segments begin and end."""
-        return np.linspace(0, len(self._steps), count + 1).round().astype(np.intp)
+        return np.linspace(0, len(self.steps), count + 1).round().astype(np.intp)
 
     def _iterated(self, z: Array, equations: ClosingEquations, iterations: int) -> tuple[Array, ClosingEquations, int]:
         """Iterate until no step helps; return the unknowns, their equations, and the number of all iterations."""
@@ -580,7 +580,7 @@ class OrbitSearch:
         """
         if self.energy is None:
             return
-        away, row = float(equations.defects[-1]), float(self._row_units(equations)[-1])
+        away, row = float(equations.defects[-1]), float(self.row_units(equations)[-1])
         if not abs(away) <= allowed * row + RESOLVED * roundoff(1) * abs(self.energy):
             raise OrbitError(
                 f"the periodic orbit near the guess has the energy {self.energy + away:.10g}, not {self.energy:.10g}: "
@@ -595,7 +595,7 @@ class OrbitSearch:
         """
         inverse, units = self._inverse(equations), self._units(equations)
         change = inverse @ equations.defects
-        rows, size = self._row_units(equations), float(np.linalg.norm(change / units))
+        rows, size = self.row_units(equations), float(np.linalg.norm(change / units))
         residual = float(np.linalg.norm(equations.defects / rows))
         if size <= SETTLED * math.sqrt(len(z)):
             return None
@@ -606,7 +606,7 @@ class OrbitSearch:
             states = trial[:-1].reshape(-1, 2, self.stepper.dimension)
             trial[:-1] = np.ravel([self.reduction.normalised(*state) for state in states])
             with suppress(EventError, StepFailedError):
-                at = self._closing(trial)
+                at = self.closing_equations(trial)
                 less = np.linalg.norm(inverse @ at.defects / units) < (1.0 - shortened / 4.0) * size
                 if less and np.linalg.norm(at.defects / rows) < MOST_INCREASE * residual:
                     return trial, at
@@ -616,23 +616,23 @@ class OrbitSearch:
         """Return the sizes of the unknowns: of the motion for each start of a segment, and the time of one radian."""
         return np.append(np.tile(equations.sizes, len(equations.segments)), self.period / (2.0 * math.pi))
 
-    def _row_units(self, equations: ClosingEquations) -> Array:
+    def row_units(self, equations: ClosingEquations) -> Array:
         """Return the sizes of the equations, of that of the energy the change by the size of the motion."""
-        rows = np.tile(self._reduced(equations.sizes), len(equations.segments))
+        rows = np.tile(self.reduced_sizes(equations.sizes), len(equations.segments))
         if self.energy is None:
             return rows
         return np.append(rows, float(np.linalg.norm(equations.partials[-1] * self._units(equations))) or 1.0)
 
     def _inverse(self, equations: ClosingEquations) -> Array:
         """Return the pseudoinverse of the Jacobian in units of the motion; fixed unknowns do not change."""
-        units, rows = self._units(equations), self._row_units(equations)
+        units, rows = self._units(equations), self.row_units(equations)
         free = np.delete(np.arange(len(units)), self.fixed_indices)
         inverse = np.zeros((len(units), len(rows)))
         scaled = equations.partials[:, free] * units[free] / rows[:, np.newaxis]
         inverse[free] = units[free, np.newaxis] * np.linalg.pinv(scaled, NULL_SINGULAR_VALUE) / rows
         return inverse
 
-    def _reduced(self, sizes: Array) -> Array:
+    def reduced_sizes(self, sizes: Array) -> Array:
         """Return sizes (2m,) of positions and momenta as those of the coordinates of the reduced tangent space."""
         return np.repeat(sizes[[0, -1]], self.reduction.size // 2)
 
@@ -646,19 +646,19 @@ class OrbitSearch:
         least = (RESOLVED * rounding or LEAST_SIZE for rounding in size.rounding)
         return np.repeat(list(map(max, (size.position, size.momentum), least)), self.stepper.dimension)
 
-    def _closing(self, z: Array) -> ClosingEquations:
+    def closing_equations(self, z: Array) -> ClosingEquations:
         """Integrate one period and return the residuals with their derivatives; ``z`` has the start of each segment."""
         size = 2 * self.stepper.dimension
         starts = z[:-1].reshape(-1, size)
         count = len(starts)
-        bounds = self._bounds(count)
+        bounds = self.bounds(count)
         segments = [
-            self._segment(start, self._steps, first, last, z[-1])
+            self._segment(start, self.steps, first, last, z[-1])
             for start, first, last in zip(starts, bounds[:-1], bounds[1:], strict=True)
         ]
         sizes = self._sizes_of(np.vstack([starts, *(segment.states for segment in segments)]))
         gradients = [
-            self._integral_gradients(start, segment.start_time, sizes)
+            self.integral_gradients(start, segment.start_time, sizes)
             for start, segment in zip(starts, segments, strict=True)
         ]
         left = self._independent_equations(starts, segments, gradients, sizes)
@@ -666,14 +666,14 @@ class OrbitSearch:
         defects = np.zeros(rows.shape[:2])
         for k, segment in enumerate(segments):
             after = (k + 1) % count
-            leaving, outward = self._leaving(segment), self.reduction.outward(*np.split(starts[after], 2))
+            leaving, outward = self.leaving(segment), self.reduction.outward(*np.split(starts[after], 2))
             end = segment.states[-1] if after else self._returned(segment.states[-1], starts[0])
             defects[k] = outward @ (self.reduction.aligned(end, starts[after]) - starts[after])
             rows[k, :, k * size : (k + 1) * size] = leaving @ segment.monodromy
             rows[k, :, after * size : (after + 1) * size] -= outward
             rows[k, :, -1] = leaving @ segment.by_period
         rows[-1, np.flatnonzero(self.drifts)] = 0.0
-        error, relative_error = float(np.abs(defects).max()), float(np.abs(defects / self._reduced(sizes)).max())
+        error, relative_error = float(np.abs(defects).max()), float(np.abs(defects / self.reduced_sizes(sizes)).max())
         monodromy = leaving @ segments[-1].monodromy @ self.reduction.inward(*np.split(starts[-1], 2))
         rows[-1], defects[-1] = left @ rows[-1], left @ defects[-1]
         partials, residuals = rows.reshape(defects.size, -1), defects.ravel()
@@ -691,7 +691,7 @@ class OrbitSearch:
         q, p = np.split(end, 2)
         return np.concatenate([np.where(self.drifts, start[: len(q)], q - self.gain), p])
 
-    def _leaving(self, segment: _Segment) -> Array:
+    def leaving(self, segment: _Segment) -> Array:
         """Return the matrix from changes of (q, p) at the end of a segment to the reduced tangent space."""
         return self.reduction.outward(*np.split(segment.states[-1], 2))
 
@@ -718,7 +718,7 @@ class OrbitSearch:
 
     def _discretisation_error(self, z: Array, equations: ClosingEquations) -> float:
         """Return the distance of a closed orbit to that of a finer sequence of steps; see :class:`PeriodicOrbit`."""
-        start, period, steps = z[:-1], float(z[-1]), self._steps.finer
+        start, period, steps = z[:-1], float(z[-1]), self.steps.finer
         tangents = np.zeros((0, self.stepper._input_size))
         at = self.t + period * steps.ends[:-1], period * steps.widths, tangents, self.parameters, self.options
         try:
@@ -739,15 +739,15 @@ class OrbitSearch:
         Energy and momentum maps count as conserved if the Jacobian of every segment maps their gradients accordingly,
         and if events that change the state leave their values at the ends of steps unchanged.
         """
-        conserved_masks, units = [], self._reduced(sizes)
+        conserved_masks, units = [], self.reduced_sizes(sizes)
         accepted = CONSERVED if self.stepper.interface.conserves_energy else SAME  # weak damping is no conservation
         inward = [self.reduction.inward(*np.split(start, 2)) for start in starts]
         begins = [gradient @ own * units for gradient, own in zip(gradients, inward, strict=True)]
         for start, segment, begin, own in zip(starts, segments, begins, inward, strict=True):
             last = segment.states[-1]
-            end = self._integral_gradients(last, segment.end_time, sizes) @ self.reduction.inward(*np.split(last, 2))
+            end = self.integral_gradients(last, segment.end_time, sizes) @ self.reduction.inward(*np.split(last, 2))
             end *= units
-            monodromy = self._leaving(segment) @ segment.monodromy @ own
+            monodromy = self.leaving(segment) @ segment.monodromy @ own
             monodromy = monodromy / units[:, np.newaxis] * units
             largest = np.linalg.norm(end, axis=1) * np.linalg.norm(monodromy, 2)
             conserved_masks.append(np.linalg.norm(end @ monodromy - begin, axis=1) <= accepted * largest)
@@ -762,7 +762,7 @@ class OrbitSearch:
         projection = np.eye(self.reduction.size) - directions @ directions.T
         return np.asarray(units[:, np.newaxis] * projection / units)
 
-    def _integral_gradients(self, state: Array, t: float, sizes: Array) -> Array:
+    def integral_gradients(self, state: Array, t: float, sizes: Array) -> Array:
         """Return (r, 2m) gradients of the energy and the momentum maps by finite differences, for directions only.
 
         Differences of small motions, of which a few digits remain beside the energy itself, are of the size of the
