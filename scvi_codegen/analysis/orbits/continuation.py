@@ -80,7 +80,7 @@ of 1e-6, and independent ones in units of the motion differ by their size."""
 BEYOND = {"branch": 1.0, "period doubling": -1.0}
 """Values that real indices pass at bifurcations."""
 PHASES = 128
-"""Number of states along an orbit among which the nearest to another state is sought, before its time is refined."""
+"""Number of states along an orbit among which the nearest to another state is sought."""
 BEND = math.tan(LARGEST_TURN / 4.0) / 2.0
 """Largest distance of a family from the chord of a step, relative to the chord: of an arc that turns by 30 degrees."""
 REST, COLLISION = 1e-2, 1e-4
@@ -210,8 +210,8 @@ class FamilyPoint:
     def crossings(self, after: FamilyPoint) -> Iterator[tuple[str, int | None]]:
         """Yield kind and rank of the test functions that change their sign between this orbit and the next one."""
         changed = {kind for kind, value in self.tests.items() if value * after.tests.get(kind, value) < 0.0}
-        if self.complex_values[1] == after.complex_values[1]:
-            changed -= {"torus"}
+        counts = zip(("Krein collision", "torus"), self.complex_values, after.complex_values, strict=True)
+        changed -= {kind for kind, here, there in counts if here == there}
         yield from ((kind, None) for kind in self.tests if kind in changed)
         if "fold" in changed or self.complex_values != after.complex_values:
             return
@@ -297,7 +297,9 @@ class Continuation:
     def _last_orbit(self, point: FamilyPoint) -> str:
         """Return a description of an orbit that no other follows."""
         orbit, widths = point.orbit, point.orbit.sequence.widths
-        speeds = np.linalg.norm(np.diff(self._states_along(point), axis=0), axis=1)
+        times, states = _states_along(orbit, orbit.t, np.append(orbit.q, orbit.p), orbit.period)
+        changes = np.diff(states, axis=0) / self.search.sizes_of(states)
+        speeds = np.linalg.norm(changes, axis=1) / np.diff(times)
         if speeds.min() <= REST * speeds.mean():
             return f"the orbit of the period {orbit.period:.6g} nearly rests at an equilibrium (homoclinic orbit)"
         if widths.min() <= COLLISION * widths.max():
@@ -327,36 +329,26 @@ class Continuation:
 
     def _away(self, point: FamilyPoint, y: Array) -> Array:
         """Return the change from a point to other unknowns, in units of the motion."""
-        size = 2 * self.search.stepper.dimension
-        change = np.append(self.search.reduction.aligned(y[:size], point.y[:size]), y[size:]) - point.y
-        return self._reduced(self.search, point.y, change) / point.units
+        return self._reduced(self.search, point.y, self._difference(y, point.y)) / point.units
 
-    def _states_along(self, point: FamilyPoint) -> Array:
-        """Return (n, 2m) states at equal times along an orbit, in units of the motion."""
-        with without_accuracy_warnings():
-            run = point.orbit.run()
-        states = np.hstack(run.at(np.linspace(run.t[0], run.t[-1], PHASES)))
-        return np.asarray(states / np.ptp(states, axis=0).reshape(2, -1).max(axis=1).repeat(states.shape[1] // 2))
+    def _difference(self, y: Array, other: Array) -> Array:
+        """Return y minus other unknowns, with the lengths, signs and phases of rotations of the latter."""
+        size = 2 * self.search.stepper.dimension
+        return np.append(self.search.reduction.aligned(y[:size], other[:size]), y[size:]) - other
 
     def _nearest_state(self, point: FamilyPoint, first: FamilyPoint) -> Array:
         """Return the change from an orbit to the nearest start on another one, but along the former."""
-        from scipy.optimize import minimize_scalar  # here: slow to import
-
-        with without_accuracy_warnings():
-            run = point.orbit.run()
-
-        def change(t: float) -> Array:
-            return self._away(first, np.concatenate([*run.at(t), point.y[2 * self.search.stepper.dimension :]]))
-
+        size, orbit = 2 * self.search.stepper.dimension, point.orbit
+        t, state, duration = orbit.t, point.y[:size], orbit.period
         if math.isnan(first.orbit.trivial_error):  # time is no matter of choice
-            return change(run.t[0])
-        times = np.linspace(run.t[0], run.t[-1], PHASES)
-        rest = np.tile(point.y[2 * self.search.stepper.dimension :], (PHASES, 1))
-        states = np.column_stack([*run.at(times), rest])
-        nearest = int(np.argmin([np.linalg.norm(self._away(first, state)) for state in states]))
-        bounds = times[max(0, nearest - 1)], times[min(PHASES - 1, nearest + 1)]
-        away = change(minimize_scalar(lambda t: np.linalg.norm(change(t)), bounds=bounds).x)
-        return away - first.same @ (first.same.T @ away)
+            return self._away(first, point.y)
+        for _ in range(2):  # among states along the orbit, and among those beside the nearest one
+            times, states = _states_along(orbit, t, state, duration)
+            changes = [self._away(first, np.append(state, point.y[size:])) for state in states]
+            nearest = int(np.argmin(np.linalg.norm(changes, axis=1)))
+            t, state = times[max(0, nearest - 1)], states[max(0, nearest - 1)]
+            duration = times[min(len(times) - 1, nearest + 1)] - t
+        return np.asarray(changes[nearest] - first.same @ (first.same.T @ changes[nearest]))
 
     def shifted(self, before: FamilyPoint, after: FamilyPoint) -> FamilyPoint:
         """Return a point with its start in the middle between impacts, if one is near the start."""
@@ -376,20 +368,19 @@ class Continuation:
         ]
         return replace(self.corrected(starts[1], starts[1] - starts[0]), step=after.step, largest=after.largest)
 
-    def located(self, before: FamilyPoint, after: FamilyPoint, kind: str, rank: int | None) -> FamilyPoint:
-        """Return the point between two others where a test function vanishes, by Brent's method along their chord."""
+    def bifurcations(self, before: FamilyPoint, after: FamilyPoint) -> Iterator[tuple[str, FamilyPoint]]:
+        """Yield kinds and points between two others where test functions vanish, by Brent's method along the chord."""
         from scipy.optimize import brentq  # here: slow to import
 
-        size, points = 2 * self.search.stepper.dimension, {0.0: before, 1.0: after}
-        chord = after.y - before.y
-        chord[:size] = self.search.reduction.aligned(after.y[:size], before.y[:size]) - before.y[:size]
+        points, chord = {0.0: before, 1.0: after}, self._difference(after.y, before.y)
 
-        def value(part: float) -> float:
+        def value(part: float, kind: str, rank: int | None) -> float:
             if part not in points:
                 points[part] = self.corrected(before.y + part * chord, chord, before)
             return points[part].test(kind, rank)
 
-        return points[float(brentq(value, 0.0, 1.0, xtol=LOCATED))]
+        for kind, rank in before.crossings(after):
+            yield kind, points[float(brentq(value, 0.0, 1.0, (kind, rank), xtol=LOCATED))]
 
     def branching(self, point: FamilyPoint, periods: int, *, backward: bool) -> tuple[Continuation, FamilyPoint]:
         """Return the point of a bifurcation with the tangent of the other family, whose period is a multiple."""
@@ -495,7 +486,7 @@ class Continuation:
                 own = np.append(linear.units[: search.reduction.size], linear.units[-tail:])
                 row = self._reduced(search, prediction, normal) / (own if former is None else former.units) ** 2
                 row /= np.linalg.norm(row * own)
-                away = np.append(search.reduction.aligned(y[:size], prediction[:size]), y[-tail:]) - prediction
+                away = self._difference(np.append(y[:size], y[-tail:]), prediction)
                 defects = np.append(defects, row @ self._reduced(search, prediction, away))
                 row, columns = row * own, np.zeros(len(linear.units))
                 columns[: search.reduction.size], columns[-tail:] = row[:-tail], row[-tail:]
@@ -619,6 +610,16 @@ class Continuation:
         fields = _range(fields)
         rows = linear.jacobian[len(closing.defects) :]
         return _range(fields @ _smallest(rows @ fields, 0, RANK)), gradients.shape[1]
+
+
+def _states_along(orbit: PeriodicOrbit, t: float, state: Array, duration: float) -> tuple[Array, Array]:
+    """Return times and (n, 2m) states of short steps from a state of an orbit."""
+    at: dict[str, Any] = {"t": t, "parameters": orbit.parameters, "options": orbit.options}
+    with without_accuracy_warnings():
+        run = orbit.stepper.integrate(
+            *np.split(state, 2), t_end=t + duration, max_step=duration / PHASES, check_growth=False, **at
+        )
+    return np.asarray(run.t), np.hstack([run.q, run.p])
 
 
 def _block_diagonal(blocks: Sequence[Array]) -> Array:

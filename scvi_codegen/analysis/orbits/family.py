@@ -15,14 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.analysis.estimation.measurements import state_names
 from scvi_codegen.analysis.orbits.continuation import Continuation, FamilyEndsError, FamilyPoint, Formula
 from scvi_codegen.analysis.orbits.equilibrium import Equilibrium
-from scvi_codegen.analysis.orbits.solver import (
-    ERROR,
-    ERROR_OF_EQUAL_STEPS,
-    OrbitSearch,
-    PeriodicOrbit,
-    gains_of,
-    momenta_at_rest,
-)
+from scvi_codegen.analysis.orbits.solver import OrbitSearch, PeriodicOrbit, bound_of, checked_part, gains_of, indices_of
 from scvi_codegen.analysis.orbits.step_sequence import StepSequence
 from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.codegen.native.options import SolverOptions
@@ -31,7 +24,6 @@ from scvi_codegen.common.errors import AccuracyWarning, OrbitError, StateError, 
 from scvi_codegen.common.representation import counted, summary
 from scvi_codegen.common.validation import WHOLE, ArgumentType, check_kind, checked_count, checks_arguments, of
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
-from scvi_codegen.runs.states.reduction import Reduction
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import STEPPER, Stepper
 from scvi_codegen.runs.stepping.features import require
@@ -45,24 +37,27 @@ OF_CONTINUATIONS = ("parameter", "step", "bound", "parameter_unit")
 """Settings that are saved."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Bifurcation:
     """Orbit of a family where its stability changes, or where the family turns.
 
     Attributes:
         kind: ``"fold"`` (the parameter, or else the energy, has an extremum), ``"branch"`` (another family crosses),
             ``"period doubling"``, ``"Krein collision"`` (indices meet and leave the real axis), ``"torus"``.
-        orbit: the periodic orbit there.
         after: number of the last orbit of the family before it.
     """
 
     kind: str
-    orbit: PeriodicOrbit
     after: int
     _at: FamilyPoint = field(repr=False)
     _continuation: Continuation = field(repr=False)
 
     __repr__ = summary("kind", "orbit", "after")
+
+    @property
+    def orbit(self) -> PeriodicOrbit:
+        """The periodic orbit there."""
+        return self._at.orbit
 
     def switch(
         self,
@@ -87,10 +82,11 @@ class Bifurcation:
         continuation = (
             self._continuation
             if step is None
-            else replace(self._continuation, step=_checked_part("step", step, "relative to the size of the motion"))
+            else replace(self._continuation, step=checked_part("step", step, "relative to the size of the motion"))
         )
         continuation, start = continuation.branching(self._at, periods, backward=backward)
-        return _Growing.at(continuation, start).grown(checked_count(count, "count", least=2), until, progress)
+        begun = Family._of_one(continuation, start)
+        return begun._grown(checked_count(count, "count", least=2), until, progress)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -155,8 +151,41 @@ class Family:
 
     def more(self, count: int = 100, *, until: Until = None, progress: Progress = None) -> Family:
         """Return the family with up to ``count`` further orbits."""
-        known = _Growing(self._continuation, self._first, self._last, self.orbits, self.bifurcations)
-        return known.grown(len(self) + checked_count(count, "count", least=1), until, progress)
+        return self._grown(len(self) + checked_count(count, "count", least=1), until, progress)
+
+    @classmethod
+    def _of_one(cls, continuation: Continuation, point: FamilyPoint) -> Family:
+        """Return a family of one orbit."""
+        return cls(
+            orbits=(point.orbit,), bifurcations=(), ended="", _first=point, _last=point, _continuation=continuation
+        )
+
+    def _grown(self, count: int, until: Until, progress: Progress) -> Family:
+        """Return the family with up to ``count`` orbits."""
+        continuation, last, ended = self._continuation, self._last, ""
+        orbits, bifurcations = self.orbits, self.bifurcations
+        reason = _reason(until, continuation.search.stepper)
+        try:
+            while len(orbits) < count and not ended:
+                following = continuation.following(last)
+                try:
+                    between = [] if last.of_both else list(continuation.bifurcations(last, following))
+                except OrbitError:  # the orbits between them are none of the chord: go on in smaller steps
+                    last = replace(last, step=last.step / 4.0)
+                    continue
+                before, last, after = last, continuation.shifted(last, following), len(orbits) - 1
+                orbits = (*orbits, last.orbit)
+                bifurcations += tuple(Bifurcation(kind, after, at, continuation) for kind, at in between)
+                if progress is not None:
+                    progress(len(orbits))
+                ended = reason(last.orbit) or continuation.end_at(self._first, before, last)
+        except FamilyEndsError as error:
+            ended = str(error)
+        except KeyboardInterrupt:
+            ended = "it was interrupted"
+        _warn_of_errors(orbits[len(self) - 1 :], continuation.bound)
+        ended = ended or "it has as many orbits as were asked for"
+        return replace(self, orbits=orbits, bifurcations=bifurcations, ended=ended, _last=last)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the orbits to a .npz file: q, p, period, energy, parameters, error, multipliers, stable, bifurcations.
@@ -203,7 +232,9 @@ class Family:
             raise StateError(f"'{os.fspath(path)}' is a family of '{settings['system']}', not of '{stepper.title}'")
         options = settings["options"] and SolverOptions(**settings["options"])
         orbits = list(_orbits_of(arrays, stepper, options))
-        search = _search_at(orbits[-1], orbits[-1].period, **{name: settings[name] for name in OF_SEARCHES})
+        own: dict[str, Any] = {name: np.array(settings[name]) for name in ("gain", "drifts")}
+        own |= {"fixed_indices": tuple(settings["fixed_indices"]), "energy": settings["energy"]}
+        search = _search_at(orbits[-1], orbits[-1].period, **own)
         continuation = Continuation(
             search=search,
             period_of=settings["period"] and Formula.of(settings["period"], stepper.parameters),
@@ -215,7 +246,7 @@ class Family:
         found = zip(arrays["kinds"], arrays["bifurcations"], others, strict=True)
         return cls(
             orbits=tuple(orbits),
-            bifurcations=tuple(_located(str(kind), int(k), at, continuation) for kind, k, at in found),
+            bifurcations=tuple(Bifurcation(str(kind), int(k), at, continuation) for kind, k, at in found),
             ended=settings["ended"],
             _first=first,
             _last=replace(last, step=settings["next step"], largest=settings["largest"]),
@@ -294,10 +325,6 @@ def family(
     require(stepper, "periodic_orbit")
     if start.stepper.interface != stepper.interface:
         raise StateError(f"the start is one of '{start.stepper.title}', not of '{stepper.title}'")
-    names = state_names(stepper)
-    for name in fixed:
-        if name not in names:
-            raise StateError(f"fixed names '{name}', which is no coordinate or momentum{closest(name, names)}")
     if parameter is not None and parameter not in stepper.parameters:
         raise StateError(f"'{parameter}' is no parameter of '{stepper.title}'{closest(parameter, stepper.parameters)}")
     first = _state_at(start, mode, amplitude)
@@ -306,43 +333,31 @@ def family(
     if period is not None and parameter is None:
         raise StateError("period= is a formula of parameter=, which is missing: name it, or give fixed_period=True")
     prescribed = None if energy is None else checked_number(energy, "the energy")
-    indices = (*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else []))
+    indices = indices_of(stepper, fixed, fixed_period=fixed_period)
     search = _search_at(start, float(first[-1]), fixed_indices=indices, energy=prescribed, **gains_of(stepper, gain))
     continuation = Continuation(
         search=search,
         parameter=None if parameter is None else stepper.parameters.index(parameter),
-        step=_checked_part("step", step, "relative to the size of the motion"),
-        bound=_bound(search, error),
+        step=checked_part("step", step, "relative to the size of the motion"),
+        bound=bound_of(search.sequence, error),
         period_of=None if period is None else Formula.of(period, stepper.parameters),
     )
     continuation, point = continuation.begun(first, start, backward=backward)
-    return _Growing.at(continuation, point).grown(checked_count(count, "count", least=1), until, progress)
+    begun = Family._of_one(continuation, point)
+    return begun._grown(checked_count(count, "count", least=1), until, progress)
 
 
-def _search_at(
-    start: PeriodicOrbit | Equilibrium,
-    period: float,
-    *,
-    fixed_indices: Sequence[int],
-    energy: float | None,
-    gain: ArrayLike,
-    drifts: ArrayLike,
-) -> OrbitSearch:
+def _search_at(start: PeriodicOrbit | Equilibrium, period: float, **rest: Any) -> OrbitSearch:
     """Return the closing equations next to a start."""
-    return OrbitSearch(
-        stepper=start.stepper,
-        at_rest=momenta_at_rest(start.stepper, start.q, start.t, start.parameters),
-        reduction=Reduction(start.stepper.interface),
+    return OrbitSearch.at(
+        start.stepper,
+        start.q,
         period=period,
         sequence=_equal_steps_of(start),
-        max_step=math.inf,
-        fixed_indices=tuple(fixed_indices),
-        energy=energy,
-        gain=np.asarray(gain, dtype=float),
-        drifts=np.asarray(drifts, dtype=bool),
         t=start.t,
         parameters=np.array(start.parameters),
         options=start.options if isinstance(start, PeriodicOrbit) else None,
+        **rest,
     )
 
 
@@ -361,18 +376,6 @@ def _equal_steps_of(start: PeriodicOrbit | Equilibrium) -> StepSequence | None:
     if isinstance(start, Equilibrium) or start.sequence.tolerance is not None:
         return None
     return start.sequence
-
-
-def _bound(search: OrbitSearch, error: float | None) -> float:
-    if error is None:
-        return ERROR if search.sequence is None else ERROR_OF_EQUAL_STEPS
-    return _checked_part("error", error, "a bound of the relative discretisation error")
-
-
-def _checked_part(name: str, value: float, meaning: str) -> float:
-    if not 0.0 < (value := checked_number(value, name)) <= 1.0:
-        raise StateError(f"{name} must be between 0 and 1, {meaning}, not {value:g}")
-    return value
 
 
 def _state_at(start: PeriodicOrbit | Equilibrium, mode: int, amplitude: float | None) -> Array:
@@ -411,56 +414,6 @@ def _reason(until: Until, stepper: Stepper) -> Callable[[PeriodicOrbit], str]:
     return reason
 
 
-@dataclass(frozen=True, eq=False)
-class _Growing:
-    """Orbits of a family, of which the last one is continued."""
-
-    continuation: Continuation
-    first: FamilyPoint
-    last: FamilyPoint
-    orbits: Sequence[PeriodicOrbit]
-    bifurcations: Sequence[Bifurcation] = ()
-
-    @classmethod
-    def at(cls, continuation: Continuation, point: FamilyPoint) -> _Growing:
-        """Return a family of one orbit."""
-        return cls(continuation, point, point, [point.orbit])
-
-    def grown(self, count: int, until: Until, progress: Progress) -> Family:
-        """Return the family with up to ``count`` orbits."""
-        continuation, orbits, stepper = self.continuation, list(self.orbits), self.continuation.search.stepper
-        last, ended, bifurcations = self.last, "", list(self.bifurcations)
-        try:
-            reason = _reason(until, stepper)
-            while len(orbits) < count and not ended:
-                following = continuation.following(last)
-                try:
-                    between = (
-                        [] if last.of_both else list(_bifurcations(continuation, last, following, len(orbits) - 1))
-                    )
-                except OrbitError:  # the orbits between them are none of the chord: go on in smaller steps
-                    last = replace(last, step=last.step / 4.0)
-                    continue
-                before, last = last, continuation.shifted(last, following)
-                orbits, bifurcations = [*orbits, last.orbit], bifurcations + between
-                if progress is not None:
-                    progress(len(orbits))
-                ended = reason(last.orbit) or continuation.end_at(self.first, before, last)
-        except FamilyEndsError as reason:
-            ended = str(reason)
-        except KeyboardInterrupt:
-            ended = "it was interrupted"
-        _warn_of_errors(orbits[len(self.orbits) - 1 :], continuation.bound)
-        return Family(
-            orbits=tuple(orbits),
-            bifurcations=tuple(bifurcations),
-            ended=ended or "it has as many orbits as were asked for",
-            _first=self.first,
-            _last=last,
-            _continuation=continuation,
-        )
-
-
 def _warn_of_errors(orbits: Sequence[PeriodicOrbit], bound: float) -> None:
     worst = max(orbits, key=lambda orbit: orbit.error)
     if worst.error > bound and warnings_wanted():
@@ -469,16 +422,3 @@ def _warn_of_errors(orbits: Sequence[PeriodicOrbit], bound: float) -> None:
             f"above the bound {bound:.1e}: use a method of higher degree or a larger error=",
             AccuracyWarning,
         )
-
-
-def _bifurcations(
-    continuation: Continuation, before: FamilyPoint, after: FamilyPoint, number: int
-) -> Iterator[Bifurcation]:
-    """Locate the bifurcations between two points of the family."""
-    for kind, rank in before.crossings(after):
-        at = continuation.located(before, after, kind, rank)
-        yield _located(kind, number, at, continuation)
-
-
-def _located(kind: str, number: int, at: FamilyPoint, continuation: Continuation) -> Bifurcation:
-    return Bifurcation(kind=kind, orbit=at.orbit, after=number, _at=at, _continuation=continuation)

@@ -276,9 +276,8 @@ def periodic_orbit(
     """
     stepper = stepper.bind(q, parameters)[0]._known_with_events
     q, p, velocity = stepper._states.start(q, p, velocity)
-    interface, names = stepper.interface, state_names(stepper)
     require(stepper, "periodic_orbit")
-    check_inputs_given(interface, parameters)
+    check_inputs_given(stepper.interface, parameters)
     if energy is not None:
         require(stepper, "energy")
     if (period := checked_number(period, "the period")) <= 0.0:
@@ -288,37 +287,46 @@ def periodic_orbit(
         raise StateError(f"max_step={max_step:g} requires adaptive steps: omit it, or steps and h")
     if sequence is None:
         require(stepper, "adaptive")
-    bound = ERROR if sequence is None else ERROR_OF_EQUAL_STEPS
-    if error is not None and not 0.0 < (bound := checked_number(error, "error")) < 1.0:
-        raise StateError(f"error must be between 0 and 1, a bound of the relative discretisation error, not {bound:g}")
-    for name in fixed:
-        if name not in names:
-            raise StateError(f"fixed names '{name}', which is no coordinate or momentum{closest(name, names)}")
     t, values = checked_number(t, "the time t"), stepper._parameters(parameters)
     momenta = stepper._initial_momenta(q, p, velocity, t, values)
     start = np.concatenate(stepper._states.pair(q, momenta))
-    search = OrbitSearch(
-        stepper=stepper,
-        at_rest=momenta_at_rest(stepper, start[: stepper.dimension], t, values),
-        reduction=Reduction(interface),
+    search = OrbitSearch.at(
+        stepper,
+        start[: stepper.dimension],
         period=period,
         sequence=sequence,
         max_step=limits.get("max_step", math.inf),
-        fixed_indices=(*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else [])),
+        fixed_indices=indices_of(stepper, fixed, fixed_period=fixed_period),
         energy=None if energy is None else checked_number(energy, "the energy"),
         **gains_of(stepper, gain),
         t=t,
         parameters=values,
         options=options,
     )
-    return search.orbit(np.append(start, search.period), bound)
+    return search.orbit(np.append(start, search.period), bound_of(sequence, error))
 
 
-def momenta_at_rest(stepper: Stepper, q: Array, t: float, parameters: Array) -> Array:
-    """Return the momenta without velocity, 0 where they are undefined."""
-    with suppress(StateError):  # undefined of most Hamiltonians
-        return stepper.momentum(q, np.zeros_like(q), t, parameters)
-    return np.zeros_like(q)
+def bound_of(sequence: StepSequence | None, error: float | None) -> float:
+    """Return the bound of the discretisation error, by default that of adaptive or equal steps."""
+    if error is None:
+        return ERROR if sequence is None else ERROR_OF_EQUAL_STEPS
+    return checked_part("error", error, "a bound of the relative discretisation error")
+
+
+def checked_part(name: str, value: float, meaning: str) -> float:
+    """Return a number between 0 and 1, or raise :class:`StateError`."""
+    if not 0.0 < (value := checked_number(value, name)) <= 1.0:
+        raise StateError(f"{name} must be between 0 and 1, {meaning}, not {value:g}")
+    return value
+
+
+def indices_of(stepper: Stepper, fixed: Sequence[str], *, fixed_period: bool) -> tuple[int, ...]:
+    """Return the indices of the unknowns with fixed values, -1 of the period."""
+    names = state_names(stepper)
+    for name in fixed:
+        if name not in names:
+            raise StateError(f"fixed names '{name}', which is no coordinate or momentum{closest(name, names)}")
+    return (*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else []))
 
 
 def gains_of(stepper: Stepper, gain: ArrayLike | Sequence[float | None] | None) -> dict[str, Any]:
@@ -369,6 +377,18 @@ class OrbitSearch:
     t: float
     parameters: Array
     options: SolverOptions | None
+
+    @classmethod
+    def at(
+        cls, stepper: Stepper, q: Array, *, t: float, parameters: Array, max_step: float = math.inf, **rest: Any
+    ) -> OrbitSearch:
+        """Return the equations next to a position, whose momenta without velocity are 0 where they are undefined."""
+        at_rest = np.zeros_like(q)
+        with suppress(StateError):  # undefined of most Hamiltonians
+            at_rest = stepper.momentum(q, at_rest, t, parameters)
+        reduction = Reduction(stepper.interface)
+        own: dict[str, Any] = {"at_rest": at_rest, "reduction": reduction, "max_step": max_step}
+        return cls(stepper=stepper, t=t, parameters=parameters, **own, **rest)
 
     def orbit(self, guess: Array, bound: float) -> PeriodicOrbit:
         """Return the orbit near a guess, with a discretisation error below a bound if steps are adaptive.
@@ -640,7 +660,7 @@ class OrbitSearch:
         q, p = np.split(states, 2, axis=1)
         return SizeOfMotion.of(q, p, self.at_rest)
 
-    def _sizes_of(self, states: Array) -> Array:
+    def sizes_of(self, states: Array) -> Array:
         """Return the (2m,) sizes of positions and momenta along states, at least their rounding errors."""
         size = self._size_of(states)
         least = (RESOLVED * rounding or LEAST_SIZE for rounding in size.rounding)
@@ -656,7 +676,7 @@ class OrbitSearch:
             self._segment(start, self.steps, first, last, z[-1])
             for start, first, last in zip(starts, bounds[:-1], bounds[1:], strict=True)
         ]
-        sizes = self._sizes_of(np.vstack([starts, *(segment.states for segment in segments)]))
+        sizes = self.sizes_of(np.vstack([starts, *(segment.states for segment in segments)]))
         gradients = [
             self.integral_gradients(start, segment.start_time, sizes)
             for start, segment in zip(starts, segments, strict=True)

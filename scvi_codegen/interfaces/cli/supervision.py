@@ -62,10 +62,10 @@ def interruptions() -> Iterator[list[int]]:
 
 
 @contextlib.contextmanager
-def progress_bar(steps: int) -> Iterator[Callable[[int], None]]:
+def progress_bar(steps: int, label: str = "integrating") -> Iterator[Callable[[int], None]]:
     """Show a bar on stderr if that is a terminal; the function it yields takes the number of completed steps."""
     if not sys.stderr.isatty() or steps == 0 or is_quiet():
         yield lambda done: None
         return
-    with click.progressbar(length=steps, label="integrating", file=sys.stderr) as bar:
+    with click.progressbar(length=steps, label=label, file=sys.stderr) as bar:
         yield lambda done: bar.update(done - bar.pos)

@@ -21,7 +21,7 @@ from scvi_codegen.interfaces.models.options import (
     STATE,
     VELOCITY,
     check_alternatives,
-    checked_path_value,
+    checked_value,
     real,
     with_exact_numbers,
 )
@@ -76,6 +76,7 @@ class Model(TimeSpan):
         events: zero crossings that runs record, which may change the state.
         mesh: of the fields of a density.
         path: ends and kind of the paths of ``scvi-codegen path``, by the keys of the section ``[path]``.
+        family: continuation of ``scvi-codegen family``, by the keys of the section ``[family]``.
         page: ranges of sliders, speed and plots of :func:`~scvi_codegen.page`, as its arguments.
         picture: points, and rods, springs, walls, bodies and trails between them, as of :func:`~scvi_codegen.page`.
 
@@ -97,6 +98,7 @@ class Model(TimeSpan):
     events: tuple[Event, ...] = ()
     mesh: Any = field(default=None, compare=False, repr=False)
     path: Mapping[str, Any] = field(default_factory=dict)
+    family: Mapping[str, Any] = field(default_factory=dict)
     page: Mapping[str, Any] = field(default_factory=dict)
     picture: Mapping[str, Any] = field(default_factory=dict)
 
@@ -120,7 +122,9 @@ class Model(TimeSpan):
         if self.mesh is None:
             object.__setattr__(self, "mesh", self.system.mesh)
         object.__setattr__(self, "page", _with_lists(self.page))
-        object.__setattr__(self, "path", {key: checked_path_value(key, value) for key, value in self.path.items()})
+        for section in ("path", "family"):
+            values = {key: checked_value(section, key, value) for key, value in getattr(self, section).items()}
+            object.__setattr__(self, section, values)
         object.__setattr__(self, "picture", _with_lists(self.picture))
         object.__setattr__(self, "method", as_method(self.method, self.system))
         if isinstance(self.system, FirstOrderSystem) and self.p is self.velocity is None:

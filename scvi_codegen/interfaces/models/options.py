@@ -311,6 +311,18 @@ _TABLE |= {
         "path", COUNT, "N", "Start around the centre, too, both ways, with up to N whole revolutions.", common=False
     ),
 }
+_OF_FAMILIES = {
+    "amplitude": (NUMBER, "A", "Begin at the equilibrium near --q, with this deviation."),
+    "mode": (COUNT, "N", "Oscillation of the equilibrium, by descending frequency [0]."),
+    "period": (TEXT, "T", "Period of an orbit near --q, or its formula (2*pi/w)."),
+    "vary": (TEXT, "NAME", "Parameter of the system along which the family is continued."),
+    "fixed": (TEXT, "NAMES", "Coordinates and momenta that keep their values, y,p_x."),
+    "until": (TEXT, "CONDITION", "Condition that ends the family, 'energy > -1.57'."),
+    "backward": (SWITCH, "", "Towards smaller values of the parameter, or of the energy."),
+    "stride": (NUMBER, "S", "Largest step, relative to the motion [0.1]."),
+    "count": (COUNT, "N", "Largest number of orbits [50]."),
+}
+_TABLE |= {name: Option("family", *option, common=False) for name, option in _OF_FAMILIES.items()}
 OPTIONS = tuple(option.named(name) for name, option in _TABLE.items())
 KEYED = tuple(option for option in OPTIONS if option.section and not option.is_section)
 """Options with a key of their own in a section of model files."""
@@ -338,9 +350,9 @@ STATE = {option.key: option.field for option in options_of("initial") if option.
 """Field of a model by key of ``[initial]``."""
 
 
-def checked_path_value(key: str, value: Any) -> Any:
-    """Return a value of the section ``[path]``, or raise :class:`ModelFileError`."""
-    options, where = {option.key: option for option in options_of("path")}, f"[path] {key}"
+def checked_value(section: str, key: str, value: Any) -> Any:
+    """Return a value of the section ``[path]`` or ``[family]``, or raise :class:`ModelFileError`."""
+    options, where = {option.key: option for option in options_of(section)}, f"[{section}] {key}"
     if key not in options:
         raise ModelFileError(f"there is no key {where}: use {', '.join(options)}")
     if options[key].kind == NUMBERS:
@@ -349,6 +361,8 @@ def checked_path_value(key: str, value: Any) -> Any:
         return [real(entry, where) for entry in value]
     if options[key].kind != TEXT:
         return options[key].read(value, where)
+    if section == "family" and not isinstance(value, str):
+        raise ModelFileError(f"{where} must be a text, not {value!r}")
     names = isinstance(value, list | tuple) and all(isinstance(entry, str) for entry in value)
     if value is not True and not names and not isinstance(value, str):
         raise ModelFileError(f"{where} must be true or a list of coordinates with signs, not {value!r}")

@@ -144,7 +144,9 @@ def page(
 
 def _model_of(system: Any, motion: Mapping[str, Any]) -> Model:
     """Return the model of a system with the arguments of its motion."""
-    accepted = [name for name in Model.__dataclass_fields__ if name not in ("system", "path", "page", "picture")]
+    accepted = [
+        name for name in Model.__dataclass_fields__ if name not in ("system", "path", "family", "page", "picture")
+    ]
     for name in motion:
         if name not in accepted:
             raise ArgumentError(f"page() takes no {name!r}{keyword_hint(name, accepted)}")

@@ -1,6 +1,6 @@
 """Command ``scvi-codegen family``: a family of periodic orbits, by energy or along a parameter."""
 
-import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,34 +13,30 @@ from scvi_codegen.analysis.orbits.equilibrium import Equilibrium, equilibrium
 from scvi_codegen.analysis.orbits.solver import PeriodicOrbit, periodic_orbit
 from scvi_codegen.common.errors import ModelFileError
 from scvi_codegen.common.representation import counted
-from scvi_codegen.interfaces.cli.command_group import check_writable, is_quiet, reporting, tell
+from scvi_codegen.interfaces.cli.command_group import check_writable, reporting, tell
 from scvi_codegen.interfaces.cli.model_options import model_arguments, read_model, with_known_sizes
+from scvi_codegen.interfaces.cli.supervision import progress_bar
 from scvi_codegen.interfaces.models.model import Model
+from scvi_codegen.interfaces.models.options import options_of
 from scvi_codegen.interfaces.pictures.canvas import PICTURES, check_plot_path
 from scvi_codegen.runs.stepper import Stepper
 
+OWN = tuple(option.name for option in options_of("family"))
+STRIDE, COUNT = 0.1, 50
+
 
 @click.command()
-@model_arguments("solver")
-@click.option("--amplitude", type=float, metavar="A", help="Begin at the equilibrium near --q, with this deviation.")
-@click.option(
-    "--mode", type=int, default=0, metavar="N", help="Oscillation of the equilibrium, by descending frequency [0]."
-)
-@click.option("--period", metavar="T", help="Period of an orbit near --q, or its formula (2*pi/w).")
-@click.option("--vary", metavar="NAME", help="Parameter of the system along which the family is continued.")
-@click.option("--fixed", multiple=True, metavar="NAME", help="Coordinate or momentum that keeps its value.")
-@click.option("--until", metavar="CONDITION", help="Condition that ends the family, 'energy > -1.57'.")
-@click.option("--backward", is_flag=True, help="Towards smaller values of the parameter, or of the energy.")
-@click.option("--stride", type=float, default=0.1, metavar="S", help="Largest step, relative to the motion [0.1].")
-@click.option("--count", type=int, default=50, metavar="N", help="Largest number of orbits [50].")
+@model_arguments("solver", *OWN)
+@click.option("--resume", type=click.Path(), metavar="FILE", help="Continue a family that -o wrote.")
 @click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Orbits: .npz.")
 @click.option("--plot", type=click.Path(), metavar="FILE", help="Plot (.png, .svg, .pdf).")
 @reporting
-def family(model_name: str, output: str | None, plot: str | None, **choices: Any) -> None:
+def family(model_name: str, resume: str | None, output: str | None, plot: str | None, **choices: Any) -> None:
     """Continue a family of periodic orbits of MODEL, and locate its bifurcations.
 
     The family begins at an orbit near the initial state of MODEL (--period), or at the equilibrium near its positions
-    (--amplitude). It is one by energy, or along a parameter (--vary). After Ctrl-C the orbits so far are written.
+    (--amplitude). It is one by energy, or along a parameter (--vary). After Ctrl-C the orbits so far are written, from
+    which --resume continues.
 
     \b
     Examples:
@@ -55,23 +51,8 @@ def family(model_name: str, output: str | None, plot: str | None, **choices: Any
     if plot is not None:
         check_plot_path(plot, PICTURES)
     model = with_known_sizes(read_model(model_name, choices), "family")
-    stepper, vary = model.stepper(), choices["vary"]
-    period = None if choices["period"] is None else Formula.of(choices["period"], stepper.parameters)
-    varies = period is not None and vary in map(str, period.expression.free_symbols)
-    members = families.family(
-        stepper,
-        _start(model, stepper, choices["amplitude"], period, fixed_period=varies),
-        parameter=vary,
-        step=choices["stride"],
-        count=choices["count"],
-        until=choices["until"],
-        backward=choices["backward"],
-        fixed=choices["fixed"],
-        period=choices["period"] if varies else None,
-        mode=choices["mode"],
-        amplitude=choices["amplitude"],
-        progress=None if is_quiet() or not sys.stderr.isatty() else _show_progress,
-    )
+    with progress_bar(model.family.get("count", COUNT), "orbits") as progress:
+        members = _members(model, resume, progress)
     tell(_described(members), **_numbers(members))
     for target, write in ((output, members.save), (plot, members.plot)):
         if target is not None:
@@ -79,6 +60,31 @@ def family(model_name: str, output: str | None, plot: str | None, **choices: Any
             tell(f"wrote {target}")
     if written := [target for target in (output, plot) if target]:
         tell(written=written)
+
+
+def _members(model: Model, resume: str | None, progress: Callable[[int], None]) -> families.Family:
+    """Return the family of a model, or that of a file with further orbits."""
+    stepper, settings = model.stepper(), dict(model.family)
+    count, until = settings.get("count", COUNT), settings.get("until")
+    if resume is not None:
+        return families.Family.load(stepper, resume).more(count, until=until, progress=progress)
+    vary, text, amplitude = (settings.get(key) for key in ("vary", "period", "amplitude"))
+    period = None if text is None else Formula.of(text, stepper.parameters)
+    varies = period is not None and vary in {str(name) for name in period.expression.free_symbols}
+    return families.family(
+        stepper,
+        _start(model, stepper, amplitude, period, fixed_period=varies),
+        parameter=vary,
+        step=settings.get("stride", STRIDE),
+        count=count,
+        until=until,
+        backward=settings.get("backward", False),
+        fixed=[name.strip() for name in settings.get("fixed", "").split(",") if name.strip()],
+        period=text if varies else None,
+        mode=settings.get("mode", 0),
+        amplitude=amplitude,
+        progress=progress,
+    )
 
 
 def _start(
@@ -95,10 +101,6 @@ def _start(
     return periodic_orbit(
         stepper, model.q, model.p, velocity=model.velocity, period=value, fixed_period=fixed_period, **at
     )
-
-
-def _show_progress(count: int) -> None:
-    click.echo(f"\r{counted(count, 'orbit')}", nl=False, err=True)
 
 
 def _described(members: families.Family) -> str:

@@ -103,7 +103,7 @@ Examples:
   scvi-codegen run ring.toml --size N=10000 --plot ring.png
 """
 
-OWN = tuple(option for option in OPTIONS if not (option.common or option.section == "path"))
+OWN = tuple(option for option in OPTIONS if not (option.common or option.section in ("path", "family")))
 """Options that other commands do not have."""
 ERRORS = {option.name: option for option in OWN if option.determines == STEP_SIZE}
 """Those of an error that determines the step size."""

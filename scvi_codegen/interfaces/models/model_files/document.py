@@ -47,7 +47,7 @@ def document_of(model: Model, *, as_arrays: bool = True) -> dict[str, Any]:
     if model.tables and "field" not in document:
         declared = {table.partition("[")[0]: table for table in system.definition.get("tables", ())}
         document["tables"] = {declared[name]: np.asarray(rows).tolist() for name, rows in model.tables.items()}
-    further = {name: getattr(model, name) for name in ("path", "page", "picture") if getattr(model, name)}
+    further = {name: getattr(model, name) for name in ("path", "family", "page", "picture") if getattr(model, name)}
     return {**document, **motion, **further}
 
 

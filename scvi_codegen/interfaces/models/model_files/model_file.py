@@ -63,11 +63,11 @@ FIELD_KEYS = (
     *("scalars", "point_lagrangians", "discretisation"),
 )
 KEYS = {"system": SYSTEM_KEYS, "field": FIELD_KEYS, "page": PAGE_KEYS, "picture": PICTURE_KEYS} | {
-    section: tuple(option.key for option in options_of(section)) for section in ("initial", "run", "path")
+    section: tuple(option.key for option in options_of(section)) for section in ("initial", "run", "path", "family")
 }
 SECTIONS = (
     *("system", "field", "forces", *TORQUES, "functions", "inputs", "sizes", "parameters", "tables", "initial"),
-    *("contacts", "events", "method", "run", "path", "page", "picture"),
+    *("contacts", "events", "method", "run", "path", "family", "page", "picture"),
 )
 ARRAY_SECTIONS = ("sizes", "tables")
 """Sections of systems with arrays."""
@@ -208,7 +208,9 @@ def _read_model(document: Document, changes: Document, folder: str | os.PathLike
     method = read_method(fitted(specification, system))
     values |= {"inputs": _read_inputs(document.get("inputs", {}), folder), "solver": solver}
     events = read_events(document.get("events", []))
-    values |= {name: document.get(name, {}) for name in ("path", "page", "picture")} | read_run(document["run"])
+    values |= {name: document.get(name, {}) for name in ("path", "family", "page", "picture")} | read_run(
+        document["run"]
+    )
     model = Model(system=system, method=method, events=events, **values)
     check_page(model.page, model)
     check_picture(model)

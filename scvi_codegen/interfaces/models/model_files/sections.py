@@ -294,7 +294,8 @@ def words_of(document: Document) -> set[str]:
             for entry in value.values() if isinstance(value, dict) else value:
                 yield from texts(entry)
 
-    sections = {name: section for name, section in document.items() if name not in ("method", "run", "path", "page")}
+    without = ("method", "run", "path", "family", "page")
+    sections = {name: section for name, section in document.items() if name not in without}
     for name in {"system", "field"} & sections.keys():
         sections[name] = {key: value for key, value in sections[name].items() if key != "name"}
     return {word for text in texts(sections) for word in re.findall(r"[A-Za-z_]\w*", text)}
