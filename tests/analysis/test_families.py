@@ -63,9 +63,104 @@ def test_periods_of_a_pendulum_are_elliptic_integrals(pendulum):
 def test_family_ends_where_rounding_errors_hide_the_orbit(pendulum):
     """Near the separatrix runs of a period do not close: they pass the upper equilibrium."""
     family = sc.family(pendulum, sc.equilibrium(pendulum, [0.0]), amplitude=0.1, step=1.0)
+    assert "nearly rests at an equilibrium (homoclinic orbit)" in family.ended
     assert "no periodic orbit was found" in family.ended
     assert max(orbit.residual for orbit in family) < 1e-2
     assert not family.bifurcations
+
+
+@pytest.mark.second
+def test_family_ends_at_an_equilibrium(pendulum):
+    """Where the nonlinear terms, of the relative size of the square of the amplitude, are below the error 1e-9."""
+    orbit = sc.periodic_orbit(pendulum, [0.5], [0.0], period=6.3)
+    family = sc.family(pendulum, orbit, backward=True, step=0.5)
+    assert family.ended.startswith("it shrinks to the equilibrium near q = [")
+    assert 0 < abs(family[-1].q[0]) < 3.2e-5 * 0.51
+    assert family[-1].period == pytest.approx(2 * np.pi, abs=1e-9)
+
+
+@pytest.mark.rotated
+def test_isola_is_followed_once():
+    """Limit cycles of the radius r with (r^2 - 2)^2 + a^2 = 1, and the period 2 pi."""
+    system = sc.LagrangianSystem.from_text(
+        name="isola",
+        coordinates=["x"],
+        lagrangian="x_dot**2/2 - x**2/2",
+        forces={"x": "x_dot*((x**2 + x_dot**2 - 2)**2 + a**2 - 1)/4"},
+        parameters={"a": 0.0},
+    )
+    stepper = sc.compile_stepper(system, "svi:8")
+    isola = sc.family(stepper, sc.periodic_orbit(stepper, [1.0], [0.0], period=6.3), parameter="a", step=0.2)
+    assert isola.ended == "it is closed: the next orbit is the first one"
+    assert [found.kind for found in isola.bifurcations] == ["fold", "fold"]
+    assert [found.orbit.parameters[0] for found in isola.bifurcations] == pytest.approx([1, -1], abs=1e-9)
+    x, p = np.array([(orbit.q[0], orbit.p[0]) for orbit in isola]).T
+    assert (x**2 + p**2 - 2) ** 2 + isola.values**2 == pytest.approx(np.ones(len(isola)), abs=1e-9)
+    angles = np.unwrap(np.arctan2(isola.values, x**2 + p**2 - 2))
+    assert 0.9 < abs(angles[-1] - angles[0]) / (2 * np.pi) < 1.05
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize("apart", [1e-3, 0.0])
+def test_two_branches_between_two_orbits(apart):
+    """The indices of y and z pass 1 at stiffnesses of y that differ by ``apart``, which leaves the orbit unchanged."""
+    system = sc.LagrangianSystem.from_text(
+        name="two across one",
+        coordinates=["x", "y", "z"],
+        lagrangian="(x_dot**2 + y_dot**2 + z_dot**2)/2 - x**2/2 - x**4/4 - k*y**2/2 - (k + d)*z**2/2"
+        " + x**2*(y**2 + z**2)/5",
+        parameters={"k": 1.5, "d": apart},
+    )
+    stepper = sc.compile_stepper(system, "svi:6")
+    orbit = sc.periodic_orbit(stepper, [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], period=4.77, fixed=["x"])
+    family = sc.family(stepper, orbit, parameter="k", fixed=["x"], until="k > 2.2")
+    assert family.periods == pytest.approx(np.full(len(family), orbit.period), rel=1e-12)
+    assert [found.kind for found in family.bifurcations] == ["branch"] * 4
+    numbers = [found.after for found in family.bifurcations]
+    assert numbers[0] == numbers[1] < numbers[2] == numbers[3]
+    k = np.sort([found.orbit.parameters[0] for found in family.bifurcations])
+    assert np.diff(k)[[0, 2]] == pytest.approx([apart, apart], abs=1e-9)
+    for found in family.bifurcations:
+        assert np.sort(abs(found.orbit.stability_indices - 1))[1] < 1e-8
+
+
+@pytest.mark.rotated
+def test_start_of_an_orbit_keeps_its_distance_from_impacts():
+    """A free particle between walls at 0 and L(y) = 1: the period is 2/v, whatever phase the start has."""
+    system = sc.LagrangianSystem.from_text("box", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - y**2/2 - y**4/4 - x*y**2/10")
+    walls = [sc.Event("x", direction=-1, restitution=1.0), sc.Event("1 - x", direction=-1, restitution=1.0)]
+    stepper = sc.compile_stepper(system, "svi:4", events=walls)
+    orbit = sc.periodic_orbit(stepper, [0.02, 0.0], [1.0, 0.0], period=2.0)
+    family = sc.family(stepper, orbit, count=12)
+    assert len(family) == 12
+    assert family.periods == pytest.approx([2 / abs(orbit.p[0]) for orbit in family], rel=1e-10)
+    for orbit in family[1:]:
+        times = np.concatenate([crossings.t for crossings in orbit.run().events]) / orbit.period
+        assert min(times.min(), 1 - times.max()) > 0.05
+
+
+@pytest.mark.second
+def test_families_of_rotations():
+    """A body swings about its first and second axis as a pendulum: T = 4 K((E + 1)/2) sqrt(I)."""
+    system = sc.LagrangianSystem.from_text(
+        "body", rotations={"R": "omega"}, lagrangian="(omega_1**2 + 2*omega_2**2 + 2.5*omega_3**2)/2 + R_33"
+    )
+    stepper = sc.compile_stepper(system, "svi:4")
+    rest = sc.equilibrium(stepper, [1.0, 1e-3, 0.0, 0.0])
+    assert rest.frequencies == pytest.approx([1, np.sqrt(0.5)], rel=1e-12)
+    for mode, inertia in enumerate((1, 2)):
+        family = sc.family(stepper, rest, amplitude=0.1, mode=mode, count=4)
+        expected = 4 * ellipk((family.energies + 1) / 2) * np.sqrt(inertia)
+        assert family.periods == pytest.approx(expected, rel=1e-11)
+
+
+def test_families_with_constraints_are_refused():
+    rod = sc.LagrangianSystem.from_text(
+        "rod", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 - 1"]
+    )
+    stepper = sc.compile_stepper(rod, "svi:2")
+    with pytest.raises(sc.MethodError, match="use coordinates without constraints"):
+        sc.equilibrium(stepper, [0.0, -1.0])
 
 
 @pytest.mark.second
@@ -172,6 +267,8 @@ def test_eigenvalues_have_their_error(method, error):
 
 
 def test_starts_without_a_family_are_refused(pendulum):
+    with pytest.raises(sc.OrbitError, match="no orbit has this amplitude= beside the equilibrium; reduce it"):
+        sc.family(pendulum, sc.equilibrium(pendulum, [0.0]), amplitude=4.0)
     rest = sc.equilibrium(pendulum, [0.0])
     orbit = sc.periodic_orbit(pendulum, [0.5], [0.0], period=6.3)
     with pytest.raises(sc.StateError, match="needs the amplitude="):
@@ -207,11 +304,50 @@ def test_starts_without_a_family_are_refused(pendulum):
 
 
 @pytest.mark.second
-def test_family_is_saved_and_drawn(pendulum, tmp_path):
+def test_family_is_saved_and_drawn(pendulum, moon, tmp_path):
     family = sc.family(pendulum, sc.equilibrium(pendulum, [0.0]), amplitude=0.5, count=3)
     family.save(tmp_path / "family.npz")
     with np.load(tmp_path / "family.npz") as saved:
         assert saved["period"] == pytest.approx(family.periods, rel=1e-15)
         assert saved["multipliers"].shape == (3, 2)
     family.plot(tmp_path / "family.png")
+    with pytest.raises(sc.StateError, match=r"is a family of 'pendulum.*', not of 'restricted three-body problem"):
+        sc.Family.load(moon, tmp_path / "family.npz")
+    heavier = sc.LagrangianSystem.from_text("pendulum", ["q"], "q_dot**2 + g*cos(q)", parameters={"g": 1.0})
+    with pytest.raises(sc.StateError, match="but of another one"):
+        sc.Family.load(sc.compile_stepper(heavier, "svi:8"), tmp_path / "family.npz")
+    (tmp_path / "none.npz").write_text("nothing")
+    with pytest.raises(sc.StateError, match=r"none\.npz' has no family of Family\.save"):
+        sc.Family.load(pendulum, tmp_path / "none.npz")
     assert (tmp_path / "family.png").stat().st_size > 10_000
+
+
+@pytest.mark.rotated
+def test_family_of_a_file_continues(moon, tmp_path):
+    """Orbits, the closure of the first one and the branches of a family, after Ctrl-C, are those without a file."""
+
+    def interrupt(count):
+        if count == 14:
+            raise KeyboardInterrupt
+
+    rest = sc.equilibrium(moon, [0.83, 0, 0])
+    whole = sc.family(moon, rest, amplitude=0.01, step=0.2, count=16)
+    family = sc.family(moon, rest, amplitude=0.01, step=0.2, progress=interrupt)
+    assert family.ended == "it was interrupted"
+    family.save(tmp_path / "family.npz")
+    loaded = sc.Family.load(moon, tmp_path / "family.npz")
+    assert repr(loaded) == repr(family)
+    assert [orbit.period for orbit in loaded] == [orbit.period for orbit in family]
+    longer = loaded.more(2)
+    assert longer.periods == pytest.approx(whole.periods, rel=1e-3)
+    last = longer[-1]
+    nearest = sc.periodic_orbit(moon, whole[-1].q, whole[-1].p, period=whole[-1].period, energy=last.energy)
+    assert last.period == pytest.approx(nearest.period, rel=1e-8)
+    (before,), (after,) = whole.bifurcations, longer.bifurcations
+    assert (before.kind, before.after) == (after.kind, after.after)
+    north, again = (found.switch(count=2) for found in (before, after))
+    change = np.append(north[1].q - north[0].q, north[1].p - north[0].p)
+    assert change[abs(change).argmax()] > 0
+    heights = [abs(halo[1].run().q[:, 2]).max() for halo in (north, again)]
+    assert heights[0] == pytest.approx(heights[1], rel=1e-3)
+    assert heights[0] > 1e-3

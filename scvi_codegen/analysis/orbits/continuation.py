@@ -83,7 +83,7 @@ PHASES = 128
 """Number of states along an orbit among which the nearest to another state is sought."""
 BEND = math.tan(LARGEST_TURN / 4.0) / 2.0
 """Largest distance of a family from the chord of a step, relative to the chord: of an arc that turns by 30 degrees."""
-REST, COLLISION = 1e-2, 1e-4
+REST, COLLISION = 0.1, 1e-4
 """Least speed relative to the mean one, and shortest step relative to the longest, of an orbit whose family ends at a
 homoclinic orbit and at a collision."""
 NEAR_START = 0.05
@@ -298,12 +298,11 @@ class Continuation:
         """Return a description of an orbit that no other follows."""
         orbit, widths = point.orbit, point.orbit.sequence.widths
         times, states = _states_along(orbit, orbit.t, np.append(orbit.q, orbit.p), orbit.period)
-        changes = np.diff(states, axis=0) / self.search.sizes_of(states)
-        speeds = np.linalg.norm(changes, axis=1) / np.diff(times)
-        if speeds.min() <= REST * speeds.mean():
-            return f"the orbit of the period {orbit.period:.6g} nearly rests at an equilibrium (homoclinic orbit)"
+        changes = np.linalg.norm(np.diff(states, axis=0) / self.search.sizes_of(states), axis=1)
         if widths.min() <= COLLISION * widths.max():
             return f"the orbit of the period {orbit.period:.6g} approaches a collision, and no other one follows"
+        if (changes / np.diff(times)).min() <= REST * changes.sum() / orbit.period:
+            return f"the orbit of the period {orbit.period:.6g} nearly rests at an equilibrium (homoclinic orbit)"
         return "no orbit follows"
 
     def change_along(self, point: FamilyPoint) -> Array:
@@ -312,10 +311,11 @@ class Continuation:
 
     def end_at(self, first: FamilyPoint, before: FamilyPoint, after: FamilyPoint) -> str:
         """Return why a family ends at an orbit, or ``""``: it shrinks to a point, or passes its first orbit."""
-        size = after.units[0]
+        shrinks = after.units[: self.search.reduction.size] < before.units[: self.search.reduction.size]
         # Terms that are not linear have the relative size of the square of the amplitude, here below the bound.
-        if size < math.sqrt(self.bound) * after.largest and size < before.units[0]:
-            return f"it shrinks to the equilibrium near q = {np.array2string(after.orbit.q, precision=6)}"
+        if shrinks[0] and after.units[0] < math.sqrt(self.bound) * after.largest:
+            end = "the equilibrium" if shrinks[-1] else "a collision"
+            return f"it shrinks to {end} near q = {np.array2string(after.orbit.q, precision=6)}"
         length = np.linalg.norm(self._away(before, after.y))
         tail = slice(self.search.reduction.size, None)
         if before is first or (np.abs(self._away(before, first.y)[tail]) > (1.0 + BEND) * length).any():

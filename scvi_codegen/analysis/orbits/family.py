@@ -240,9 +240,16 @@ class Family:
             period_of=settings["period"] and Formula.of(settings["period"], stepper.parameters),
             **{name: settings[name] for name in OF_CONTINUATIONS},
         )
-        first, last, *others = (continuation.corrected(*point) for point in arrays["points"])
-        if not np.abs(first.y - arrays["points"][0, 0]).max() <= SAME_ORBIT * np.abs(first.y).max():
-            raise StateError(f"the orbits of '{os.fspath(path)}' are none of '{stepper.title}', another system")
+        points = arrays["points"]
+        try:
+            first, last, *others = (continuation.corrected(*point) for point in points)
+            same = np.abs(first.y - points[0, 0]).max() <= SAME_ORBIT * np.abs(first.y).max()
+        except OrbitError:
+            same = False
+        if not same:
+            raise StateError(
+                f"the orbits of '{os.fspath(path)}' are none of this '{stepper.title}', but of another one"
+            )
         found = zip(arrays["kinds"], arrays["bifurcations"], others, strict=True)
         return cls(
             orbits=tuple(orbits),
