@@ -50,6 +50,7 @@ def main(
       lattices:ring:1000, ..    array systems; C by hand, REBOUND, OpenMM
       digits                    31 digits; heyoka in long double and quadruple precision
       drift                     energy over ten million steps
+      families                  periodic orbits a second, by continuation
       first-step                time from text to the first step
       scaling, threads          a step of array systems of 10^3 to 10^6 coordinates, in one and two threads
       by-hand                   a step of a ring and of a field beside C by hand

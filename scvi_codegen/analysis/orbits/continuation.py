@@ -79,7 +79,7 @@ RANK = 1e-3
 of 1e-6, and independent ones in units of the motion differ by their size."""
 BEYOND = {"branch": 1.0, "period doubling": -1.0}
 """Values that real indices pass at bifurcations."""
-PHASES = 128
+PHASES = 64
 """Number of states along an orbit among which the nearest to another state is sought."""
 BEND = math.tan(LARGEST_TURN / 4.0) / 2.0
 """Largest distance of a family from the chord of a step, relative to the chord: of an arc that turns by 30 degrees."""
@@ -88,10 +88,6 @@ REST, COLLISION = 0.1, 1e-4
 homoclinic orbit and at a collision."""
 NEAR_START = 0.05
 """Time between start and nearest impact, relative to the period, below which the start is moved along the orbit."""
-
-
-class FamilyEndsError(OrbitError):
-    """No orbit follows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,19 +197,15 @@ class FamilyPoint:
         real = np.abs(self.others.imag) <= SAME
         return float(np.sort(np.where(real, BEYOND[kind] * self.others.real - 1.0, -1.0))[-1 - rank])
 
-    @property
-    def complex_values(self) -> tuple[int, int]:
-        """Number of the complex indices or multipliers, and of those with a modulus above 1."""
-        values = self.others[np.abs(self.others.imag) > SAME]
-        return len(values), int(np.count_nonzero(np.abs(values) > 1.0))
-
     def crossings(self, after: FamilyPoint) -> Iterator[tuple[str, int | None]]:
         """Yield kind and rank of the test functions that change their sign between this orbit and the next one."""
         changed = {kind for kind, value in self.tests.items() if value * after.tests.get(kind, value) < 0.0}
-        counts = zip(("Krein collision", "torus"), self.complex_values, after.complex_values, strict=True)
-        changed -= {kind for kind, here, there in counts if here == there}
+        values = [point.others[np.abs(point.others.imag) > SAME] for point in (self, after)]  # complex ones
+        counts = {"Krein collision": {len(part) for part in values}}
+        counts["torus"] = {np.count_nonzero(np.abs(part) > 1.0) for part in values}
+        changed -= {kind for kind, numbers in counts.items() if len(numbers) == 1}
         yield from ((kind, None) for kind in self.tests if kind in changed)
-        if "fold" in changed or self.complex_values != after.complex_values:
+        if "fold" in changed or len(counts["Krein collision"]) > 1:
             return
         for kind in BEYOND.keys() - changed:
             ranks = range(len(self.others))
@@ -292,7 +284,7 @@ class Continuation:
                 continue
             wider = GROWTH if following.corrections <= FEW_CORRECTIONS else 1.0
             return replace(following, step=min(self.step, wider * step))
-        raise FamilyEndsError(f"{self._last_orbit(point)} at {SMALLEST_STEP:.0e} of the step: {failure}")
+        raise OrbitError(f"{self._last_orbit(point)} at {SMALLEST_STEP:.0e} of the step: {failure}")
 
     def _last_orbit(self, point: FamilyPoint) -> str:
         """Return a description of an orbit that no other follows."""

@@ -13,14 +13,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.analysis.estimation.measurements import state_names
-from scvi_codegen.analysis.orbits.continuation import Continuation, FamilyEndsError, FamilyPoint, Formula
+from scvi_codegen.analysis.orbits.continuation import Continuation, FamilyPoint, Formula
 from scvi_codegen.analysis.orbits.equilibrium import Equilibrium
 from scvi_codegen.analysis.orbits.solver import OrbitSearch, PeriodicOrbit, bound_of, checked_part, gains_of, indices_of
 from scvi_codegen.analysis.orbits.step_sequence import StepSequence
 from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.atomic import write_atomically
-from scvi_codegen.common.errors import AccuracyWarning, OrbitError, StateError, closest, warn
+from scvi_codegen.common.errors import (
+    AccuracyWarning,
+    EventError,
+    OrbitError,
+    StateError,
+    StepFailedError,
+    closest,
+    warn,
+)
 from scvi_codegen.common.representation import counted, summary
 from scvi_codegen.common.validation import WHOLE, ArgumentType, check_kind, checked_count, checks_arguments, of
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
@@ -85,11 +93,11 @@ class Bifurcation:
             else replace(self._continuation, step=checked_part("step", step, "relative to the size of the motion"))
         )
         continuation, start = continuation.branching(self._at, periods, backward=backward)
-        begun = Family._of_one(continuation, start)
+        begun = Family((start.orbit,), (), "", start, start, continuation)
         return begun._grown(checked_count(count, "count", least=2), until, progress)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Family:
     """One-parameter family of periodic orbits.
 
@@ -153,13 +161,6 @@ class Family:
         """Return the family with up to ``count`` further orbits."""
         return self._grown(len(self) + checked_count(count, "count", least=1), until, progress)
 
-    @classmethod
-    def _of_one(cls, continuation: Continuation, point: FamilyPoint) -> Family:
-        """Return a family of one orbit."""
-        return cls(
-            orbits=(point.orbit,), bifurcations=(), ended="", _first=point, _last=point, _continuation=continuation
-        )
-
     def _grown(self, count: int, until: Until, progress: Progress) -> Family:
         """Return the family with up to ``count`` orbits."""
         continuation, last, ended = self._continuation, self._last, ""
@@ -179,7 +180,7 @@ class Family:
                 if progress is not None:
                     progress(len(orbits))
                 ended = reason(last.orbit) or continuation.end_at(self._first, before, last)
-        except FamilyEndsError as error:
+        except (EventError, OrbitError, StepFailedError) as error:
             ended = str(error)
         except KeyboardInterrupt:
             ended = "it was interrupted"
@@ -205,11 +206,8 @@ class Family:
         settings = {name: getattr(continuation, name) for name in OF_CONTINUATIONS}
         settings |= {name: np.asarray(getattr(continuation.search, name)).tolist() for name in OF_SEARCHES}
         settings |= {"system": self[0].stepper.title, "ended": self.ended, "largest": self._last.largest}
-        settings |= {
-            "next step": self._last.step,
-            "period": period and period.text,
-            "options": options and asdict(options),
-        }
+        settings |= {"next step": self._last.step, "period": period and period.text}
+        settings["options"] = options and asdict(options)
         arrays["settings"] = np.array(json.dumps(settings))
         write_atomically(path, lambda file: np.savez(file, **arrays))
 
@@ -350,7 +348,7 @@ def family(
         period_of=None if period is None else Formula.of(period, stepper.parameters),
     )
     continuation, point = continuation.begun(first, start, backward=backward)
-    begun = Family._of_one(continuation, point)
+    begun = Family((point.orbit,), (), "", point, point, continuation)
     return begun._grown(checked_count(count, "count", least=1), until, progress)
 
 

@@ -346,6 +346,8 @@ METHOD_KEYS = tuple(option.name for option in options_of("method") if option.com
 """Options that specify the method."""
 OF_ADAPTIVE_STEPS = ("absolute_tolerance", "max_step", "first_step")
 """Options of adaptive steps besides the tolerance."""
+FURTHER = ("path", "family", "page", "picture")
+"""Sections of commands and pictures, which are fields of a model."""
 STATE = {option.key: option.field for option in options_of("initial") if option.kind == NUMBERS}
 """Field of a model by key of ``[initial]``."""
 

@@ -38,6 +38,7 @@ from scvi_codegen.interfaces.models.model_files.page_section import (
     drawn_system_of_model,
     starts_from_momenta,
 )
+from scvi_codegen.interfaces.models.options import FURTHER
 from scvi_codegen.interfaces.models.packages.example import absolute_tolerances_of, check_example
 from scvi_codegen.interfaces.models.packages.package import integrator_of
 from scvi_codegen.interfaces.pages.webassembly import LICENCES, check_compiler, webassembly
@@ -144,9 +145,7 @@ def page(
 
 def _model_of(system: Any, motion: Mapping[str, Any]) -> Model:
     """Return the model of a system with the arguments of its motion."""
-    accepted = [
-        name for name in Model.__dataclass_fields__ if name not in ("system", "path", "family", "page", "picture")
-    ]
+    accepted = [name for name in Model.__dataclass_fields__ if name not in ("system", *FURTHER)]
     for name in motion:
         if name not in accepted:
             raise ArgumentError(f"page() takes no {name!r}{keyword_hint(name, accepted)}")

@@ -22,7 +22,8 @@ from scvi_codegen.interfaces.pictures.canvas import PICTURES, check_plot_path
 from scvi_codegen.runs.stepper import Stepper
 
 OWN = tuple(option.name for option in options_of("family"))
-STRIDE, COUNT = 0.1, 50
+NAMES, COUNT = {"vary": "parameter", "stride": "step"}, 50
+"""Arguments of the function with other names here, and the largest number of orbits."""
 
 
 @click.command()
@@ -64,27 +65,16 @@ def family(model_name: str, resume: str | None, output: str | None, plot: str | 
 
 def _members(model: Model, resume: str | None, progress: Callable[[int], None]) -> families.Family:
     """Return the family of a model, or that of a file with further orbits."""
-    stepper, settings = model.stepper(), dict(model.family)
-    count, until = settings.get("count", COUNT), settings.get("until")
+    stepper, settings = model.stepper(), {"count": COUNT} | {NAMES.get(key, key): x for key, x in model.family.items()}
     if resume is not None:
-        return families.Family.load(stepper, resume).more(count, until=until, progress=progress)
-    vary, text, amplitude = (settings.get(key) for key in ("vary", "period", "amplitude"))
+        further = {key: settings[key] for key in ("count", "until") if key in settings}
+        return families.Family.load(stepper, resume).more(**further, progress=progress)
+    text = settings.pop("period", None)
     period = None if text is None else Formula.of(text, stepper.parameters)
-    varies = period is not None and vary in {str(name) for name in period.expression.free_symbols}
-    return families.family(
-        stepper,
-        _start(model, stepper, amplitude, period, fixed_period=varies),
-        parameter=vary,
-        step=settings.get("stride", STRIDE),
-        count=count,
-        until=until,
-        backward=settings.get("backward", False),
-        fixed=[name.strip() for name in settings.get("fixed", "").split(",") if name.strip()],
-        period=text if varies else None,
-        mode=settings.get("mode", 0),
-        amplitude=amplitude,
-        progress=progress,
-    )
+    varies = period is not None and settings.get("parameter") in {str(name) for name in period.expression.free_symbols}
+    settings["fixed"] = [name.strip() for name in settings.get("fixed", "").split(",") if name.strip()]
+    start = _start(model, stepper, settings.get("amplitude"), period, fixed_period=varies)
+    return families.family(stepper, start, period=text if varies else None, progress=progress, **settings)
 
 
 def _start(

@@ -11,7 +11,7 @@ import numpy as np
 
 from scvi_codegen.common.errors import ModelFileError
 from scvi_codegen.interfaces.models.model import Model
-from scvi_codegen.interfaces.models.options import STATE
+from scvi_codegen.interfaces.models.options import FURTHER, STATE
 from scvi_codegen.systems.first_order import FirstOrderSystem
 from scvi_codegen.systems.formulas.indices import Array
 from scvi_codegen.systems.system import MechanicalSystem
@@ -47,7 +47,7 @@ def document_of(model: Model, *, as_arrays: bool = True) -> dict[str, Any]:
     if model.tables and "field" not in document:
         declared = {table.partition("[")[0]: table for table in system.definition.get("tables", ())}
         document["tables"] = {declared[name]: np.asarray(rows).tolist() for name, rows in model.tables.items()}
-    further = {name: getattr(model, name) for name in ("path", "family", "page", "picture") if getattr(model, name)}
+    further = {name: getattr(model, name) for name in FURTHER if getattr(model, name)}
     return {**document, **motion, **further}
 
 

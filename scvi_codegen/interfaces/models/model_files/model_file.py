@@ -47,7 +47,7 @@ from scvi_codegen.interfaces.models.model_files.sections import (
     words_of,
 )
 from scvi_codegen.interfaces.models.model_files.values import read_values
-from scvi_codegen.interfaces.models.options import OF_ADAPTIVE_STEPS, STEP_KEYS, options_of, with_exact_numbers
+from scvi_codegen.interfaces.models.options import FURTHER, OF_ADAPTIVE_STEPS, STEP_KEYS, options_of, with_exact_numbers
 from scvi_codegen.methods import fitted
 from scvi_codegen.methods.controllers import SYMPLECTIC, check_controller, default_controller, with_time_transformation
 from scvi_codegen.systems.checks.definition import warn_of_mistakes
@@ -67,7 +67,7 @@ KEYS = {"system": SYSTEM_KEYS, "field": FIELD_KEYS, "page": PAGE_KEYS, "picture"
 }
 SECTIONS = (
     *("system", "field", "forces", *TORQUES, "functions", "inputs", "sizes", "parameters", "tables", "initial"),
-    *("contacts", "events", "method", "run", "path", "family", "page", "picture"),
+    *("contacts", "events", "method", "run", *FURTHER),
 )
 ARRAY_SECTIONS = ("sizes", "tables")
 """Sections of systems with arrays."""
@@ -208,9 +208,7 @@ def _read_model(document: Document, changes: Document, folder: str | os.PathLike
     method = read_method(fitted(specification, system))
     values |= {"inputs": _read_inputs(document.get("inputs", {}), folder), "solver": solver}
     events = read_events(document.get("events", []))
-    values |= {name: document.get(name, {}) for name in ("path", "family", "page", "picture")} | read_run(
-        document["run"]
-    )
+    values |= {name: document.get(name, {}) for name in FURTHER} | read_run(document["run"])
     model = Model(system=system, method=method, events=events, **values)
     check_page(model.page, model)
     check_picture(model)
