@@ -286,6 +286,12 @@ class TestCommand:
         assert [row[0] for row in rows] == names[:1] * len(data["cases"][0]["measurements"])
         assert float(rows[-1][3]) == data["cases"][0]["measurements"][-1]["error"]
 
+    @pytest.mark.rotated
+    def test_families_have_orbits_a_second(self):
+        (table,) = bench.benchmark(["families"], bench.Plan(peers=(), quick=True)).data()["tables"]
+        assert [row["orbits"] for row in table["rows"]] == [4, 4]
+        assert all(row["error"] < 1e-9 < row["orbits_a_second"] for row in table["rows"])
+
     def test_interrupt_saves_completed_measurements(self, tmp_path, monkeypatch):
         def interrupt(plan, report_activity):
             raise KeyboardInterrupt

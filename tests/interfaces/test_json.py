@@ -151,6 +151,28 @@ def test_json_of_paths_is_that_of_the_model_file_and_of_the_interface():
         assert message in invoke("path", "harmonic-oscillator", *wrong, status=status).output
 
 
+@pytest.mark.rotated
+def test_json_of_families_is_that_of_the_model_file_and_of_a_file_that_continues():
+    words = ("--q", "0", "--amplitude", "0.3", "--stride", "0.2", "--fixed", "p_q", "--method", "svi:4")
+    whole = json_of("family", "planar-pendulum", *words, "--count", "4")
+    text = invoke("systems", "planar-pendulum").stdout.replace("q = [0.5]", "q = [0.0]")
+    section = '[family]\namplitude = 0.3\nstride = 0.2\nfixed = "p_q"\ncount = 2\n'
+    Path("own.toml").write_text(f"{text}\n{section}")
+    model = parse_model(f"{text}\n{section}")
+    assert model.family == {"amplitude": 0.3, "stride": 0.2, "fixed": "p_q", "count": 2}
+    assert parse_model(dump_model(model)) == model
+    half = json_of("family", "own.toml", "--q", "0", "--method", "svi:4", "-o", "half.npz")
+    assert half["orbits"] == whole["orbits"][:2]
+    again = json_of("family", "own.toml", "--q", "0", "--method", "svi:4", "--resume", "half.npz")
+    assert [orbit["period"] for orbit in again["orbits"]] == pytest.approx(
+        [orbit["period"] for orbit in whole["orbits"]], rel=1e-9
+    )
+    assert again["orbits"][-1]["period"] == pytest.approx(4 * ellipk((1 + again["orbits"][-1]["energy"]) / 2), rel=1e-9)
+    for wrong, message in (("until = 3", r"[family] until must be a text, not 3"), ("form = 1", "unknown key 'form'")):
+        Path("wrong.toml").write_text(f"{text}\n[family]\n{wrong}\n")
+        assert message in invoke("family", "wrong.toml", status=2).output
+
+
 @pytest.mark.parametrize(
     ("run", "tolerance"),
     [("span = 3.0\nerror = 1e-6", 0.0), ("span = 3.0\ntolerance = 1e-6", 1e-6), ("step = 0.1\nsteps = 9", None)],

@@ -8,6 +8,7 @@ import pytest
 import scvi_codegen
 from scvi_codegen import Model, ModelFileError
 from scvi_codegen.interfaces.cli.commands.derive import derive
+from scvi_codegen.interfaces.cli.commands.family import family
 from scvi_codegen.interfaces.cli.commands.path import path
 from scvi_codegen.interfaces.cli.commands.run import run
 from scvi_codegen.interfaces.models.model_files.model_file import dump_model, parse_model
@@ -85,8 +86,10 @@ def test_flags_of_commands_are_those_of_the_table():
     common = {option.name for option in OPTIONS if option.common}
     assert common <= {each.name for each in derive.params}
     of_paths = {option.name for option in OPTIONS if option.section == "path"}
-    assert {option.name for option in OPTIONS} - of_paths <= {each.name for each in run.params}
+    of_families = {option.name for option in OPTIONS if option.section == "family"}
+    assert {option.name for option in OPTIONS} - of_paths - of_families <= {each.name for each in run.params}
     assert common | of_paths <= {each.name for each in path.params}
+    assert common | of_families <= {each.name for each in family.params}
     assert not {option.name for option in OPTIONS if not option.common} & {each.name for each in derive.params}
 
 

@@ -42,7 +42,6 @@ OF_ORBITS = tuple(name for name in PeriodicOrbit.__dataclass_fields__ if name no
 """Fields of orbits that are saved as they are."""
 OF_SEARCHES = ("fixed_indices", "energy", "gain", "drifts")
 OF_CONTINUATIONS = ("parameter", "step", "bound", "parameter_unit")
-"""Settings that are saved."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,8 +36,7 @@ def family(model_name: str, resume: str | None, output: str | None, plot: str | 
     """Continue a family of periodic orbits of MODEL, and locate its bifurcations.
 
     The family begins at an orbit near the initial state of MODEL (--period), or at the equilibrium near its positions
-    (--amplitude). It is one by energy, or along a parameter (--vary). After Ctrl-C the orbits so far are written, from
-    which --resume continues.
+    (--amplitude). It is one by energy, or along a parameter (--vary). After Ctrl-C the orbits so far are written.
 
     \b
     Examples:
