@@ -154,6 +154,28 @@ def test_families_of_rotations():
         assert family.periods == pytest.approx(expected, rel=1e-11)
 
 
+@pytest.mark.rotated
+def test_family_of_a_motion_that_drifts():
+    """Van der Pol's cycle has w = 1 - m^2/16 + 17 m^4/3072 + 35 m^6/884736; it drives s'' = x^2 - s', ds = int x^2."""
+    system = sc.LagrangianSystem.from_text(
+        name="driven drift",
+        coordinates=["s", "x"],
+        lagrangian="(s_dot**2 + x_dot**2 - x**2)/2",
+        forces={"s": "x**2 - s_dot", "x": "m*(1 - x**2)*x_dot"},
+        parameters={"m": 0.15},
+    )
+    stepper, gain = sc.compile_stepper(system, "svi:4"), [None, 0.0]
+    orbit = sc.periodic_orbit(stepper, [0.0, 2.0], [2.0, 0.0], period=6.29, gain=gain)
+    family = sc.family(stepper, orbit, parameter="m", gain=gain, step=0.02, count=3)
+    m = family.values
+    assert (np.diff(m) > 0).all()
+    expected = 2 * np.pi / (1 - m**2 / 16 + 17 * m**4 / 3072 + 35 * m**6 / 884736)
+    assert family.periods == pytest.approx(expected, rel=1e-9)
+    run = family[-1].run()
+    x = run.at(np.linspace(run.t[0], run.t[-1], 65)[:-1])[0][:, 1]
+    assert run.q[-1, 0] - run.q[0, 0] == pytest.approx(family[-1].period * np.mean(x**2), rel=1e-8)
+
+
 def test_families_with_constraints_are_refused():
     rod = sc.LagrangianSystem.from_text(
         "rod", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 - 1"]

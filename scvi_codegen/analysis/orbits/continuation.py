@@ -589,7 +589,7 @@ class Continuation:
         """Return the orthonormal directions to the same orbit, and the number of conserved quantities.
 
         They are the flow and the fields Omega grad J of the conserved quantities, whose gradients are the equations
-        that the projection ``independent`` removes; of them those that keep the fixed entries.
+        that the projection ``independent`` removes, and shifts of drifting positions, if they keep fixed entries.
         """
         closing, size, units = linear.closing, search.reduction.size, linear.units
         kept, strengths, _ = np.linalg.svd(closing.independent * units[:size] / units[:size, np.newaxis])
@@ -599,7 +599,7 @@ class Continuation:
             flow = search.leaving(closing.motion) @ closing.motion.by_period / units[:size]
             fields = np.column_stack([flow / np.linalg.norm(flow), fields])
         fields = np.vstack([fields, np.zeros((len(units) - size, fields.shape[1]))])
-        fields = _range(fields)
+        fields = _range(np.column_stack([fields, np.eye(len(units))[:, np.flatnonzero(search.drifts)]]))
         rows = linear.jacobian[len(closing.defects) :]
         return _range(fields @ _smallest(rows @ fields, 0, RANK)), gradients.shape[1]
 
