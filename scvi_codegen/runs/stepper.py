@@ -46,7 +46,14 @@ from scvi_codegen.runs.results.dense_output import times_of_run
 from scvi_codegen.runs.results.output import ALL_STATES, Output
 from scvi_codegen.runs.states.layout import InitialData
 from scvi_codegen.runs.states.times import times_after
-from scvi_codegen.runs.states.validation import Array, EnsembleParameters, Parameters, States, flat_state
+from scvi_codegen.runs.states.validation import (
+    Array,
+    EnsembleParameters,
+    Parameters,
+    States,
+    check_step_given,
+    flat_state,
+)
 from scvi_codegen.runs.states.words import check_doubles, hashed
 from scvi_codegen.runs.stepping.array_interface import RunSizes, interface_of_sizes, shapes_of_call, sizes_of_run
 from scvi_codegen.runs.stepping.compiled_method import Variants
@@ -547,6 +554,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         They satisfy d/dt L_v = L_q + f + G^T lambda with G = g_q, or g_v for a velocity constraint; for ``x**2 + y**2 =
         l**2`` the tension of the rod is -2 l lambda. They depend on the state alone and are as accurate as the state.
         """
+        check_step_given(self.interface, parameters)
         values = multipliers(self, q, p, t, parameters)
         return values[0] if self._states.is_one(q) else values
 

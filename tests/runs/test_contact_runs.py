@@ -72,6 +72,29 @@ def test_work_is_exact_where_the_motion_is(tmp_path: Any) -> None:
             made.work()
 
 
+def test_single_steps_require_the_modes_that_runs_choose() -> None:
+    stepper = of(POINT, "x y", [sc.contact("y", slip="x_dot", friction=0.3)])
+    state, slides = ([0.0, 0.0], [2.0, 0.0]), {"contact_1_closed": 1.0, "contact_1_direction": 1.0}
+    run = stepper.integrate(*state, h=0.1, steps=1)
+    for call, arguments in (
+        (stepper.step, (*state, 0.1)),
+        (stepper.jacobian, (*state, 0.1)),
+        (stepper.sensitivity, (*state, 0.1)),
+        (stepper.work_and_impulses, (*state, 0.1)),
+        (stepper.multipliers, state),
+        (sc.equilibrium, (stepper, state[0])),
+    ):
+        with pytest.raises(sc.ContactError, match=r"integrate.*steps=1.*contact_1_closed"):
+            call(*arguments, parameters={})
+    assert np.array_equal(np.ravel(stepper.step(*state, 0.1, parameters=slides)), [*run.q[-1], *run.p[-1]])
+    assert np.allclose(
+        stepper.jacobian(*state, 0.1, parameters=slides)[:, [0, 2]], run.sensitivity().state[-1][:, [0, 2]]
+    )
+    assert stepper.multipliers(*state, parameters=slides)[0] == pytest.approx(G)
+    assert not stepper.supports("action")
+    assert not stepper.supports("path")
+
+
 STEPS = pytest.mark.parametrize("steps", [{"h": 0.05}, {}])
 
 

@@ -20,7 +20,7 @@ from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.runs.accuracy.size import RESOLVED, roundoff
 from scvi_codegen.runs.states.reduction import Reduction
-from scvi_codegen.runs.states.validation import Array, Parameters, check_inputs_given
+from scvi_codegen.runs.states.validation import Array, Parameters, check_step_given
 from scvi_codegen.runs.stepper import STEPPER, Stepper
 from scvi_codegen.runs.stepping.features import require
 
@@ -101,7 +101,7 @@ def equilibrium(stepper: Stepper, q: ArrayLike, *, t: float = 0.0, parameters: P
     """
     stepper = stepper.bind(q, parameters)[0]._known_with_events
     require(stepper, "periodic_orbit")
-    check_inputs_given(stepper.interface, parameters)
+    check_step_given(stepper.interface, parameters)
     values, rest = stepper._parameters(parameters), np.zeros(stepper.dimension)
     positions, _, velocity = stepper._states.start(q, None, rest)
     momenta = stepper._initial_momenta(positions, None, velocity, t, values)

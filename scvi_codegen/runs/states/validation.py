@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.codegen.native.arguments import checked_number, real_array
 from scvi_codegen.codegen.rendering.source import NAME_IN_FORMULA, NUMBER, Interface
-from scvi_codegen.common.errors import StateError, closest
+from scvi_codegen.common.errors import ContactError, StateError, closest
 from scvi_codegen.common.representation import counted
 from scvi_codegen.runs.states.words import Shapes
 
@@ -310,6 +310,18 @@ def check_inputs_given(interface: Interface, parameters: Any) -> None:
     """Raise :class:`StateError` if an input is not set."""
     if missing := inputs_not_given(interface, parameters):
         raise missing_input(missing[0])
+
+
+def check_step_given(interface: Interface, parameters: Any) -> None:
+    """Raise an error if inputs of a single step, or modes of its contacts, are not set; those in order set all."""
+    check_inputs_given(interface, parameters)
+    masks = [name for contact in interface.contacts for name in contact.masks]
+    if masks and (parameters is None or (isinstance(parameters, Mapping) and parameters.keys().isdisjoint(masks))):
+        raise ContactError(
+            "single steps do not choose the modes of contacts: use the run integrate(.., h=h, steps=1), its "
+            "multipliers(), sensitivity(), tangent and pullback, or set modes, as "
+            f"parameters={{'{masks[0]}': 1}}, all of stepper.modes"
+        )
 
 
 def check_left_to_inputs(interface: Interface, parameters: Any) -> None:

@@ -150,7 +150,7 @@ FEATURES = {
         ("with events that set parameters", _DERIVATIVES, "make them terminal, and restart with the new parameters"),
         (
             "with contacts",
-            "check_growth device observe_ensemble hessian chaos_ensemble flow advice shadow_energy",
+            f"check_growth device observe_ensemble hessian chaos_ensemble flow advice {_ACTIONS}",
             "use runs and ensembles with h, or with t_end and a tolerance, without it",
         ),
         ("with constraints", "device observe_ensemble", "use coordinates without constraints, or omit it"),

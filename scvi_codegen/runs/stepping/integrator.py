@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.codegen.native.binding import Binding
 from scvi_codegen.codegen.native.options import SolverOptions, step_failure
-from scvi_codegen.runs.states.validation import Array, Parameters, States, check_inputs_given
+from scvi_codegen.runs.states.validation import Array, Parameters, States, check_step_given
 from scvi_codegen.runs.stepping.features import require
 from scvi_codegen.runs.stepping.step_derivatives import LinearisedMethod
 
@@ -42,10 +42,11 @@ class Integrator(LinearisedMethod):
 
         Raises:
             StateError: if a shape or name is invalid, or a number is not finite.
+            ContactError: for contacts whose modes are not among the parameters.
             StepFailedError: if the stage equations cannot be solved.
         """
         q0, p0 = self._states.pair(q, p)
-        check_inputs_given(self.interface, parameters)
+        check_step_given(self.interface, parameters)
         arrays = [*map(self._states.block, (q0, p0, self._parameters_at(q0, p0, parameters)))]
         q1, p1 = np.empty_like(arrays[0]), np.empty_like(arrays[1])
         t = self._states.time(t)
@@ -144,7 +145,7 @@ class Integrator(LinearisedMethod):
             return self.known.work_and_impulses(q, p, h, t, self._parameters(parameters), options=options)
         if not self.interface.exchange_names:
             require(self, "work")
-        check_inputs_given(self.interface, parameters)
+        check_step_given(self.interface, parameters)
         state = *self._states.pair(q, p), self._parameters(parameters)
         q1, p1, values = *np.empty((2, self.dimension)), np.empty(len(self.interface.exchange_names) + 1)
         name = "work_and_impulses"
@@ -176,7 +177,7 @@ class Integrator(LinearisedMethod):
             return self.known._discrete_legendre(q0, q1, h, t, self._parameters(parameters), options)
         if not self.interface.has_action:
             require(self, "discrete_lagrangian")
-        check_inputs_given(self.interface, parameters)
+        check_step_given(self.interface, parameters)
         ends = self._vector(q0, "q0"), self._vector(q1, "q1"), self._parameters(parameters)
         p0, p1, action = *np.empty((2, self.dimension)), np.empty(1)
         binding = self.binding.with_function("discrete_legendre")

@@ -16,7 +16,7 @@ from scvi_codegen.codegen.native.arguments import checked_number, checked_step, 
 from scvi_codegen.codegen.native.options import REASONS, SolverOptions, step_failure
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.representation import summary
-from scvi_codegen.runs.states.validation import Array, Parameters, check_inputs_given
+from scvi_codegen.runs.states.validation import Array, Parameters, check_step_given
 from scvi_codegen.runs.stepping.state_functions import StateFunctions
 
 
@@ -235,7 +235,7 @@ class LinearisedMethod(StateFunctions):
         """
         q0, p0 = self._states.pair(q, p)
         starts = Starts.chain(q0, p0, np.array([checked_number(t, "the time t")]), np.array([checked_step(h)]))
-        check_inputs_given(self.interface, parameters)
+        check_step_given(self.interface, parameters)
         values = self._parameters_at(q0, p0, parameters)
         vectors, size = np.zeros((2, len(seeds), self._input_size)), seeds.shape[1]
         vectors[int(transpose), :, :size] = seeds
