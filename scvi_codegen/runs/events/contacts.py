@@ -56,8 +56,8 @@ def warn_of_choices(watch: Any) -> None:
     """Warn if several motions were possible at a transition, and if the restitution of an impact was replaced."""
     if getattr(watch, "ambiguous", 0):
         warn(
-            "a transition has several motions, with a contact open and with it closed: G M^-1 (G - mu d T)^T <= 0 "
-            "(Painleve's paradox); reduce friction, or change the geometry",
+            "a transition has several motions, with contacts open, sticking or sliding, as in Painleve's paradox; the "
+            "run has one of them: reduce friction, or change the geometry",
             EventWarning,
         )
     if law := getattr(watch, "law", 0):

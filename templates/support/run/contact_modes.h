@@ -2,10 +2,13 @@
 
 /* Choice of modes: forces in the friction cones, by projection, propose them; the conditions of contacts.h decide. */
 enum {
+  CONTACT_MODES = 4096, /* that are tried where a relaxation finds none */
+  CONTACT_OTHERS = 256, /* that are compared with the one that was found */
   CONTACT_TRIALS = 8, /* of a relaxation, each of twice as many sweeps */
   CONTACT_SWEEPS = 50 /* over the forces of contacts */
 };
 
+#define CONTACT_APART 1e-5 /* part of their size by which the rates of two motions differ */
 #define CONTACT_ASIDE 1e-9 /* largest angle between friction and slip in space */
 #define CONTACT_COMPLIANCE 1e-3 /* of friction at the start of a relaxation */
 
@@ -184,9 +187,56 @@ static int modes_of_forces(contact_problem *in, int trial, const real *force, co
   return changed;
 }
 
+/* Modes that a contact may have, of which the first ones stick; beside the best one only those that static friction does
+ * not distinguish from it. Slips in space at rest have no other direction. Returns their number. */
+static int list_modes(const contact_problem *in, int k, const contact_mode *best, contact_mode *mode)
+{
+  const real *const friction = in->of->coefficient + 3 * k;
+  const int line = CONTACTS[k].slips == 1 && in->role[k].sticks && !(best && friction[0] != friction[1]);
+  int count = 0;
+  if (!line || !in->begins[k])
+    mode[count++] = line || !best || !best[k].closed ? in->role[k] : best[k];
+  for (int way = 1; line && way >= -1; way -= 2) {
+    mode[count] = CONTACT_SLIPS;
+    mode[count++].direction[0] = way;
+  }
+  if (!in->is_free[k] && CONTACTS[k].normal >= 0)
+    mode[count++] = CONTACT_IS_OPEN;
+  return count;
+}
+
+/* First consistent modes among all, beside the best ones of which rates differ from theirs; 0 if there are none, or too
+ * many to try. */
+static int enumerate_modes(contact_problem *in, const contact_mode *best, const real *rates, int most,
+    contact_mode *mode)
+{
+  real force[CONTACT_ROWS], after[CONTACT_ROWS], size = 0.0;
+  contact_mode list[EVENT_CONTACTS][4];
+  int count[EVENT_CONTACTS], total = 1;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    count[k] = list_modes(in, k, best, list[k]);
+    total *= total <= most ? count[k] : 1;
+  }
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    size = fmax(size, fabs(in->right[r]));
+  in->is_strict = in->is_relaxed = 0;
+  for (int number = 0; total <= most && number < total; number++) {
+    int differs = !best;
+    for (int k = 0, rest = number; k < EVENT_CONTACTS; rest /= count[k++])
+      mode[k] = list[k][rest % count[k]];
+    if (!is_consistent(in, mode, force, after))
+      continue;
+    for (int r = 0; r < CONTACT_ROWS && best; r++)
+      differs |= fabs(after[r] - rates[r]) > CONTACT_APART * fmax(size, fabs(after[r]));
+    if (differs)
+      return 1;
+  }
+  return 0;
+}
+
 /* Finds consistent modes: all contacts that meet closed, all slips at rest sticking; else by relaxation of the forces,
  * from the present ones, then from 0, with friction in proportion to its limits. If slips without a rate are all that
- * is consistent, these begin. Returns 0 if none is found. */
+ * is consistent, these begin; else by trial of all. Returns 0 if none is found. */
 static int relax_modes(contact_problem *in, real *force, contact_mode *best)
 {
   real exact[CONTACT_ROWS], after[CONTACT_ROWS];
@@ -218,7 +268,8 @@ static int relax_modes(contact_problem *in, real *force, contact_mode *best)
     if (trial == 0)
       memset(force, 0, BYTES(CONTACT_ROWS));
   }
-  return found;
+  memcpy(in->limit, limit, sizeof limit);
+  return found || enumerate_modes(in, NULL, NULL, CONTACT_MODES, best);
 }
 
 /* Notes why no motion is possible; contact k, or all. */
@@ -231,12 +282,12 @@ static int refuse(const event_step *step, int reason, int k, real value)
 }
 
 /* The first contact of Painleve's paradox, G M^-1 (G - mu d T)^T <= 0 of a slip, at rest in any direction; -1: none. */
-static int painleve(const contact_problem *in, int at_rest, real *entry)
+static int painleve(const contact_problem *in, real *entry)
 {
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, slips = CONTACTS[k].slips;
     const real *const W = in->of->W + normal * CONTACT_ROWS, *const coupling = W + CONTACTS[k].tangential;
-    real along = in->limit[k] && at_rest ? length_of(coupling, slips) : 0.0;
+    real along = in->limit[k] ? length_of(coupling, slips) : 0.0;
     if (normal < 0 || slips == 0 || in->is_free[k])
       continue;
     for (int j = 0; j < slips; j++)
@@ -261,17 +312,17 @@ static int is_impossible(const contact_terms *of, int k)
 static int choose_modes(const event_step *step, const contact_terms *of, const contact_change *now, real *force)
 {
   contact_problem in = {.of = of, .right = of->second, .is_strict = 1};
-  contact_mode best[EVENT_CONTACTS];
+  contact_mode best[EVENT_CONTACTS], other[EVENT_CONTACTS];
   real second[CONTACT_ROWS], entry = 0.0;
   int imposed[CONTACT_ROWS] = {0};
   for (int k = 0; k < EVENT_CONTACTS; k++)
     allow_modes(&in, k, now);
   if (!relax_modes(&in, force, best)) {
-    const int paradox = painleve(&in, 1, &entry);
+    const int paradox = painleve(&in, &entry);
     return refuse(step, CONTACT_WITHOUT_MODE, paradox, paradox < 0 ? 0.0 : entry);
   }
-  step->watch->ambiguous |= painleve(&in, 0, &entry) >= 0;
   solve_contacts(of, best, of->second, force, second, imposed);
+  step->watch->ambiguous |= enumerate_modes(&in, best, second, CONTACT_OTHERS, other);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential;
     const int is_slow = CONTACTS[k].slips > 0 && (in.rests[k] || in.begins[k]);

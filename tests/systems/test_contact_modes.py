@@ -1,0 +1,105 @@
+"""Modes of contacts at random states, compared with all modes that satisfy the conditions."""
+
+import itertools
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from notation import lagrange
+from numpy.typing import NDArray
+
+import scvi_codegen as sc
+
+pytestmark = pytest.mark.rotated
+CONTACTS, M = 3, 6
+SMALL, SAME = 1e-12, 1e-8
+Matrix = NDArray[np.float64]
+
+
+def consistent(rows: Matrix, slips: Matrix, forces: Matrix, friction: Matrix, rates: Matrix) -> list[Matrix]:
+    """Return the accelerations of all consistent modes of contacts in a plane, by trial of each.
+
+    Args:
+        rows, slips: (k, m) gaps and slips by the velocities, both divided by the Cholesky factor of the mass.
+        forces: (m,) applied.
+        friction, rates: (k,) coefficients and slips at the state.
+    """
+    found: list[Matrix] = []
+    choices: list[Sequence[Any]] = [
+        ("open", np.sign(w)) if abs(w) > SMALL else ("open", "stick", 1.0, -1.0) for w in rates
+    ]
+    for modes in itertools.product(*choices):
+        imposed, pushed, owner = [], [], []
+        for k, mode in enumerate(modes):
+            if mode == "stick":
+                imposed += [rows[k], slips[k]]
+                pushed += [rows[k], slips[k]]
+                owner += [k, k]
+            elif mode != "open":
+                imposed.append(rows[k])
+                pushed.append(rows[k] - friction[k] * mode * slips[k])
+                owner.append(k)
+        matrix, along = np.reshape(imposed, (-1, M)), np.reshape(pushed, (-1, M))
+        multipliers = np.linalg.solve(matrix @ along.T, -matrix @ forces) if owner else np.empty(0)
+        acceleration = forces + along.T @ multipliers
+        holds = True
+        for k, mode in enumerate(modes):
+            own = multipliers[[j for j, each in enumerate(owner) if each == k]]
+            if mode == "open":
+                holds &= rows[k] @ acceleration >= -SMALL
+            elif mode == "stick":
+                holds &= own[0] >= -SMALL and abs(own[1]) <= friction[k] * own[0] + SMALL
+            else:
+                starts = abs(rates[k]) > SMALL or mode * (slips[k] @ acceleration) >= -SMALL
+                holds &= own[0] >= -SMALL and starts
+        if holds and not any(np.allclose(acceleration, other, atol=SAME) for other in found):
+            found.append(acceleration)
+    return found
+
+
+@pytest.mark.parametrize(("seed", "largest"), [(0, 2.0), (1, 5.0)])
+def test_runs_have_one_of_all_consistent_modes_and_say_whether_there_are_several(seed: int, largest: float) -> None:
+    """Particles m = 1 of constant forces with up to three contacts, whose normals and slips are neither orthogonal."""
+    names = [f"x_{i}" for i in range(M)]
+    numbers = {f"{kind}_{k}_{i}": 0.0 for kind in "gw" for k in range(CONTACTS) for i in range(M)}
+    numbers |= {f"{kind}_{k}": 0.0 for kind in ("mu", "away") for k in range(CONTACTS)} | {f"f_{x}": 0.0 for x in names}
+    contacts = [
+        sc.contact(
+            " + ".join([f"away_{k}", *(f"g_{k}_{i}*{x}" for i, x in enumerate(names))]),
+            slip=" + ".join(f"w_{k}_{i}*{x}_dot" for i, x in enumerate(names)),
+            friction=f"mu_{k}",
+        )
+        for k in range(CONTACTS)
+    ]
+    text = " + ".join(f"{x}_dot**2/2 + f_{x}*{x}" for x in names)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", sc.SystemDefinitionWarning)  # parameters of contacts alone
+        stepper = sc.compile_stepper(lagrange("random", " ".join(names), text, **numbers), "svi:1", contacts=contacts)
+    random, outcomes = np.random.default_rng(seed), []
+    for _ in range(200):
+        forces, (rows, slips) = random.normal(size=M), random.normal(size=(2, CONTACTS, M))
+        friction, count = random.uniform(0.0, largest, CONTACTS), random.integers(1, CONTACTS + 1)
+        rests = random.random(count) < 0.5
+        imposed = np.concatenate([rows[:count], slips[:count][rests]])
+        velocity = random.normal(size=M) * (len(imposed) < M)
+        velocity -= np.linalg.pinv(imposed) @ (imposed @ velocity)
+        states = consistent(rows[:count], slips[:count], forces, friction, slips[:count] @ velocity)
+        values = dict(
+            zip(numbers, [*rows.ravel(), *slips.ravel(), *friction, *np.zeros(CONTACTS), *forces], strict=True)
+        )
+        values |= {f"away_{k}": 100.0 for k in range(count, CONTACTS)}
+        outcomes.append(min(len(states), 2))
+        start: dict[str, Any] = {"velocity": velocity, "h": 1e-6, "steps": 1, "parameters": values}
+        if not states:
+            with pytest.raises(sc.ContactError, match="no mode of the contacts is consistent"):
+                stepper.integrate(np.zeros(M), **start)
+            continue
+        with warnings.catch_warnings(record=True) as issued:
+            warnings.simplefilter("always")
+            acting = stepper.integrate(np.zeros(M), **start).contact_forces()[0]
+        acceleration = forces + rows.T @ acting[:, 0] + slips.T @ acting[:, 1]
+        assert any(np.allclose(acceleration, other, atol=1e-5) for other in states)
+        assert any("several motions" in str(each.message) for each in issued) == (len(states) > 1)
+    assert np.all(np.bincount(outcomes, minlength=3) > [0, 100, 0])
