@@ -103,3 +103,27 @@ def test_runs_have_one_of_all_consistent_modes_and_say_whether_there_are_several
         assert any(np.allclose(acceleration, other, atol=1e-5) for other in states)
         assert any("several motions" in str(each.message) for each in issued) == (len(states) > 1)
     assert np.all(np.bincount(outcomes, minlength=3) > [0, 100, 0])
+
+
+def test_independent_contacts_have_their_own_scales() -> None:
+    """A block that is pressed with 1e12 times the weight of one that slides to v^2 / (2 mu)."""
+    contacts = [sc.contact(gap, slip=slip, friction=0.3) for gap, slip in (("y", "x_dot"), ("u", "z_dot"))]
+    text = "(x_dot**2 + y_dot**2 + z_dot**2 + u_dot**2)/2 - G*y - u"
+    stepper = sc.compile_stepper(lagrange("blocks", "x y z u", text, G=1e12), "svi:3", contacts=contacts)
+    run = stepper.integrate([0.0] * 4, velocity=[0, 0, 1, 0], h=0.1, t_end=5.0)
+    assert run.q[-1] == pytest.approx([0.0, 0.0, 1 / 0.6, 0.0], abs=1e-14)
+    assert run.contact_modes[-1] == (pytest.approx(1 / 0.3), ("stick", "stick"))
+
+
+@pytest.mark.parametrize(
+    ("friction", "jumps"),
+    [("where(x_dot > w, 1, 2)", True), ("2 - sign(w - x_dot)", True), ("1 + abs(x_dot - w)", False), ("2 + x", False)],
+)
+def test_friction_that_jumps_where_slip_vanishes_is_refused(friction: str, jumps: bool) -> None:
+    system = lagrange("mass", "x", "x_dot**2/2 - x**2/w", w=0.5)
+    make = [sc.friction("x_dot - w", limit=friction)]
+    if not jumps:
+        assert sc.compile_stepper(system, "svi:1", contacts=make)
+        return
+    with pytest.raises(sc.SystemDefinitionError, match="at rest would depend on the motion before"):
+        sc.compile_stepper(system, "svi:1", contacts=make)

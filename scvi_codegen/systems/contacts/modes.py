@@ -6,6 +6,7 @@ the functions of transitions are 1 in modes that they do not end. Runs choose th
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -223,10 +224,28 @@ class _Binding:
             )
         return gradient
 
+    def _check_friction(self, item: Any) -> None:
+        """Raise if friction jumps where a slip vanishes: its value at rest would be that of the motion before."""
+        from scvi_codegen.systems.formulas.kinks import switching_function, unit_step
+
+        for slip, name in itertools.product(slips_of(item), ("friction", "static_friction", "limit", "static_limit")):
+            formula = self.sympy.sympify(getattr(item, name, None) or 0)
+            signs = {u: switching_function(u.args[0]) for u in formula.atoms(unit_step)}
+            at_zero = [u for u, (function, _) in signs.items() if function == switching_function(slip)[0]]
+            above, below = (formula.xreplace({u: int(signs[u][1] == side) for u in at_zero}) for side in (1, -1))
+            velocity = min(slip.free_symbols & self.moving, key=str)
+            if at_zero and self.sympy.simplify((above - below).subs(velocity, self.sympy.solve(slip, velocity)[0])):
+                raise SystemDefinitionError(
+                    f"{name}='{formula}' of a contact of '{self.system.name}' jumps where its slip '{slip}' vanishes: "
+                    "friction at rest would depend on the motion before. Give one that is continuous there, and "
+                    "static_friction= or static_limit= at rest"
+                )
+
     def _add(self, number: int, item: Any) -> ContactRows:
         of_gap = isinstance(item, Contact)
         slips = slips_of(item)
         along = [self._gradient(item, slip, self.system.velocities, "slip") for slip in slips]
+        self._check_friction(item)
         closed = self._mask(number, "closed") if of_gap else None
         sticks = [self._mask(number, f"sticks_{k}") for k in range(1, len(slips) + 1)]
         moving = self._slipping(number, slips) if slips else None

@@ -23,14 +23,12 @@ enum {
 static int impulses_of(const contact_terms *of, int contact, const int *closed, real restitution, const real *rate,
     real *impulse)
 {
-  contact_problem in = {.of = of};
+  contact_problem in = {.of = of, .scale = of->speed};
   contact_mode mode[EVENT_CONTACTS];
   real right[CONTACT_ROWS], after[CONTACT_ROWS];
   memcpy(right, rate, sizeof right);
   right[CONTACTS[contact].normal] *= 1.0 + restitution;
   in.right = right;
-  for (int r = 0; r < CONTACT_ROWS; r++)
-    in.scale = fmax(in.scale, of->speed[r]);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     in.is_free[k] = CONTACTS[k].normal < 0 || !(k == contact || closed[k]);
     in.rests[k] = !in.is_free[k] && CONTACTS[k].slips > 0;

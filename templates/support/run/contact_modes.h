@@ -18,7 +18,7 @@ enum {
 typedef struct {
   const contact_terms *of;
   const real *right;
-  real scale; /* of the rates */
+  const real *scale; /* of the rates, NULL: 0 */
   int is_strict; /* slips that begin have a rate */
   int is_relaxed; /* contacts at their limit do not stick */
   int is_free[EVENT_CONTACTS], rests[EVENT_CONTACTS], begins[EVENT_CONTACTS], limit[EVENT_CONTACTS];
@@ -47,17 +47,25 @@ static void allow_modes(contact_problem *in, int k, const contact_change *now)
     in->role[k].direction[i] = w[i] / length_of(w, at->slips);
 }
 
+/* Effect of rounding on the rates of a row, by their sizes in all rows on whose forces it depends. */
+static real rounding_at_row(const contact_problem *in, const real *after, int row)
+{
+  real size = 0.0;
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    if (in->of->W[row * CONTACT_ROWS + r] != 0.0)
+      size = fmax(size, fmax(in->scale ? in->scale[r] : 0.0, fmax(fabs(in->right[r]), fabs(after[r]))));
+  return CONTACT_ROUNDING * size;
+}
+
 /* Whether modes satisfy the conditions; their forces, and the rates with them. */
 static int is_consistent(const contact_problem *in, const contact_mode *mode, real *force, real *after)
 {
   const contact_terms *const of = in->of;
-  real small = CONTACT_ROUNDING * in->scale;
   if (!solve_contacts(of, mode, in->right, force, after, NULL))
     return 0;
-  for (int r = 0; r < CONTACT_ROWS; r++)
-    small = fmax(small, CONTACT_ROUNDING * fmax(fabs(in->right[r]), fabs(after[r])));
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
+    const real small = rounding_at_row(in, after, normal < 0 ? slip : normal);
     real begin = 0.0, moves = 0.0, aside;
     if (in->is_free[k])
       continue;
@@ -158,15 +166,12 @@ static int modes_of_forces(contact_problem *in, int trial, const real *force, co
 {
   const contact_terms *const of = in->of;
   const contact_mode *const role = in->role;
-  real small = in->scale;
   int changed = 0;
-  for (int r = 0; r < CONTACT_ROWS; r++)
-    small = fmax(small, fabs(in->right[r]));
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal;
     const real tau = length_of(force + CONTACTS[k].tangential, CONTACTS[k].slips);
     mode[k] = role[k];
-    if (normal >= 0 && force[normal] * of->W[normal * (CONTACT_ROWS + 1)] <= CONTACT_ROUNDING * small)
+    if (normal >= 0 && force[normal] * of->W[normal * (CONTACT_ROWS + 1)] <= rounding_at_row(in, in->right, normal))
       mode[k] = CONTACT_IS_OPEN;
     if ((trial == 0 && in->begins[k]) ||
         (mode[k].sticks && tau >= (1.0 - CONTACT_ROUNDING) * friction_limit(of, k, in->limit[k], force)))
