@@ -54,7 +54,6 @@ def motion(names: str, links: tuple[Any, ...] = ()) -> Any:
 
 
 PANELS: dict[str, tuple[str, list[str]]] = {
-    "a": ("phase plane", ["a p_a"]),
     "a b": ("configuration", ["a b"]),
     "a b c": ("configuration", ["a b", "a c"]),
     "y x": ("orbit", ["x y"]),
@@ -82,6 +81,30 @@ def test_overviews_draw_the_columns_that_their_labels_name(names: str) -> None:
     assert axes[0].figure.get_suptitle() == "S by M"
     legends = [text.get_text() for legend in axes[0].figure.legends for text in legend.get_texts()]
     assert legends == (["1", "2"] if title == "orbits" else [])
+
+
+@pytest.mark.parametrize(
+    ("names", "changes_energy", "drawn"),
+    [("a", None, ["a"]), ("a b c", "L depends on time", ["a", "b", "c"]), ("x y", "forces", None)],
+)
+def test_one_coordinate_and_driven_systems_are_drawn_in_time(names, changes_energy, drawn) -> None:
+    """Bodies with forces are drawn by their paths."""
+    run = motion(names)
+    run.stepper.interface.changes_energy = changes_energy
+    axes = sc.plot_motion(run)
+    assert axes.get_title() == ("motion in time" if drawn else "orbit")
+    if drawn:
+        assert [line.get_label() for line in axes.lines] == drawn
+        assert all(np.array_equal(line.get_xydata(), np.stack([T, run[line.get_label()]], 1)) for line in axes.lines)
+        assert axes.get_ylabel() == (names if len(drawn) == 1 else "")
+
+
+def test_quantities_are_drawn_in_time_by_their_names(tmp_path) -> None:
+    run = motion("a b")
+    axes = run.plot.time("p_b", path=tmp_path / "momentum.svg")
+    assert np.array_equal(axes.lines[0].get_xydata(), np.stack([T, run.p[:, 1]], 1))
+    assert (axes.get_xlabel(), axes.get_ylabel(), (tmp_path / "momentum.svg").exists()) == ("t", "p_b", True)
+    assert len(run.plot.time().lines) == 2
 
 
 def test_other_drawings_have_the_values_of_their_arrays() -> None:

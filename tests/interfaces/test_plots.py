@@ -3,6 +3,7 @@
 import importlib.util
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -67,6 +68,15 @@ def test_failed_picture_leaves_no_file(kepler, tmp_path, monkeypatch):
     with pytest.raises(RuntimeError, match="no picture"):
         sc.plot_trajectory(kepler, tmp_path / "orbit.png")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.second
+def test_robots_are_drawn_to_scale_in_all_axes():
+    robot = sc.LagrangianSystem.from_mjcf(Path(__file__).parents[1] / "systems/robots/ball.xml")
+    run = sc.compile_stepper(robot, "svi:1").integrate([0.4, 2.0, 0.0, 0.0, 0.0], velocity=[0.0] * 5, h=0.01, steps=50)
+    space = run.plot()[0]
+    edges = [np.ptp(limits) for limits in (space.get_xlim3d(), space.get_ylim3d(), space.get_zlim3d())]
+    assert edges == pytest.approx([edges[2] * size for size in space._box_aspect / space._box_aspect[2]])
 
 
 @pytest.mark.rotated

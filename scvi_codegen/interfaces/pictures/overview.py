@@ -3,7 +3,7 @@
 The attribute is a callable for the overview with a method for each kind of plot. Points of a Poincare section are those
 where a trajectory crosses a surface.
 
-Plots of paths: orbits of bodies, planes of two coordinates, phase planes, many coordinates over time.
+Plots of paths: orbits of bodies, planes of two coordinates, coordinates over time.
 """
 
 from __future__ import annotations
@@ -95,13 +95,13 @@ def plot_trajectory(trajectory: Motions, path: str | os.PathLike[str] | None = N
         figure = new_figure(path, (4.6 * count, 4.4))
         kinds = [_projection(motions[0]), *[None] * (count - 1)]
         axes = tuple(figure.add_subplot(1, count, k + 1, projection=kind) for k, kind in enumerate(kinds))
+        for panel_axes in axes:  # before axes are made equal, which a change of their ticks would undo
+            panel_axes.locator_params(axis="x", nbins=5)
         draw_paths(axes[:-1], motions)
         plot_energy(motions, ax=axes[-1])
         named = len(bodies(interface.coordinates))
         if 1 < named <= len(COLORS) and len(motions) == 1:
             figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=named)
-        for panel_axes in axes:
-            panel_axes.locator_params(axis="x", nbins=5)
         figure.suptitle(plain(interface.title), fontsize=11)
         if path is not None:
             save(figure, path)
@@ -192,6 +192,19 @@ class Plots:
         """Draw a phase portrait, as :func:`scvi_codegen.plot_phase`."""
         return plot_phase(self.trajectory, path, axes=axes, ax=ax)
 
+    def time(self, *names: str, path: Path = None, ax: Axes | None = None) -> Axes:
+        """Draw quantities over time: names as of ``run[name]``, a curve each; by default the coordinates.
+
+        Raises:
+            StateError: for an unknown name, or another suffix of ``path``.
+            PlotError: without matplotlib.
+        """
+        motions = several(self.trajectory)
+        with panel(path, ax) as panel_axes:
+            for number, motion in enumerate(motions):
+                _draw_times(panel_axes, smooth(motion), names, number if len(motions) > 1 else None)
+        return panel_axes
+
     def energy(self, path: Path = None, *, ax: Axes | None = None) -> Axes:
         """Draw the energy error over time, as :func:`scvi_codegen.plot_energy`."""
         return plot_energy(self.trajectory, path, ax=ax)
@@ -223,7 +236,7 @@ MAX_CURVES = 6
 
 @checks_arguments(trajectory=MOTIONS, ax=CANVAS)
 def plot_motion(trajectory: Motions, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
-    """Draw the path of a trajectory: orbits, a plane of coordinates, a phase plane, or all coordinates over time.
+    """Draw the path of a trajectory: orbits, a plane of coordinates, or coordinates over time.
 
     Between adaptive steps curves are dense output. Robots from files are drawn as links in space, at a few times.
 
@@ -287,14 +300,23 @@ def path_panels(motion: Trajectory) -> int:
         return 2
     result = bodies(coordinates)
     spatial = result and len(result[0].columns) == 3
-    return 2 if spatial or (not result and 3 <= len(coordinates) <= MAX_CURVES) else 1
+    planes = not result and not _is_drawn_in_time(motion) and 3 <= len(coordinates) <= MAX_CURVES
+    return 2 if spatial or planes else 1
+
+
+def _is_drawn_in_time(motion: Trajectory) -> bool:
+    """Return whether the coordinates are drawn over time: one, or those of a driven or damped system without bodies."""
+    interface = motion.stepper.interface
+    m = len(interface.coordinates)
+    return m == 1 or (m <= MAX_CURVES and bool(interface.changes_energy) and not bodies(interface.coordinates))
 
 
 def draw_paths(panels: Sequence[Axes], motions: Sequence[Trajectory]) -> None:
     """Draw the paths into the panels.
 
-    One coordinate is drawn in the phase plane, bodies by their orbits, robots by their links, rotations by body axes, a
-    few coordinates in their first planes, many coordinates as one image over time (of the first trajectory).
+    Bodies are drawn by their orbits, robots by their links, rotations by body axes, one coordinate and those of a
+    driven or damped system over time, a few others in their first planes, many as one image over time (of the first
+    trajectory).
     """
     for number, motion in enumerate(motions):
         if number == 0 or path_panels(motion) > 1 or len(motion.stepper.interface.coordinates) <= MAX_CURVES:
@@ -310,10 +332,8 @@ def _draw_path(panels: Sequence[Axes], motion: Trajectory, which: int | None) ->
     elif motion.stepper.interface.rotations:
         for axes, plane in zip(panels, combinations(range(3), 2), strict=False):
             draw_unit_vectors(axes, motion, plane, which)
-    elif m == 1:
-        interface = motion.stepper.interface
-        _draw_curve(panels[0], motion.q[:, 0], motion.p[:, 0], color(first))
-        panels[0].set(xlabel=interface.coordinates[0], ylabel=interface.momenta[0], title="phase plane")
+    elif _is_drawn_in_time(motion):
+        _draw_times(panels[0], motion, (), which)
     elif result:
         for axes, plane in zip(panels, combinations(range(3), 2), strict=False):
             for number, body in enumerate(result):
@@ -326,6 +346,16 @@ def _draw_path(panels: Sequence[Axes], motion: Trajectory, which: int | None) ->
             _draw_plane(axes, motion, plane, first)
     else:
         _draw_image(panels[0], motion)
+
+
+def _draw_times(axes: Axes, motion: Trajectory, names: Sequence[str], which: int | None) -> None:
+    """Draw quantities over time, by default the first coordinates, in one colour if the motion is one of several."""
+    names = names or motion.stepper.interface.coordinates[:MAX_CURVES]
+    for number, name in enumerate(names):
+        axes.plot(motion.t, motion[name], color=color(number if which is None else which), label=plain(name))
+    axes.set(xlabel="t", ylabel=plain(names[0]) if len(names) == 1 else "", title="motion in time")
+    if len(names) > 1 and not which:
+        axes.legend(loc="best")
 
 
 def _draw_plane(axes: Axes, motion: Trajectory, plane: tuple[int, int], number: int) -> None:
