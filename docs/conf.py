@@ -23,11 +23,13 @@ extensions = [
     "notebooks",
     "public_names",
     "search_words",
+    "thumbnails",
 ]
 exclude_patterns = ["_extensions", "motions"]
 
 html_theme = "furo"
 html_title = f"scvi_codegen {release}"
+html_logo = html_favicon = "_static/logo.svg"
 html_copy_source = html_show_sourcelink = False
 html_static_path = ["_static", "../templates/mathematics"]
 html_css_files = ["site.css"]

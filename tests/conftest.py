@@ -18,8 +18,10 @@ from tiers import QUICK, SECOND, UNOPTIMISED_TIERS, long_ones_first, mark_later_
 
 from scvi_codegen import LagrangianSystem, Stepper
 from scvi_codegen.codegen.native.building import FLAGS_VARIABLE
+from scvi_codegen.common import validation
 from scvi_codegen.methods.method import Method
 
+validation.KEEPS_FRAMES = True
 logging.getLogger("scvi_codegen").setLevel(logging.WARNING)  # slow compilations are not announced on stderr
 sys.addaudithook(programs.audit)
 signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests run in the background of a shell

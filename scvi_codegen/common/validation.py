@@ -12,6 +12,7 @@ import numbers
 import operator
 import os
 import re
+import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Context, Decimal
@@ -228,6 +229,22 @@ def _check_sizes(kind: ArgumentType, value: Any, function: str, error: type[Scvi
         raise error(f"{function}() is not available for {value!r:.60}: {value.REQUIRES_SIZES}")
 
 
+OF_A_CACHE = ("cache_clear", "cache_info")
+"""Functions of a cached function."""
+KEEPS_FRAMES = sys.flags.dev_mode
+"""Whether tracebacks of the errors of this package show its frames, as with ``python -X dev``, or end at the call."""
+
+
+def _as_shown(raised: ScviCodegenError) -> ScviCodegenError:
+    return raised if KEEPS_FRAMES else raised.with_traceback(None)
+
+
+def _check_names(function: str, keywords: Collection[str], accepted: Collection[str]) -> None:
+    for name in keywords:
+        if name not in accepted:
+            raise ArgumentError(f"{function}() takes no {name!r}{keyword_hint(name, accepted)}")
+
+
 def checks_arguments(
     error: type[ScviCodegenError] = ArgumentError, /, **kinds: ArgumentType
 ) -> Callable[[Called], Called]:
@@ -262,22 +279,23 @@ def checks_arguments(
 
         @functools.wraps(function)
         def checked(*arguments: Any, **keywords: Any) -> Any:
-            if len(arguments) <= first and unchecked.issuperset(keywords):
+            try:
+                if len(arguments) > first or not unchecked.issuperset(keywords):
+                    check(arguments, keywords)
                 return function(*arguments, **keywords)
-            if not (open_ended or keywords.keys() <= keyword_names.keys()):
-                name = next(name for name in keywords if name not in keyword_names)
-                raise ArgumentError(f"{function.__qualname__}() takes no {name!r}{keyword_hint(name, keyword_names)}")
+            except ScviCodegenError as raised:
+                raise _as_shown(raised) from raised.__cause__
+
+        def check(arguments: tuple[Any, ...], keywords: dict[str, Any]) -> None:
+            _check_names(function.__qualname__, keywords, keywords if open_ended else keyword_names)
             for position, name, kind in positions:
                 if position < len(arguments) or name in keywords:
                     value = arguments[position] if position < len(arguments) else keywords[name]
                     if not (value is None and name in optional):
                         _check_sizes(kind, value, function.__qualname__, error)
                         check_kind(kind, value, name, error)
-            return function(*arguments, **keywords)
 
-        for of_a_cache in ("cache_clear", "cache_info"):
-            if hasattr(function, of_a_cache):
-                setattr(checked, of_a_cache, getattr(function, of_a_cache))
+        vars(checked).update({name: getattr(function, name) for name in OF_A_CACHE if hasattr(function, name)})
         return cast(Called, checked)
 
     return decorate

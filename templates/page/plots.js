@@ -91,7 +91,7 @@ function fitted(canvas) {
 
 /** Draws ys over xs; where a periodic variable jumps, points are not joined. */
 function plot(canvas, xs, ys, color, { symmetric = false, periods = [0, 0] } = {}) {
-  const [pen, width, height] = fitted(canvas), left = 52, bottom = 17, top = 6, right = 8;
+  const [pen, width, height] = fitted(canvas), bottom = 17, top = 6, right = 8;
   const range = (list) => {
     let low = Infinity, high = -Infinity;
     for (const x of list) { if (x < low) low = x; if (x > high) high = x; }
@@ -102,13 +102,16 @@ function plot(canvas, xs, ys, color, { symmetric = false, periods = [0, 0] } = {
   let [x0, x1] = range(xs), [y0, y1] = range(ys);
   if (symmetric) { y1 = Math.max(...ys.reduce(([a, b], y) => [Math.max(a, y), Math.max(b, -y)], [0, 0]), 2.3e-16); y0 = -y1; }
   const pad = 0.08 * (y1 - y0); y0 -= pad; y1 += pad;
+  let left = 52;
   const px = (x) => left + ((width - left - right) * (x - x0)) / (x1 - x0), py = (y) => height - bottom - ((height - bottom - top) * (y - y0)) / (y1 - y0);
   const marked = (low, high, wanted) => { // with digits in which they differ
     const marks = ticks(low, high, wanted), digits = clamped(Math.ceil(Math.log10(Math.max(Math.abs(low), Math.abs(high)) / (marks[1] - marks[0]))) + 1 || 3, 3, 7);
     return marks.map((mark) => [mark, short(mark, digits)]);
   };
   pen.font = `11px ${colors.sans}`; pen.fillStyle = colors.muted; pen.textBaseline = "middle"; pen.textAlign = "right";
-  for (const [mark, text] of marked(y0, y1, 3)) { line(pen, [[left, py(mark)], [width - right, py(mark)]], colors.rule, 1); pen.fillText(text, left - 6, py(mark)); }
+  const levels = marked(y0, y1, 3);
+  left = Math.max(left, ...levels.map(([, text]) => pen.measureText(text).width + 8));
+  for (const [mark, text] of levels) { line(pen, [[left, py(mark)], [width - right, py(mark)]], colors.rule, 1); pen.fillText(text, left - 6, py(mark)); }
   pen.textBaseline = "top"; pen.textAlign = "center";
   for (const [mark, text] of marked(x0, x1, clamped(width / 75, 2, 5))) { const half = pen.measureText(text).width / 2; if (px(mark) + half < width) pen.fillText(text, px(mark), height - bottom + 4); }
   pen.beginPath();

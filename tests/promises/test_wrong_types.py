@@ -1,6 +1,7 @@
 """Public calls with an argument of the wrong type: an error of the project's own that names the argument, each time."""
 
 import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import samples
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
+from scvi_codegen.common import validation
 from scvi_codegen.common.errors import ScviCodegenError
 from scvi_codegen.common.validation import TEXT, checks_arguments, hints, keyword_hint
 
@@ -192,3 +194,15 @@ def test_system_accepts_positional_arguments_and_scalar_states():
     plan = {"h": 0.1, "steps": 3}
     assert swing.integrate(1.0, 0.5, **plan).q.tolist() == swing.integrate([1.0], [0.5], **plan).q.tolist()
     assert swing.energy(1.0, 0.5) == swing.energy([1.0], [0.5])
+
+
+def test_tracebacks_end_at_the_call(monkeypatch):
+    """Frames of the package are shown with ``python -X dev``, and in these tests."""
+    for keeps, deep in ((False, False), (True, True)):
+        monkeypatch.setattr(validation, "KEEPS_FRAMES", keeps)
+        with pytest.raises(sc.ExpressionError, match=r'coordinates=\["q\[N\]"\]') as raised:
+            sc.LagrangianSystem.from_text("s", ["x"], "sum(i in N, m[i]*x_dot**2)")
+        files = [Path(frame.path).name for frame in raised.traceback]
+        assert files[:2] == ["test_wrong_types.py", "validation.py"]
+        assert ("grammar.py" in files) is deep
+        assert (len(files) > 2) is deep

@@ -57,7 +57,7 @@ _SPACE = re.compile(r"[ \t\r\n\f]*")
 
 _HINTS = {
     ".": "attribute access is not part of the grammar",
-    "[": "subscripts require arrays, declared among the coordinates or parameters, as q[N] (of a rotation: R_11)",
+    "[": 'subscripts require arrays: declare coordinates=["q[N]"] or parameters={"m[N]": 1.0} (of a rotation: R_11)',
     "^": "powers are written x**2",
     "=": "write the right-hand side only; equalities, assignments and keyword arguments are not part of the grammar",
     "'": "write the velocity of q as q_dot; strings are not part of the grammar",

@@ -23,6 +23,8 @@ from scvi_codegen.common.cache import CACHE_VARIABLE, cache_folder, cache_info, 
 from scvi_codegen.common.errors import BuildError, MissingLibraryError
 from scvi_codegen.interfaces.cli.command_group import FAILURE, CommandFailure, reporting, tell
 
+OF_FIRST_RUNS, OF_DEVELOPERS = ("compiler", "data", "plot"), ("bench", "docs", "release", "test")
+"""Extras that are listed first and last."""
 OK, MISSING, FAILED = "ok", "lacks", "fails"
 PACKAGE = "scvi-codegen"
 REQUIREMENT = re.compile(
@@ -72,9 +74,9 @@ def run_checks() -> Iterator[CheckResult]:
     yield _packages("", "libraries")
     yield from _compilation()
     yield _cache()
-    for extra in dict.fromkeys(requirement["extra"] for requirement in _described(PACKAGE)):
-        if extra:
-            yield _packages(extra, f"extra {extra}")
+    extras = {requirement["extra"] for requirement in _described(PACKAGE)} - {""}
+    for extra in sorted(extras, key=lambda extra: (extra in OF_DEVELOPERS, extra not in OF_FIRST_RUNS, extra)):
+        yield _packages(extra, f"extra {extra}")
     yield _gpu()
 
 
