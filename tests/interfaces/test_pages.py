@@ -401,12 +401,12 @@ def computed(text, steps):
         pytest.param(STIFF_FLOOR, 200, [0, 0], id="a kink"),
     ],
 )
-def test_the_webassembly_computes_the_bits_of_python_within_200_kilobytes(tmp_path, text, steps, statuses):
+def test_the_webassembly_computes_the_bits_of_python_within_300_kilobytes(tmp_path, text, steps, statuses):
     needs("node")
     pytest.importorskip("ziglang", reason="pages are compiled by the extra compiler")
     path = written(tmp_path, text)
     page = sc.page(path)
-    assert len(page.html) < 200_000
+    assert len(page.html) < 300_000  # of which the font of formulas has 68,000
     state = computed(page.html, steps)
     assert state["statuses"] == statuses
     model = sc.load_model(path)
@@ -436,7 +436,7 @@ def test_every_motion_of_the_site_moves_within_its_size(browser, tmp_path):
     for path in sorted(MOTIONS.glob("*.toml")):
         file, messages, view = tmp_path / f"{path.stem}.html", [], browser.new_page()
         sc.page(path).save(file)
-        assert file.stat().st_size < 200_000, path
+        assert file.stat().st_size < 300_000, path
         view.on("console", lambda message, to=messages: to.append(message.text))
         view.on("pageerror", lambda error, to=messages: to.append(str(error)))
         view.goto(file.as_uri())

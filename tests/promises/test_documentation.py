@@ -211,6 +211,15 @@ class TestTheSite:
         loaded = r'<(?:script|img|link rel="stylesheet")[^>]+(?:src|href)="https?:'
         assert [name for name, page in pages.items() if re.search(loaded, page)] == []
 
+    def test_thumbnails_show_one_panel_of_each_picture(self, site):
+        page = (site / "gallery" / "index.html").read_text(encoding="utf-8")
+        views = [
+            re.search(r'viewBox="\S+ \S+ (\S+) (\S+)"', (site / "_images" / name).read_text(encoding="utf-8"))
+            for name in re.findall(r'src="\.\./_images/(panel_\w+\.svg)"', page)
+        ]
+        assert len(views) > 50
+        assert all(min(map(float, view.groups())) > 30 for view in views)
+
     def test_no_formula_is_incomplete(self, site):
         """No dollar sign remains in the text outside of code."""
         code = re.compile(r"<(pre|code|script|style)\b.*?</\1>", re.DOTALL)

@@ -20,6 +20,8 @@ FLAGS = (
 )
 """The bits are those of a build for x86-64 with musl by the same compiler, without ``-msimd128``."""
 LICENCES = (
+    "Formulas are set in a subset of STIX Two Math (Copyright 2001-2021 The STIX Fonts Project Authors), under the SIL"
+    " Open Font License, Version 1.1.",
     "What scvi-codegen generated in this page may be used without any condition. Its WebAssembly also contains parts"
     " of musl (Copyright © 2005-2020 Rich Felker, et al.; pow, exp2 and log Copyright © 2017-2018 Arm Limited), of"
     " zig and its compiler_rt (Copyright (c) Zig contributors) and of wasi-libc (its contributors), all under the"
