@@ -213,12 +213,9 @@ class TestTheSite:
 
     def test_thumbnails_show_one_panel_of_each_picture(self, site):
         page = (site / "gallery" / "index.html").read_text(encoding="utf-8")
-        views = [
-            re.search(r'viewBox="\S+ \S+ (\S+) (\S+)"', (site / "_images" / name).read_text(encoding="utf-8"))
-            for name in re.findall(r'src="\.\./_images/(panel_\w+\.svg)"', page)
-        ]
+        views = re.findall(r'src="\.\./_images/(panel_\w+\.svg)"', page)
         assert len(views) > 50
-        assert all(min(map(float, view.groups())) > 30 for view in views)
+        assert all((site / "_images" / name).read_text(encoding="utf-8").count(" viewBox=") == 1 for name in views)
 
     def test_no_formula_is_incomplete(self, site):
         """No dollar sign remains in the text outside of code."""
