@@ -202,7 +202,7 @@ class FamilyPoint:
         changed = {kind for kind, value in self.tests.items() if value * after.tests.get(kind, value) < 0.0}
         values = [point.others[np.abs(point.others.imag) > SAME] for point in (self, after)]  # complex ones
         counts = {"Krein collision": {len(part) for part in values}}
-        counts["torus"] = {np.count_nonzero(np.abs(part) > 1.0) for part in values}
+        counts["torus"] = {int(np.count_nonzero(np.abs(part) > 1.0)) for part in values}
         changed -= {kind for kind, numbers in counts.items() if len(numbers) == 1}
         yield from ((kind, None) for kind in self.tests if kind in changed)
         if "fold" in changed or len(counts["Krein collision"]) > 1:
