@@ -6,7 +6,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from random_robots import RECORDED, SEEDS, Mjcf, Urdf, by_mujoco, by_pinocchio, state_of
+from random_robots import (
+    RECORDED,
+    SEEDS,
+    Mjcf,
+    Urdf,
+    Whole,
+    by_mujoco,
+    by_pinocchio,
+    equations_of,
+    errors_of_motion,
+    motion_by_pinocchio,
+    state_of,
+)
 
 import scvi_codegen as sc
 from scvi_codegen.common.errors import SystemDefinitionError
@@ -69,16 +81,12 @@ def test_random_robots_have_the_recorded_energies(kind, seed, tmp_path):
 @pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize("seed", MORE)
 def test_random_models_have_the_energies_of_mujoco(seed, tmp_path):
-    mujoco = pytest.importorskip("mujoco", reason="pip install mujoco")
+    pytest.importorskip("mujoco", reason="pip install mujoco")
     robot = Mjcf(seed)
     try:
         compare(robot, by_mujoco(robot, state_of(robot), robot.write(tmp_path)), tmp_path)
-    except SystemDefinitionError:  # two hinges of a body may be drawn with one axis
-        model = mujoco.MjModel.from_xml_path(str(robot.write(tmp_path)))
-        data = mujoco.MjData(model)
-        mujoco.mj_forward(model, data)
-        singular = data.warning[int(mujoco.mjtWarning.mjWARN_INERTIA)].number > 0
-        if not singular:
+    except SystemDefinitionError:
+        if not singular(robot.write(tmp_path)):
             raise
 
 
@@ -88,6 +96,40 @@ def test_random_robots_have_the_energies_of_pinocchio(seed, tmp_path):
     pytest.importorskip("pinocchio", reason="pip install pin")
     robot = Urdf(seed)
     compare(robot, by_pinocchio(robot, state_of(robot), robot.write(tmp_path)), tmp_path)
+
+
+def singular(file: Any) -> bool:
+    """Whether MuJoCo finds no inverse of the mass matrix: two hinges of a body may be drawn with one axis."""
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_path(str(file))
+    mujoco.mj_forward(model, data := mujoco.MjData(model))
+    return bool(data.warning[int(mujoco.mjtWarning.mjWARN_INERTIA)].number > 0)
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize("seed", range(120))
+def test_models_with_all_that_is_read_move_as_by_mujoco(seed, tmp_path):
+    pytest.importorskip("mujoco", reason="pip install mujoco")
+    robot = Whole(seed)
+    file, meshes = robot.write(tmp_path), 'mesh="m' in robot.included  # whose axes have 8 digits in MuJoCo
+    try:
+        system = sc.LagrangianSystem.from_mjcf(file, actuators=True)
+    except SystemDefinitionError:
+        assert singular(file)
+        return
+    assert max(errors_of_motion(system, file)) < (1e-6 if meshes else 1e-8)
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize("seed", range(SEEDS, 80))
+def test_random_robots_move_as_by_pinocchio(seed, tmp_path):
+    pytest.importorskip("pinocchio", reason="pip install pin")
+    robot = Urdf(seed)
+    system = sc.LagrangianSystem.from_urdf(file := robot.write(tmp_path), floating=robot.floating)
+    joints, motion = motion_by_pinocchio(robot, state_of(robot), file)
+    kinds = [0 if name == "l0" else 3 for name in joints]
+    assert equations_of(system, joints, kinds)(motion, [0.0])[2] < 1e-8
 
 
 def test_attributes_of_mujoco_are_known():

@@ -5,6 +5,7 @@
 
 import json
 import random
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,8 @@ def element(tag: str, attributes: dict[str, str], *inner: str) -> str:
 class Mjcf:
     """Random model; ``document`` is its text, ``included`` that of a file that it includes."""
 
+    depth = 2
+
     def __init__(self, seed: int) -> None:
         self.draw, self.seed = Draw(seed), seed
         draw = self.draw
@@ -65,7 +68,7 @@ class Mjcf:
         inner = element("default", {"class": "a"}, self.default(), element("default", {"class": "b"}, self.default()))
         defaults = element("default", {}, inner, self.default())
         defaults += element("default", {}, self.default(), element("default", {"class": "c"}, self.default()))
-        world = "".join(self.body(2) for _ in range(2))
+        world = "".join(self.body(self.depth) for _ in range(2))
         self.included = f"<mujocoinclude>{world}</mujocoinclude>"
         sections = [
             element("compiler", compiler),
@@ -74,6 +77,7 @@ class Mjcf:
             element("worldbody", {}, '<include file="included.xml"/>', element("site", {"name": "s"} | self.site())),
             element("equality", {}, *self.equalities()),
             element("actuator", {}, *self.actuators()),
+            *self.sections(),
         ]
         self.document = element("mujoco", {}, *sorted(sections, key=lambda _: draw.random()))
 
@@ -104,6 +108,17 @@ class Mjcf:
         )
         return attributes | ({} if self.fromto else draw.some(0.5, pos=draw.numbers(3)))
 
+    def spring(self, kind: str) -> dict[str, str]:
+        return {"stiffness": "0" if kind == "ball" else self.draw.numbers(1, -1, 3)}
+
+    def further(self, name: str) -> list[str]:
+        """Return further parts of a body."""
+        return []
+
+    def sections(self) -> list[str]:
+        """Return further sections."""
+        return []
+
     def site(self) -> dict[str, str]:
         return self.draw.turn(0.4) | self.draw.some(0.5, pos=self.draw.numbers(3))
 
@@ -117,14 +132,13 @@ class Mjcf:
     def body(self, depth: int) -> str:
         draw, name = self.draw, f"b{self.bodies}"
         self.bodies += 1
-        free, parts = depth == 2 and draw.maybe(0.25), []
+        free, parts = depth == self.depth and draw.maybe(0.25), []
         kinds = [draw.one("hinge", "slide", "ball")] + ["hinge" for _ in range(draw.maybe(0.3))]
-        for k, kind in enumerate([] if free or not (depth == 2 or draw.maybe(0.8)) else kinds):
+        for k, kind in enumerate([] if free or not (depth == self.depth or draw.maybe(0.8)) else kinds):
             if kind == "hinge" and "ball" in kinds[:k]:
                 continue
             self.joints[f"j{name}{k}"] = kind
-            spring = {"stiffness": "0" if kind == "ball" else draw.numbers(1, -1, 3)}
-            own = {"name": f"j{name}{k}", "type": kind, **self.joint(), **self.klass("class"), **spring}
+            own = {"name": f"j{name}{k}", "type": kind, **self.joint(), **self.klass("class"), **self.spring(kind)}
             parts.append(element("joint", own))
         if free:
             self.joints[f"j{name}"] = "free"
@@ -143,6 +157,7 @@ class Mjcf:
             parts.append(element("inertial", mass | (moments if draw.maybe() else full)))
         if draw.maybe(0.4):
             parts = [element("frame", {"pos": draw.numbers(3), **draw.turn(), **self.klass("childclass")}, *parts)]
+        parts += self.further(name)
         parts += [self.body(depth - 1) for _ in range(depth > 0 and 1 + draw.maybe(0.3))]
         parts.append(element("site", {"name": f"s{name}"} | self.site()))
         own = {"name": name, "pos": draw.numbers(3), **draw.turn(), **self.klass("childclass")}
@@ -167,6 +182,91 @@ class Mjcf:
         (folder / "included.xml").write_text(self.included)
         (folder / "model.xml").write_text(self.document)
         return folder / "model.xml"
+
+
+BOX = "-1 -.5 -.25 0 -.5 -.25 -1 .5 -.25 0 .5 -.25 -1 -.5 .25 0 -.5 .25 -1 .5 .25 0 .7 .25"
+FACES = "0 2 1 1 2 3 4 5 6 5 7 6 0 1 4 1 5 4 2 6 3 3 6 7 0 4 2 2 4 6 1 3 5 3 7 5"
+PART = """<mujoco model="part"><compiler angle="{angle}" eulerseq="{sequence}"/><default><geom size=".2"/></default>
+<worldbody><body name="p" pos="{place}" euler="{turn}"><joint name="pj" axis="{axis}" ref=".3" stiffness="2 1"/>
+<geom pos="{center}"/><site name="ps" pos=".1 0 0"/></body></worldbody></mujoco>"""
+
+
+class Whole(Mjcf):
+    """Random model over all parts that are read: meshes, tendons, springs, media, macros, actuators, limits, keys."""
+
+    depth = 1
+
+    def __init__(self, seed: int) -> None:
+        self.clamped = seed % 3 == 0  # torques, and then no actuators of tendons
+        super().__init__(20000 + seed)
+        self.included = self.included.replace('gravcomp="-', 'gravcomp="')  # which MuJoCo ignores if all are < 0
+        kinds = {"angle": self.draw.one("radian", "degree"), "sequence": self.draw.one("xyz", "ZYX")}
+        numbers = {key: self.draw.numbers(3, 0.1) for key in ("place", "turn", "axis", "center")}
+        self.part = PART.format(**kinds, **numbers)
+
+    def spring(self, kind: str) -> dict[str, str]:
+        draw = self.draw
+        damping = {"damping": draw.numbers(draw.one(1, 2, 3), 0)} if draw.maybe(0.3) else {}
+        stiffness = draw.numbers(draw.one(1, 2, 3), 0, 3) if draw.maybe() else "0"
+        limits = draw.some(0.3, range="0 0.2" if kind == "ball" else "0.1 0.2")
+        return {"stiffness": stiffness, **damping, **limits, **draw.some(0.5 * self.clamped, actuatorfrcrange="-1 2")}
+
+    def further(self, name: str) -> list[str]:
+        draw, parts = self.draw, list[str]()
+        if draw.maybe(0.3):
+            shape = {"type": "mesh", "mesh": draw.one("m0", "m1"), "size": "0.1", **draw.turn()}
+            parts.append(element("geom", shape | draw.some(0.5, pos=draw.numbers(3), mass=draw.numbers(1, 1, 2))))
+        if draw.maybe(0.2):
+            sphere = {"type": "sphere", "size": ".1", "group": "0", "pos": draw.numbers(3)}
+            inner = element("geom", sphere) if draw.maybe() else self.copied(sphere)
+            copies = {"count": draw.one("1", "2", "3"), "offset": draw.numbers(3), "sep": draw.one("", "-")}
+            parts.append(element("replicate", copies | draw.some(0.5, euler=draw.numbers(3)), inner))
+        elif draw.maybe(0.15):
+            parts.append(element("attach", {"model": "part", "body": "p", "prefix": f"a{name}/"}))
+        return parts
+
+    def copied(self, shape: dict[str, str]) -> str:
+        """Return a body of a replicate, whose joints have no other names."""
+        own = {"name": f"r{self.bodies}", "pos": self.draw.numbers(3)}
+        joint = {"name": f"rj{self.bodies}", "type": "hinge", "axis": self.draw.numbers(3, 0.1), "stiffness": "1"}
+        return element("body", own, element("joint", joint), element("geom", shape))
+
+    def sections(self) -> list[str]:
+        draw, (first, *_) = self.draw, [*self.singles(), ""]
+        meshes = []
+        for k, rule in enumerate((draw.one("convex", "exact"), draw.one("legacy", "shell"))):
+            at = draw.some(0.5, scale=draw.numbers(3, 0.3), refpos=draw.numbers(3), refquat=draw.numbers(4, 0.2))
+            meshes.append(element("mesh", {"name": f"m{k}", "vertex": BOX, "face": FACES, "inertia": rule, **at}))
+        medium = draw.some(0.2, density=draw.numbers(1, 0, 2), viscosity=draw.numbers(1, 0))
+        forces = draw.some(0.6, stiffness=draw.numbers(draw.one(1, 2), 0, 2), damping=draw.numbers(1, 0))
+        forces |= draw.some(0.3, springlength=draw.one(".1", ".1 .3"))
+        start = int(draw.random() * self.bodies)
+        sites = (element("site", {"site": f"sb{(start + k) % self.bodies}"}) for k in range(2))
+        path = element("spatial", {"name": "path", **forces}, '<site site="s"/>', *sites)
+        factors = (element("joint", {"joint": name, "coef": draw.numbers(1)}) for name in self.singles())
+        tendons = [path] + ([element("fixed", {"name": "sum", **forces}, *factors)] if first else [])
+        bounds = draw.some(0.5, ctrlrange="-.3 .2") | draw.some(0.3, forcerange="-.2 .4", gear=draw.numbers(1, 1, 3))
+        servo = draw.one(("position", {"kp": "3", "kv": "1"}), ("velocity", {"kv": "2"}), ("motor", {}))
+        plain = {"armature": "0", "damping": "0", **servo[1], **bounds}
+        acting = [] if self.clamped else [element(servo[0], {"name": "servo", "tendon": "path", **plain})]
+        affine = {"gaintype": "fixed", "biastype": "affine", "biasprm": "1 -2 -.5", "gainprm": "2", **bounds}
+        acting += (
+            [element("general", {"name": "force", "joint": first, **affine})] if first and not self.clamped else []
+        )
+        return [
+            element("asset", {}, *meshes, '<model name="part" file="part.xml"/>'),
+            element("option", medium),
+            element("tendon", {}, *(each for each in tendons if draw.maybe(0.6) or each is path)),
+            element("actuator", {}, *acting),
+            element("keyframe", {}, element("key", draw.some(0.5, name="k"))),
+        ]
+
+    def singles(self) -> list[str]:
+        return [name for name, kind in self.joints.items() if kind in ("hinge", "slide")]
+
+    def write(self, folder: Path) -> Path:
+        (folder / "part.xml").write_text(self.part)
+        return super().write(folder)
 
 
 class Urdf:
@@ -294,12 +394,46 @@ def by_pinocchio(robot: Urdf, state: State, path: Path) -> list[float]:
     return [energy - potentials[1] + potentials[0], -damped @ v**2]
 
 
-def flow(model: Any, q: Any, v: Any) -> Any:
-    """Return the rates of MuJoCo's positions q at its velocities v."""
+def motion_by_pinocchio(robot: Urdf, state: State, path: Path) -> tuple[list[str], tuple[Any, Any, Any]]:
+    """Return joints, the base first, and their positions, velocities and accelerations in MuJoCo's order.
+
+    With v = G u, where G has the factors of joints that follow others, u' = (G^T M G)^-1 G^T (f - n(q, v)).
+    """
+    import numpy as np
+    import pinocchio
+
+    model = pinocchio.buildModelFromUrdf(str(path), *[pinocchio.JointModelFreeFlyer()] * robot.floating)
+    data, q, free = model.createData(), pinocchio.neutral(model), 6 * robot.floating
+    names = [name for name in model.names[1:] if name not in robot.mimics and name != "root_joint"]
+    follows, u = np.zeros((model.nv, free + len(names))), np.zeros(free + len(names))
+    follows[:free, :free] = np.eye(free)
+    if robot.floating:
+        turn = state["l0"][3:7]
+        rotation = pinocchio.Quaternion(*turn).toRotationMatrix()
+        q[:7], u[:3], u[3:6] = [*state["l0"][:3], *turn[1:], turn[0]], rotation.T @ state["l0"][7:10], state["l0"][10:]
+    for name in model.names[1 + robot.floating :]:
+        joint = model.joints[model.getJointId(name)]
+        leader, factor, offset = robot.mimics.get(name, (name, 1.0, 0.0))
+        angle, place = factor * state[leader][0] + offset, free + names.index(leader)
+        q[joint.idx_q : joint.idx_q + joint.nq] = [np.cos(angle), np.sin(angle)] if joint.nq == 2 else [angle]
+        follows[joint.idx_v, place], u[place] = factor, state[leader][1]
+    v = follows @ u
+    mass, bias = pinocchio.crba(model, data, q), pinocchio.nonLinearEffects(model, data, q, v)
+    mass = np.triu(mass) + np.triu(mass, 1).T
+    changes = np.linalg.solve(follows.T @ mass @ follows, follows.T @ (-model.damping * v - bias))
+    if robot.floating:
+        changes[:3] = rotation @ (changes[:3] + np.cross(u[3:6], u[:3]))
+        u[:3] = state["l0"][7:10]
+    places = [*(state["l0"][:7] if robot.floating else []), *(state[name][0] for name in names)]
+    return [*(["l0"] if robot.floating else []), *names], (np.array(places), u, changes)
+
+
+def flow(kinds: Any, q: Any, v: Any) -> Any:
+    """Return the rates of MuJoCo's positions q of joints of these kinds at its velocities v."""
     import numpy as np
 
     rates, k = [], 0
-    for kind in model.jnt_type:
+    for kind in kinds:
         count = (3, 0, 1, 1)[kind]
         rates += [*v[k : k + count]]
         k += count
@@ -313,20 +447,49 @@ def flow(model: Any, q: Any, v: Any) -> Any:
 def errors_of_motion(system: Any, path: Path) -> list[float]:
     """Return errors of T - V (but for a constant), damping power and equations of motion at a random state of MuJoCo.
 
-    The accelerations are MuJoCo's without equalities. The error of d/dt L_v - L_q - f is relative to |f| + |L_q| + 1.
+    The accelerations are MuJoCo's without equalities.
     """
     import mujoco
+    import numpy as np
+
+    model = mujoco.MjModel.from_xml_path(str(path))
+    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+    data, draw = mujoco.MjData(model), np.random.default_rng(1)
+    labels = [model.joint(j).name or model.body(model.jnt_bodyid[j]).name for j in range(model.njnt)]
+    equations = equations_of(system, labels, model.jnt_type)
+    controls = dict(zip(system.actuators.values(), draw.uniform(-2, 2, len(system.actuators)), strict=True))
+    held = controls | {name: min(max(controls[name], low), high) for name, low, high in system.input_ranges}
+    constants = [held.get(name.removesuffix("_0"), 0.0) for name in ("t", *map(str, system.parameters))]
+    energies, lifts, off = [], model.body_gravcomp * model.body_mass, mujoco.mjtDisableBit
+    passive = off.mjDSBL_SPRING | off.mjDSBL_DAMPER  # without energies of lifts in MuJoCo
+    lifted = not (model.opt.disableflags & passive == passive or model.opt.disableflags & off.mjDSBL_GRAVITY)
+    for scale in (0.0, 1.0):
+        mujoco.mj_resetData(model, data)
+        mujoco.mj_integratePos(model, data.qpos, draw.uniform(-1, 1, model.nv) * scale, 1.0)
+        data.qvel[:] = scale * draw.uniform(-1, 1, model.nv)
+        data.ctrl[: len(controls)] = [*controls.values()]
+        mujoco.mj_forward(model, data)
+        energy, power, error = equations((data.qpos, data.qvel, data.qacc_smooth), constants)
+        lift = lifts @ data.xipos @ model.opt.gravity * lifted
+        energies.append(energy - data.energy[1] + data.energy[0] + lift)
+    power -= float((data.qfrc_damper + data.qfrc_fluid + data.qfrc_actuator) @ data.qvel)
+    return [float(abs(x)) for x in (energies[1] - energies[0], power, error)]
+
+
+def equations_of(system: Any, labels: Sequence[str], kinds: Sequence[int]) -> Any:
+    """Return a function of positions, velocities and accelerations of joints of these labels and MuJoCo's kinds.
+
+    It returns L, the power of forces, and the error of d/dt L_v - L_q - f relative to |f| + |L_q| + 1.
+    """
     import numpy as np
     from sympy import S
 
     from scvi_codegen.common.precision import mp
     from scvi_codegen.systems.formulas.expressions import Tape, gradient
 
-    model = mujoco.MjModel.from_xml_path(str(path))
-    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
-    data, draw, names = mujoco.MjData(model), np.random.default_rng(1), []
-    for j, kind in enumerate(model.jnt_type):
-        name = system.joint_names[model.joint(j).name or model.body(model.jnt_bodyid[j]).name]
+    names: list[str] = []
+    for kind, label in zip(kinds, labels, strict=True):
+        name = system.joint_names[label]
         place, turn = [f"{x}_{name}" for x in "xyz"], [f"R_{name}_{x}" for x in "wxyz"]
         names += ([*place, *turn], turn, [name], [name])[kind]
     order = [names.index(str(q)) for q in system.coordinates]
@@ -336,31 +499,23 @@ def errors_of_motion(system: Any, path: Path) -> list[float]:
         [system.lagrangian, *(slopes.get(k, S.Zero) for k in range(2 * m)), *forces],
         (*variables, system.time, *system.parameters),
     )
-    controls = dict(zip(system.actuators.values(), draw.uniform(-2, 2, len(system.actuators)), strict=True))
-    held = controls | {name: min(max(controls[name], low), high) for name, low, high in system.input_ranges}
-    constants = [held.get(name.removesuffix("_0"), 0.0) for name in ("t", *map(str, system.parameters))]
-    energies = []
-    for scale in (0.0, 1.0):
-        mujoco.mj_resetData(model, data)
-        mujoco.mj_integratePos(model, data.qpos, draw.uniform(-1, 1, model.nv) * scale, 1.0)
-        data.qvel[:] = scale * draw.uniform(-1, 1, model.nv)
-        data.ctrl[: len(controls)] = [*controls.values()]
-        mujoco.mj_forward(model, data)
-        rate = flow(model, data.qpos, data.qvel)
-        second = flow(model, data.qpos, data.qacc_smooth)
-        second += flow(model, rate, data.qvel) - flow(model, 0 * rate, data.qvel)
-        q, v, a = ([*map(mp.mpf, part[order].tolist())] for part in (data.qpos, rate, second))
+
+    def equations(motion: Sequence[Any], constants: Sequence[float]) -> tuple[Any, Any, Any]:
+        places, rates, changes = motion
+        rate = flow(kinds, places, rates)
+        second = flow(kinds, places, changes)
+        second += flow(kinds, rate, rates) - flow(kinds, 0 * rate, rates)
+        q, v, a = ([*map(mp.mpf, part[order].tolist())] for part in (places, rate, second))
         step, sides = mp.mpf("1e-15"), []
         for h in (-step, 0, step):
             moved = [x + h * y + h * h / 2 * z for x, y, z in zip(q, v, a, strict=True)]
             sides.append(tape([*moved, *(y + h * z for y, z in zip(v, a, strict=True)), *map(mp.mpf, constants)]))
-        energies.append(sides[1][0] - data.energy[1] + data.energy[0])
-    before, (_, *values), after = (np.array(side) for side in sides)
-    torques, along, acting = values[:m], ((after - before) / (2 * step))[1 + m : 1 + 2 * m], values[2 * m :]
-    size = max(map(abs, torques)) + max(map(abs, acting)) + 1
-    power = np.dot(acting, v) - float((data.qfrc_damper + data.qfrc_fluid + data.qfrc_actuator) @ data.qvel)
-    errors = energies[1] - energies[0], power, np.abs(along - torques - acting).max() / size
-    return [float(abs(error)) for error in errors]
+        before, (energy, *values), after = (np.array(side) for side in sides)
+        torques, along, acting = values[:m], ((after - before) / (2 * step))[1 + m : 1 + 2 * m], values[2 * m :]
+        size = max(map(abs, torques)) + max(map(abs, acting)) + 1
+        return energy, np.dot(acting, v), np.abs(along - torques - acting).max() / size
+
+    return equations
 
 
 def motion_by_mujoco(path: Path, place: Any, rates: Any, span: float) -> Any:
@@ -383,7 +538,7 @@ def motion_by_mujoco(path: Path, place: Any, rates: Any, span: float) -> Any:
         free, rows = np.array(data.qacc_smooth), sides[2]
         bias, lifted = (sides[0] - sides[1]) @ data.qvel / (2 * step), np.linalg.solve(mass, rows.T)
         forces = np.linalg.lstsq(rows @ lifted, rows @ free + bias, rcond=1e-7)[0]
-        return np.concatenate([flow(model, data.qpos, data.qvel), free - lifted @ forces])
+        return np.concatenate([flow(model.jnt_type, data.qpos, data.qvel), free - lifted @ forces])
 
     return solve_ivp(field, (0, span), [*place, *rates], method="DOP853", rtol=1e-11, atol=1e-12).y[: model.nq, -1]
 

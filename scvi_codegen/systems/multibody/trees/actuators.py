@@ -10,6 +10,7 @@ from itertools import chain
 
 from sympy import Add, Expr
 
+from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.formulas.kinks import positive_part
 from scvi_codegen.systems.formulas.symbols import input_parameters, symbol
 from scvi_codegen.systems.multibody.trees.document import Element
@@ -48,7 +49,8 @@ def actuator_of(
     name = next(x for x in names if taken.isdisjoint({x, *input_parameters([x])}))
     length = exact_number(gear) * length_of(links, tendon)
     a, b, c = (exact_number(g) * symbol(name) + exact_number(b) for g, b in zip(gain, bias, strict=True))
-    return label, name, controls, _dissipation(a + b * length, c, rate_of(links, length), forces)
+    rate = intermediate(rate_of(links, length))
+    return label, name, controls, _dissipation(a + b * length, c, rate, forces)
 
 
 def _dissipation(at_rest: Expr, slope: Expr, rate: Expr, forces: Range) -> Expr:

@@ -38,7 +38,7 @@ def energies_of(links: Sequence[Link], tendons: Iterable[Tendon]) -> tuple[Expr,
     kinetic, potential, dissipated = S.Zero, S.Zero, S.Zero
     for tendon in tendons:
         length = length_of(links, tendon)
-        rate = rate_of(links, length) if tendon.armature or tendon.damping else S.Zero
+        rate = intermediate(rate_of(links, length)) if tendon.armature or tendon.damping else S.Zero
         kinetic += exact_number(tendon.armature) * rate**2 / 2
         dissipated += integral(tendon.damping, Abs(rate))
         if any(tendon.stiffness):

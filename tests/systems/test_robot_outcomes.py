@@ -1,0 +1,165 @@
+"""Outcome of each kind of robot's file: it moves as by MuJoCo or Pinocchio, or is refused with a reason.
+
+Rows of MJCF have the joints of two bodies, one on the other, and further sections; those of URDF two joints.
+"""
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from random_robots import BOX, FACES, equations_of, errors_of_motion
+
+import scvi_codegen as sc
+from scvi_codegen.common.errors import ContactError, SystemDefinitionError, SystemDefinitionWarning
+
+EQUAL = None
+"""Outcome of files that are read: equations of motion equal to 1e-8."""
+MJCF = """<mujoco><compiler {compiler}/><option gravity="0 1 -9" {option}><flag contact="disable"/></option><asset>
+<mesh name="m" vertex="{box}" face="{faces}"/></asset><worldbody><site name="w" pos=".1 .5 .2"/>
+<body name="a" pos=".1 .2 .3" euler=".1 .2 .3">{a}<geom name="ga" size=".1" pos=".3 .1 0"/>
+<site name="s" pos=".3 .1 .1"/>
+<body name="b" pos=".3 0 0">{b}<geom type="box" size=".1 .2 .3" pos=".3 0 .1"/><site name="e" pos=".2 .2 .1"/></body>
+</body></worldbody>{rest}</mujoco>"""
+A, B = '<joint name="x" axis="1 2 3" {}/>', '<joint name="y" axis="0 1 0" {}/>'
+PATH = '<tendon><spatial name="t" stiffness="3"><site site="w"/>{}<site site="e"/></spatial></tendon>'
+MUSCLE, SERVO = '<actuator><muscle joint="x"/></actuator>', '<actuator><position name="u" joint="x" kv="1"/></actuator>'
+FLUID = {"option": 'density="9" viscosity="1"'}
+ROWS: dict[str, tuple[dict[str, str], str | None]] = {
+    "degrees": ({"a": A.format('ref="20" springref="30" stiffness="1"')}, EQUAL),
+    "radians": ({"compiler": 'angle="radian"', "a": A.format('ref=".3" springref=".5" stiffness="1"')}, EQUAL),
+    "names with other characters": (
+        {"a": A.format("").replace('"x"', '"1-hip/π"'), "b": B.replace('"y"', '"exp"')},
+        EQUAL,
+    ),
+    "polynomials": ({"a": A.format('stiffness="1 2 3" damping="1 2 3"')}, EQUAL),
+    "free base": ({"a": '<freejoint name="f" align="false"/>'}, EQUAL),
+    "springs of ball joints": ({"b": '<joint name="y" type="ball" stiffness="2" damping=".1"/>'}, EQUAL),
+    "balanced inertias": (
+        {"compiler": 'balanceinertia="true"', "b": B + '<inertial pos=".1 0 0" mass="1" diaginertia=".1 .2 .9"/>'},
+        EQUAL,
+    ),
+    "meshes": ({"b": B + '<geom type="mesh" mesh="m"/>'}, EQUAL),
+    "replicate": ({"b": B + '<replicate count="3" euler="0 0 1"><geom size=".1" pos="1 0 0"/></replicate>'}, EQUAL),
+    "attach": ({"rest": '<worldbody><attach body="a" prefix="p"/></worldbody>'}, EQUAL),
+    "medium": (FLUID, EQUAL),
+    "tendon through sites": ({"rest": PATH.format('<site site="s"/>')}, EQUAL),
+    "gears": ({"rest": '<actuator><motor joint="x" gear="-20" armature=".01" damping=".1"/></actuator>'}, EQUAL),
+    "servo": ({"rest": SERVO}, EQUAL),
+    "limits and dry friction": ({"a": A.format('range="-1 1" frictionloss=".1"')}, EQUAL),
+    "ellipsoids in a medium": (
+        FLUID | {"b": B + '<geom size=".1" fluidshape="ellipsoid"/>'},
+        "has fluidshape='ellipsoid' in a medium, whose forces are not computed: remove it",
+    ),
+    "wind": ({"option": 'wind="1 0 0"'}, "wind='1 0 0', which changes the motion and is not read: remove it"),
+    "pulley": ({"rest": PATH.format('<pulley divisor="2"/>')}, "which is read through sites only, without wrapping"),
+    "wrapping": ({"rest": PATH.format('<geom geom="ga"/>')}, "which is read through sites only, without wrapping"),
+    "springdamper": ({"a": A.format('springdamper="1 1"')}, "springdamper='1 1', which changes the motion"),
+    "muscle": ({"rest": MUSCLE}, "<muscle> 'muscle' in <body> 'b' is not read as an actuator|general, motor, position"),
+    "composite": (
+        {"b": B + "<composite/>"},
+        "changes the motion and is not read: remove it, or write out what it makes",
+    ),
+    "shell": ({"b": B + '<geom size=".1" shellinertia="true"/>'}, "whose inertia is not computed: give its body an"),
+    "massless leaf": ({"b": '<body><joint name="z"/></body>' + B}, "joint 'z' moves no mass"),
+    "equality of tendons": (
+        {"rest": PATH.format("") + '<equality><tendon tendon1="t"/></equality>'},
+        "is not read: remove it or write a constraint",
+    ),
+    "too many copies": (
+        {"b": B + '<replicate count="1e8"><geom size=".1"/></replicate>'},
+        "makes more than 10000 elements",
+    ),
+    "attribute misspelt": ({"a": A.format('dampign="1"')}, "unknown attribute 'dampign'; did you mean 'damping'?"),
+}
+LINKS = """<link name="{}"><inertial><origin xyz=".1 0 .2" rpy=".1 .2 .3"/><mass value="1"/>
+<inertia ixx=".2" iyy=".3" izz=".25" ixy="0" ixz="0" iyz="0"/></inertial><visual><geometry>
+<mesh filename="package://robot/a.stl"/></geometry></visual></link>"""
+JOINT = '<joint name="{}" type="{}"><parent link="{}"/><child link="{}"/><origin xyz="0 .1 .2"/>{}</joint>'
+AXIS = '<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/>'
+ORIENTED = f'{AXIS}<dynamics damping=".2"/>'
+URDF: dict[str, tuple[str, str, str, str | None]] = {
+    "revolute, meshes of packages": ("revolute", ORIENTED, "", EQUAL),
+    "prismatic": ("prismatic", AXIS, "", EQUAL),
+    "other namespaces and frames": ("revolute", f"{AXIS}<drake:own/>", '<frame name="f" link="c"/>', EQUAL),
+    "mimic": ("revolute", f'{AXIS}<mimic joint="x" multiplier="2"/>', "", EQUAL),
+    "older properties": (
+        "revolute",
+        '<joint_properties damping="1"/>',
+        "",
+        "has damping or friction, which is not read",
+    ),
+    "substitution": ("revolute", '<axis xyz="$(arg a)"/>', "", "a substitution: write the file that xacro makes of it"),
+    "floating inside": ("floating", "", "", "is free, but its parent moves: remove the joint"),
+    "unknown kind": ("helical", "", "", "is of type 'helical', which is not read; possible: fixed, revolute"),
+}
+
+
+def moved(system: Any) -> None:
+    """Integrate from the reference configuration."""
+    start = system.keyframes["qpos0"]
+    velocity = {name: np.full(np.shape(rate), 0.1) for name, rate in start["velocity"].items()}
+    run = sc.compile_stepper(system, "svi:2").integrate(**start | {"velocity": velocity}, h=0.001, steps=3)
+    assert np.isfinite(run.q).all()
+    assert run.q[-1].tolist() != run.q[0].tolist()
+
+
+def rows(table: dict[str, Any]) -> list[Any]:
+    """Return the kinds; those that are read are rotated."""
+    return [pytest.param(kind, marks=[pytest.mark.rotated] * (row[-1] is EQUAL)) for kind, row in table.items()]
+
+
+@pytest.mark.parametrize("kind", rows(ROWS))
+@pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.SystemDefinitionWarning")
+def test_outcome_of_mjcf(kind, tmp_path):
+    (parts, outcome), file = ROWS[kind], tmp_path / "robot.xml"
+    defaults = {"compiler": 'angle="radian"', "option": "", "a": A, "b": B, "rest": "", "box": BOX, "faces": FACES}
+    file.write_text(MJCF.format(**{key: value.replace("{}", "") for key, value in (defaults | parts).items()}))
+    if outcome is not EQUAL:
+        with pytest.raises(SystemDefinitionError, match="|".join(map(re.escape, outcome.split("|")))):
+            sc.LagrangianSystem.from_mjcf(file, actuators=True)
+        return
+    system = sc.LagrangianSystem.from_mjcf(file, actuators=True)
+    moved(system)
+    pytest.importorskip("mujoco", reason="pip install mujoco")
+    assert max(errors_of_motion(system, file)) < 1e-8
+
+
+@pytest.mark.parametrize("kind", rows(URDF))
+@pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.SystemDefinitionWarning")
+def test_outcome_of_urdf(kind, tmp_path):
+    (joint, inner, rest, outcome), file = URDF[kind], tmp_path / "robot.urdf"
+    joints = JOINT.format("x", "continuous", "a", "b", ORIENTED) + JOINT.format("y", joint, "b", "c", inner)
+    file.write_text(f'<robot name="r">{"".join(map(LINKS.format, "abc"))}{joints}{rest}</robot>')
+    if outcome is not EQUAL:
+        with pytest.raises(SystemDefinitionError, match=re.escape(outcome)):
+            sc.LagrangianSystem.from_urdf(file)
+        return
+    system = sc.LagrangianSystem.from_urdf(file)
+    moved(system)
+    pinocchio = pytest.importorskip("pinocchio", reason="pip install pin")
+    model = pinocchio.buildModelFromUrdf(str(file))
+    follows = np.array([[1.0], [2.0]]) if kind == "mimic" else np.eye(2)
+    u, angles = np.array([0.4, 0.7])[: follows.shape[1]], (follows @ np.array([0.3, 0.5])[: follows.shape[1]]).tolist()
+    q = np.concatenate(
+        [[np.cos(x), np.sin(x)] if j.nq == 2 else [x] for j, x in zip(model.joints[1:], angles, strict=True)]
+    )
+    mass = pinocchio.crba(model, data := model.createData(), q)
+    mass = np.triu(mass) + np.triu(mass, 1).T
+    forces = -model.damping * (follows @ u) - pinocchio.nonLinearEffects(model, data, q, follows @ u)
+    changes = np.linalg.solve(follows.T @ mass @ follows, follows.T @ forces)
+    equations = equations_of(system, ["x", "y"][: len(u)], [3, 3][: len(u)])
+    assert equations((np.array(angles)[: len(u)], u, changes), [0.0])[2] < 1e-8
+
+
+@pytest.mark.second
+def test_outcome_of_states_outside_limits(tmp_path):
+    file, keys = tmp_path / "robot.xml", '<keyframe><key name="far" qpos="2 0"/></keyframe>'
+    parts = {"compiler": "", "option": "", "a": A.format('range="10 60"'), "b": B.format(""), "rest": keys}
+    file.write_text(MJCF.format(**parts, box=BOX, faces=FACES))
+    with pytest.warns(SystemDefinitionWarning, match="without the keyframe 'far' within the limits of joints x$"):
+        system = sc.LagrangianSystem.from_mjcf(file, limits="contact")
+    stepper = sc.compile_stepper(system, "svi:2")
+    for name in ("qpos0", "far"):
+        with pytest.raises(ContactError, match=r"limit of joint 'x' of the range 0.174533 to 1.0472\) at -"):
+            stepper.integrate(**system.keyframes[name], h=0.01, steps=2)
