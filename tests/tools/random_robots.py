@@ -111,6 +111,10 @@ class Mjcf:
     def spring(self, kind: str) -> dict[str, str]:
         return {"stiffness": "0" if kind == "ball" else self.draw.numbers(1, -1, 3)}
 
+    def forces(self, kind: str) -> dict[str, str]:
+        """Return further attributes of a joint."""
+        return {}
+
     def further(self, name: str) -> list[str]:
         """Return further parts of a body."""
         return []
@@ -138,7 +142,9 @@ class Mjcf:
             if kind == "hinge" and "ball" in kinds[:k]:
                 continue
             self.joints[f"j{name}{k}"] = kind
-            own = {"name": f"j{name}{k}", "type": kind, **self.joint(), **self.klass("class"), **self.spring(kind)}
+            spring = self.spring(kind)
+            own = {"name": f"j{name}{k}", "type": kind, **self.joint(), **self.klass("class"), **spring}
+            own |= self.forces(kind)
             parts.append(element("joint", own))
         if free:
             self.joints[f"j{name}"] = "free"
@@ -205,6 +211,9 @@ class Whole(Mjcf):
         self.part = PART.format(**kinds, **numbers)
 
     def spring(self, kind: str) -> dict[str, str]:
+        return {}
+
+    def forces(self, kind: str) -> dict[str, str]:
         draw = self.draw
         damping = {"damping": draw.numbers(draw.one(1, 2, 3), 0)} if draw.maybe(0.3) else {}
         stiffness = draw.numbers(draw.one(1, 2, 3), 0, 3) if draw.maybe() else "0"
