@@ -69,45 +69,88 @@ static real friction_limit(const contact_terms *of, int k, int which, const real
   return of->coefficient[3 * k + which] * (CONTACTS[k].normal < 0 ? 1.0 : force[CONTACTS[k].normal]);
 }
 
+/* Unknown forces of modes, of which the imposed rows count: their rows, contacts whose friction they are (-1: none), and
+ * forces of the rows by them as columns. Sliding without a gap is not among them: `force`, which is 0 otherwise. */
+typedef struct {
+  int count, row[CONTACT_ROWS], owner[CONTACT_ROWS];
+  real column[CONTACT_ROWS][CONTACT_ROWS];
+} contact_unknowns;
+
+static void find_unknowns(const contact_terms *of, const contact_mode *mode, contact_unknowns *in, real *force)
+{
+  memset(in, 0, sizeof *in);
+  memset(force, 0, BYTES(CONTACT_ROWS));
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const contact_places *at = CONTACTS + k;
+    real *const sliding = at->normal < 0 ? force : in->column[in->count];
+    for (int i = 0; i < at->slips; i++)
+      sliding[at->tangential + i] = -of->coefficient[3 * k] * mode[k].direction[i];
+    if (at->normal >= 0 && mode[k].closed) {
+      in->row[in->count] = at->normal;
+      in->owner[in->count] = -1;
+      in->column[in->count++][at->normal] = 1.0;
+    }
+    for (int i = 0; i < at->slips; i++)
+      if (mode[k].sticks >> i & 1) {
+        in->row[in->count] = at->tangential + i;
+        in->owner[in->count] = k;
+        in->column[in->count++][at->tangential + i] = 1.0;
+      }
+  }
+}
+
+/* Reduces the equations of the unknowns, the rates right + W f of the imposed rows; the number of dependent ones. */
+static int reduce_equations(const contact_terms *of, const contact_unknowns *in, const real *right, const real *force,
+    real (*matrix)[CONTACT_ROWS + 1], int *independent)
+{
+  for (int i = 0; i < in->count; i++) {
+    const real *W = of->W + in->row[i] * CONTACT_ROWS;
+    for (int j = 0; j < in->count; j++)
+      matrix[i][j] = 0.0;
+    for (int r = 0; r < CONTACT_ROWS; r++)
+      for (int j = 0; j < in->count; j++)
+        matrix[i][j] += W[r] * in->column[j][r];
+    matrix[i][in->count] = -rate_after(of, right, force, in->row[i]);
+  }
+  return eliminate(matrix, in->count, independent);
+}
+
+/* Whether rates are rounding errors of right + W f. */
+static int are_small(const contact_terms *of, const real *rates, const real *right, const real *force)
+{
+  for (int r = 0; r < CONTACT_ROWS; r++) {
+    real size = fabs(right[r]);
+    for (int j = 0; j < CONTACT_ROWS; j++)
+      size += fabs(of->W[r * CONTACT_ROWS + j] * force[j]);
+    if (fabs(rates[r]) > CONTACT_ROUNDING * size)
+      return 0;
+  }
+  return 1;
+}
+
+/* Whether forces change no rate but by rounding errors of right + W f. */
+static int leave_rates(const contact_terms *of, const real *moved, const real *right, const real *force)
+{
+  const real still[CONTACT_ROWS] = {0.0};
+  real rates[CONTACT_ROWS];
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    rates[r] = rate_after(of, still, moved, r);
+  return are_small(of, rates, right, force);
+}
+
 /* Solves for the forces of the rows in given modes with after = right + W f = 0 in imposed rows, those of least norm,
  * friction relative to its limit, if these are dependent; returns 0 if they contradict each other, or such forces
  * differ in the rates. If `imposed` is not NULL, it becomes 1 for rows to impose, which are independent. */
 static int solve_contacts(const contact_terms *of, const contact_mode *mode, const real *right, real *force,
     real *after, int *imposed)
 {
-  real matrix[CONTACT_ROWS][CONTACT_ROWS + 1], column[CONTACT_ROWS][CONTACT_ROWS]; /* forces by unknowns */
-  real x[CONTACT_ROWS], least[CONTACT_ROWS], still[CONTACT_ROWS] = {0.0}, moved[CONTACT_ROWS] = {0.0};
+  contact_unknowns in;
+  real matrix[CONTACT_ROWS][CONTACT_ROWS + 1];
+  real x[CONTACT_ROWS], least[CONTACT_ROWS], moved[CONTACT_ROWS] = {0.0}, left[CONTACT_ROWS] = {0.0};
   real weight[CONTACT_ROWS], load = DBL_MIN;
-  int row[CONTACT_ROWS], independent[CONTACT_ROWS], owner[CONTACT_ROWS], count = 0, dependent;
-  memset(force, 0, BYTES(CONTACT_ROWS));
-  memset(column, 0, sizeof column);
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const contact_places *at = CONTACTS + k;
-    real *const sliding = at->normal < 0 ? force : column[count];
-    for (int i = 0; i < at->slips; i++)
-      sliding[at->tangential + i] = -of->coefficient[3 * k] * mode[k].direction[i];
-    if (at->normal >= 0 && mode[k].closed) {
-      row[count] = at->normal;
-      owner[count] = -1;
-      column[count++][at->normal] = 1.0;
-    }
-    for (int i = 0; i < at->slips; i++)
-      if (mode[k].sticks >> i & 1) {
-        row[count] = at->tangential + i;
-        owner[count] = k;
-        column[count++][at->tangential + i] = 1.0;
-      }
-  }
-  for (int i = 0; i < count; i++) {
-    const real *W = of->W + row[i] * CONTACT_ROWS;
-    for (int j = 0; j < count; j++)
-      matrix[i][j] = 0.0;
-    for (int r = 0; r < CONTACT_ROWS; r++)
-      for (int j = 0; j < count; j++)
-        matrix[i][j] += W[r] * column[j][r];
-    matrix[i][count] = -rate_after(of, right, force, row[i]);
-  }
-  dependent = eliminate(matrix, count, independent);
+  int independent[CONTACT_ROWS];
+  find_unknowns(of, mode, &in, force);
+  const int count = in.count, dependent = reduce_equations(of, &in, right, force, matrix, independent);
   for (int i = 0; i < count; i++) {
     least[i] = x[i] = independent[i] ? matrix[i][count] / matrix[i][i] : 0.0;
     weight[i] = 1.0;
@@ -115,35 +158,27 @@ static int solve_contacts(const contact_terms *of, const contact_mode *mode, con
   for (int pass = 0; pass < 2 && dependent; pass++) {
     reduce_norm(matrix, count, independent, weight, least);
     for (int i = 0; i < count; i++) {
-      moved[row[i]] = least[i];
+      moved[in.row[i]] = least[i];
       load = fmax(load, fabs(least[i]));
     }
     for (int i = 0; i < count; i++) {
-      const real limit = owner[i] < 0 ? load : friction_limit(of, owner[i], 1, moved);
+      const real limit = in.owner[i] < 0 ? load : friction_limit(of, in.owner[i], 1, moved);
       weight[i] = 1.0 / fmax(limit, CONTACT_SLOW * load);
     }
   }
   memset(moved, 0, sizeof moved);
   for (int i = 0; i < count; i++)
     for (int r = 0; r < CONTACT_ROWS; r++) {
-      force[r] += column[i][r] * least[i];
-      moved[r] += column[i][r] * (least[i] - x[i]);
+      force[r] += in.column[i][r] * least[i];
+      moved[r] += in.column[i][r] * (least[i] - x[i]);
     }
   for (int r = 0; r < CONTACT_ROWS; r++)
     after[r] = rate_after(of, right, force, r);
   for (int i = 0; i < count && imposed; i++)
-    imposed[row[i]] = independent[i];
-  for (int r = 0; r < CONTACT_ROWS && dependent; r++) {
-    real size = fabs(right[r]);
-    for (int j = 0; j < CONTACT_ROWS; j++)
-      size += fabs(of->W[r * CONTACT_ROWS + j] * force[j]);
-    if (fabs(rate_after(of, still, moved, r)) > CONTACT_ROUNDING * size)
-      return 0;
-    for (int i = 0; i < count; i++)
-      if (row[i] == r && fabs(after[r]) > CONTACT_ROUNDING * size)
-        return 0;
-  }
-  return 1;
+    imposed[in.row[i]] = independent[i];
+  for (int i = 0; i < count; i++)
+    left[in.row[i]] = after[in.row[i]];
+  return !dependent || (leave_rates(of, moved, right, force) && are_small(of, left, right, force));
 }
 
 /* Present modes, with the directions of slips at a state, in space of (ahead.w) w + start. */

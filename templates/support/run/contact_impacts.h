@@ -14,6 +14,7 @@ enum {
   CONTACT_PLASTIC
 };
 
+#define CONTACT_SLIGHT 1e-4 /* part of the rates of bodies of which those of an impact are at least */
 #define CONTACT_LOWEST 16.0 /* roundings of a gap below which a rebound ends */
 #define CONTACT_RESIDUALS 16.0 /* residuals of its located zero below which a rebound ends */
 #define CONTACT_GAIN 1e-9 /* part of the work of an impact by which energy may grow */
@@ -23,12 +24,14 @@ enum {
 static int impulses_of(const contact_terms *of, int contact, const int *closed, real restitution, const real *rate,
     real *impulse)
 {
-  contact_problem in = {.of = of, .scale = of->speed};
+  real right[CONTACT_ROWS], after[CONTACT_ROWS], scale[CONTACT_ROWS];
+  contact_problem in = {.of = of, .scale = scale};
   contact_mode mode[EVENT_CONTACTS];
-  real right[CONTACT_ROWS], after[CONTACT_ROWS];
   memcpy(right, rate, sizeof right);
   right[CONTACTS[contact].normal] *= 1.0 + restitution;
   in.right = right;
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    scale[r] = CONTACT_SLIGHT * of->speed[r];
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     in.is_free[k] = CONTACTS[k].normal < 0 || !(k == contact || closed[k]);
     in.rests[k] = !in.is_free[k] && CONTACTS[k].slips > 0;
@@ -104,16 +107,40 @@ static real gain_of(const contact_terms *of, const real *impulse)
   return size != 0.0 ? gain / fabs(size) : 0.0;
 }
 
-/* Whether the height w^2 / (2 g'') of a rebound is of the size of rounding, or of the residual of the located zero; of
- * a gap that moves, of that of the search, which sees no rounding of time. */
-static int is_low(const event_step *step, const contact_terms *before, const contact_terms *of, int k)
+/* Whether the height w^2 / (2 g'') of a rebound is of the size of rounding, or of the residuals of the located zeros of
+ * the contacts that meet, which a projection moves; of a gap that moves, of that of the search, which sees no rounding
+ * of time. */
+static int is_low(const event_step *step, const contact_terms *of, real residual, int k)
 {
   const int row = CONTACTS[k].normal;
-  real lowest = CONTACT_LOWEST * of->rounding[row] + CONTACT_RESIDUALS * fabs(before->value[row]);
+  real lowest = CONTACT_LOWEST * of->rounding[row] + CONTACT_RESIDUALS * residual;
   for (int i = 0; i < TRANSITIONS && of->drift[row] > CONTACT_ROUNDING * of->speed[row]; i++)
     if (TRANSITION[i][0] == k && TRANSITION[i][1] == CONTACT_CLOSES)
       lowest += 4.0 * step->watch->history[EVENT_FIRST[FIRST_TRANSITION + i]].slack;
   return of->rate[row] * of->rate[row] <= -2.0 * of->second[row] * lowest;
+}
+
+/* Adds impulses to the momenta. */
+static int push(const event_step *step, event_sample *at, contact_terms *of, const real *impulse)
+{
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    for (int i = 0; i < M; i++)
+      at->p[i] += of->G[r * M + i] * impulse[r];
+  return terms_at(step, at, of);
+}
+
+/* Removes the rates of low rebounds from contacts that touch, with slips that rest: slips that remain have the direction
+ * of their friction. */
+static int settle(const event_step *step, event_sample *at, contact_terms *of, const contact_change *now)
+{
+  contact_mode mode[EVENT_CONTACTS];
+  real impulse[CONTACT_ROWS], after[CONTACT_ROWS];
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    mode[k] = now->rests[k] ? CONTACT_STICKS : CONTACT_SLIPS;
+    if (CONTACTS[k].normal >= 0 && !now->touches[k])
+      mode[k] = CONTACT_IS_OPEN;
+  }
+  return solve_contacts(of, mode, of->rate, impulse, after, NULL) ? push(step, at, of, impulse) : OK;
 }
 
 /* Impulses of all contacts that meet at a state, by the first law that creates no kinetic energy, and which contacts
@@ -121,12 +148,13 @@ static int is_low(const event_step *step, const contact_terms *before, const con
 static int collide(const event_step *step, event_sample *at, contact_terms *of, const int *closed, contact_change *now)
 {
   const contact_terms before = *of;
-  real impulse[CONTACT_ROWS];
+  real impulse[CONTACT_ROWS], residual = 0.0;
   int approaches[EVENT_CONTACTS], law = CONTACT_NEWTON, status;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal;
     approaches[k] = normal >= 0 && !of->absent[k] && !now->leaves[k] &&
         (now->closes[k] || (!closed[k] && fabs(of->value[normal]) <= CONTACT_ROUNDING * of->size[normal]));
+    residual = fmax(residual, approaches[k] ? fabs(of->value[normal]) : 0.0);
   }
   status = find_impulses(step, of, approaches, closed, law, impulse);
   while (status == OK ? law < CONTACT_PLASTIC && gain_of(of, impulse) > CONTACT_GAIN : law == CONTACT_POISSON) {
@@ -134,11 +162,8 @@ static int collide(const event_step *step, event_sample *at, contact_terms *of, 
     status = find_impulses(step, of, approaches, closed, ++law, impulse);
   }
   step->watch->law = law > step->watch->law ? law : step->watch->law;
-  for (int r = 0; status == OK && r < CONTACT_ROWS; r++)
-    for (int i = 0; i < M; i++)
-      at->p[i] += of->G[r * M + i] * impulse[r];
   if (status == OK)
-    status = terms_at(step, at, of);
+    status = push(step, at, of, impulse);
   for (int k = 0; status == OK && k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
     if (slips > 0)
@@ -149,9 +174,9 @@ static int collide(const event_step *step, event_sample *at, contact_terms *of, 
       now->touches[k] = 1;
     if (of->rate[normal] > CONTACT_ROUNDING * before.speed[normal])
       now->touches[k] = 0;
-    if (approaches[k] && (step->watch->accumulates[k] || is_low(step, &before, of, k)))
+    if (step->watch->accumulates[k] || is_low(step, of, residual, k))
       now->touches[k] = 1;
     step->watch->accumulates[k] = 0;
   }
-  return status;
+  return status == OK ? settle(step, at, of, now) : status;
 }

@@ -160,12 +160,43 @@ static void relax(const contact_problem *in, real compliance, int sweeps, real *
     }
 }
 
+/* Opens a contact, if other forces give the same rates of the imposed rows but not of all: the first of those that carry
+ * no load along such forces. Returns whether there is one. */
+static int unload(contact_problem *in, const contact_mode *mode, const real *force)
+{
+  const contact_terms *const of = in->of;
+  contact_unknowns unknown;
+  const real still[CONTACT_ROWS] = {0.0};
+  real line[CONTACT_ROWS][CONTACT_ROWS + 1], none[CONTACT_ROWS], least = INFINITY;
+  int independent[CONTACT_ROWS], first = -1;
+  find_unknowns(of, mode, &unknown, none);
+  if (!reduce_equations(of, &unknown, in->right, none, line, independent))
+    return 0;
+  for (int d = 0; d < unknown.count && first < 0; d++) {
+    real moved[CONTACT_ROWS] = {0.0};
+    for (int i = 0; i < unknown.count && !independent[d]; i++)
+      for (int r = 0; r < CONTACT_ROWS; r++)
+        moved[r] += unknown.column[i][r] * (independent[i] ? -line[i][d] / line[i][i] : i == d);
+    for (int k = 0; k < EVENT_CONTACTS && !leave_rates(of, moved, still, moved); k++) {
+      const int normal = CONTACTS[k].normal;
+      if (normal < 0 || !mode[k].closed || !(fabs(force[normal]) < least * fabs(moved[normal])))
+        continue;
+      least = fabs(force[normal] / moved[normal]);
+      first = k;
+    }
+  }
+  if (first >= 0)
+    in->role[first] = CONTACT_IS_OPEN;
+  return first >= 0;
+}
+
 /* Modes of forces in the friction cones; those below their limits stick. Where others determine a slip its friction is
- * kept relative to the normal force. Returns whether a limit changed, that of a slip that begins. */
+ * kept relative to the normal force. Returns whether a limit changed, that of a slip that begins, or a contact opens. */
 static int modes_of_forces(contact_problem *in, int trial, const real *force, contact_mode *mode)
 {
   const contact_terms *const of = in->of;
   const contact_mode *const role = in->role;
+  contact_mode sliding[EVENT_CONTACTS];
   int changed = 0;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal;
@@ -176,6 +207,9 @@ static int modes_of_forces(contact_problem *in, int trial, const real *force, co
     if ((trial == 0 && in->begins[k]) ||
         (mode[k].sticks && tau >= (1.0 - CONTACT_ROUNDING) * friction_limit(of, k, in->limit[k], force)))
       mode[k].sticks = 0;
+    sliding[k] = mode[k];
+    for (int i = 0; i < CONTACTS[k].slips && role[k].sticks && tau > 0.0; i++)
+      sliding[k].direction[i] = mode[k].closed && !mode[k].sticks ? -force[CONTACTS[k].tangential + i] / tau : 0.0;
   }
   hold_contacts(in, mode);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
@@ -189,7 +223,7 @@ static int modes_of_forces(contact_problem *in, int trial, const real *force, co
       changed |= of->coefficient[3 * k] != of->coefficient[3 * k + 1];
     }
   }
-  return changed;
+  return unload(in, sliding, force) || changed;
 }
 
 /* Modes that a contact may have, of which the first ones stick; beside the best one only those that static friction does
@@ -246,7 +280,9 @@ static int relax_modes(contact_problem *in, real *force, contact_mode *best)
 {
   real exact[CONTACT_ROWS], after[CONTACT_ROWS];
   contact_mode mode[EVENT_CONTACTS];
+  contact_mode role[EVENT_CONTACTS];
   int limit[EVENT_CONTACTS], found = 0, begins = 0;
+  memcpy(role, in->role, sizeof role);
   memcpy(best, in->role, sizeof mode);
   for (int k = 0; k < EVENT_CONTACTS; k++)
     begins |= in->begins[k];
@@ -257,9 +293,10 @@ static int relax_modes(contact_problem *in, real *force, contact_mode *best)
   for (int trial = 0; trial < CONTACT_TRIALS; trial++) {
     const int sweeps = CONTACT_SWEEPS << trial;
     memcpy(in->limit, limit, sizeof limit);
+    memcpy(in->role, role, sizeof role);
     if (trial > 0)
       relax(in, CONTACT_COMPLIANCE, sweeps, force);
-    for (int changes = 0, changed = 1; changed && changes <= EVENT_CONTACTS; changes++) {
+    for (int changes = 0, changed = 1; changed && changes <= 2 * EVENT_CONTACTS; changes++) {
       relax(in, 0.0, sweeps, force);
       changed = modes_of_forces(in, trial, force, mode);
     }
@@ -267,13 +304,16 @@ static int relax_modes(contact_problem *in, real *force, contact_mode *best)
       if (is_consistent(in, mode, exact, after)) {
         memcpy(best, mode, sizeof mode);
         found = 1;
-        if (in->is_strict)
+        if (in->is_strict) {
+          memcpy(in->role, role, sizeof role);
           return 1;
+        }
       }
     if (trial == 0)
       memset(force, 0, BYTES(CONTACT_ROWS));
   }
   memcpy(in->limit, limit, sizeof limit);
+  memcpy(in->role, role, sizeof role);
   return found || enumerate_modes(in, NULL, NULL, CONTACT_MODES, best);
 }
 

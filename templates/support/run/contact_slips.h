@@ -1,6 +1,10 @@
 #include "contact_modes.h"
 
 /* Directions of slips in space where these stop and begin. */
+enum {
+  CONTACT_HALVINGS = 30 /* of a part whose iteration does not converge */
+};
+
 #define CONTACT_BEGIN 1e-6 /* first part of a slip in space, relative to a step */
 #define CONTACT_BRAKES 0.25 /* longest parts relative to the time to its stop .. */
 #define CONTACT_GROWS 0.2 /* .. to that from its beginning .. */

@@ -325,18 +325,28 @@ static int renew_sides(const event_step *step, long long first, const event_samp
 #endif
 
 #ifdef CONTACTS_IN_SPACE
-/* Cuts a part of a fixed step to one that resolves slips in space; the first part was taken by the run. */
+/* Cuts a part of a fixed step to one that resolves slips in space, and halves it while its iteration does not converge;
+ * the first part was taken by the run unless it is replaced, in other modes. */
 static int shorten_part(const event_step *step, const event_sample *left, event_sample *right, real end, int changes,
     real *part)
 {
   const real whole = *part;
   real longest = fabs(whole);
-  int status = follow_slips(step, left, &longest);
+  int is_taken = changes == 0, status;
+  for (int k = 0; k < EVENT_MODES; k++)
+    is_taken &= step->own[MODE_PLACE[k]] == step->watch->mode[k];
+  put_modes(step->watch->mode, step->own);
+  status = follow_slips(step, left, &longest);
   if (longest < fabs(whole))
     *part = copysign(longest, whole);
-  if (status == OK && (*part != whole || changes > 0)) {
+  if (status != OK || (*part == whole && is_taken))
+    return status;
+  for (int halvings = 0; halvings <= CONTACT_HALVINGS; halvings++) {
     status = step_from_left(step, left, *part, right);
     right->t = *part == whole ? end : left->t + *part;
+    if (status != NOT_CONVERGED)
+      break;
+    *part *= 0.5;
   }
   return status;
 }
@@ -584,6 +594,20 @@ static int take_step(event_run *run, real t_end, const step_control *control, co
   return status;
 }
 
+#ifdef CONTACTS_IN_SPACE
+/* Leaves out the friction of slips in space, for a step that parts replace: only the time of the run advances. */
+static int leave_slips(const event_step *step)
+{
+  int slips = 0;
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    if (CONTACTS[k].slips == 2 && step->own[MODE_PLACE[CONTACTS[k].direction]] != 0.0) {
+      step->own[MODE_PLACE[CONTACTS[k].direction]] = 0.0;
+      slips = 1;
+    }
+  return slips;
+}
+#endif
+
 int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, const step_control *control,
     long long steps, const real *parameters, const solver_options *options, long long states, real *t, real *q, real *p,
     real *length, int *iterations, long long *number, long long room, event_crossing *found, long long *filled,
@@ -660,12 +684,14 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
       limited = &shorter;
     }
 #endif
-    for (int k = 0; k < EVENT_CONTACTS && !control && longest < fabs(run->h); k++)
-      if (CONTACTS[k].slips == 2) /* its step is replaced by parts: only the time of the run advances */
-        own[MODE_PLACE[CONTACTS[k].direction]] = 0.0;
-    if (status == OK)
+    if (status == OK && (control || longest >= fabs(run->h)))
       status = take_step(run, t_end, limited, &step, &size, &count);
-    put_modes(watch->mode, own);
+    else if (status == OK)
+      status = NOT_CONVERGED;
+    if (status == NOT_CONVERGED && !control && leave_slips(&step)) {
+      copy_run(run, &before);
+      status = take_step(run, t_end, limited, &step, &size, &count);
+    }
 #else
     if (status == OK)
       status = take_step(run, t_end, control, &step, &size, &count);
