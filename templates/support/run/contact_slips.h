@@ -2,7 +2,7 @@
 
 /* Directions of slips in space where these stop and begin. */
 enum {
-  CONTACT_HALVINGS = 30 /* of a part whose iteration does not converge */
+  CONTACT_HALVINGS = 1000 /* of parts of a step whose iterations do not converge */
 };
 
 #define CONTACT_BEGIN 1e-6 /* first part of a slip in space, relative to a step */

@@ -325,28 +325,25 @@ static int renew_sides(const event_step *step, long long first, const event_samp
 #endif
 
 #ifdef CONTACTS_IN_SPACE
-/* Cuts a part of a fixed step to one that resolves slips in space, and halves it while its iteration does not converge;
- * the first part was taken by the run unless it is replaced, in other modes. */
+/* Cuts a part of a fixed step to one that resolves slips in space, and to the longest whose iterations converge; the first
+ * part was taken by the run unless it is replaced, in other modes. */
 static int shorten_part(const event_step *step, const event_sample *left, event_sample *right, real end, int changes,
-    real *part)
+    real longest, real *part)
 {
   const real whole = *part;
-  real longest = fabs(whole);
   int is_taken = changes == 0, status;
+  longest = fmin(longest, fabs(whole));
   for (int k = 0; k < EVENT_MODES; k++)
     is_taken &= step->own[MODE_PLACE[k]] == step->watch->mode[k];
   put_modes(step->watch->mode, step->own);
-  status = follow_slips(step, left, &longest);
+  real by_slips = longest;
+  status = follow_slips(step, left, &by_slips);
+  longest = fmin(longest, by_slips);
   if (longest < fabs(whole))
     *part = copysign(longest, whole);
-  if (status != OK || (*part == whole && is_taken))
-    return status;
-  for (int halvings = 0; halvings <= CONTACT_HALVINGS; halvings++) {
+  if (status == OK && !(*part == whole && is_taken)) {
     status = step_from_left(step, left, *part, right);
     right->t = *part == whole ? end : left->t + *part;
-    if (status != NOT_CONVERGED)
-      break;
-    *part *= 0.5;
   }
   return status;
 }
@@ -361,6 +358,10 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
   event_sample left = {.t = before->t, .q = states, .p = states + M};
   event_sample right = {.fraction = 1.0, .t = run->t, .q = states + 2 * M, .p = states + 3 * M};
   int status;
+#ifdef CONTACTS_IN_SPACE
+  real longest = INFINITY;
+  int halvings = 0;
+#endif
   step->whole = step->h = length;
   copy_state(left.q, left.p, before->q, before->p);
   copy_state(right.q, right.p, run->q, run->p);
@@ -373,7 +374,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     int acts = 0, far = 0, ends, cut = 0;
 #ifdef CONTACTS_IN_SPACE
     if (!adaptive)
-      status = shorten_part(step, &left, &right, run->t, changes, &part);
+      status = shorten_part(step, &left, &right, run->t, changes, longest, &part);
     cut = part != length;
     if (status == OK && cut)
       status = evaluate_functions(step, &left, values_at(step, 0));
@@ -392,6 +393,15 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
 #endif
     if (status == OK && !far)
       status = search_step(step, &left, &right);
+#ifdef CONTACTS_IN_SPACE
+    if (status == NOT_CONVERGED && !adaptive && !step->watch->accumulated && halvings++ < CONTACT_HALVINGS) {
+      *step->filled = first;
+      longest = 0.5 * fabs(part);
+      status = OK;
+      continue;
+    }
+    longest = INFINITY;
+#endif
 #ifdef EVENT_KINKS
     if (status == OK && !far)
       note_rates(step);
