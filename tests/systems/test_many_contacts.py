@@ -190,3 +190,55 @@ def test_loops_are_checked() -> None:
         sc.LagrangianSystem.from_text(
             "sizes", ["y[N]"], "sum(i in N, y_dot[i]**2)/2", contacts=[sc.contact("y[i] for i in N")]
         )
+
+
+FEET = np.array([(0.25, 0.15), (-0.25, -0.15), (0.25, -0.15), (-0.25, 0.15)])
+
+
+@cache
+def dining_table(e: float) -> Any:
+    """Return the stepper of a table on four feet, 0.13 below its centre, in the first order of its tilts a, b."""
+    feet = [
+        sc.contact(
+            f"z + {x}*a + {y}*b",
+            slip=[f"x_dot - {y}*c_dot + 0.13*a_dot", f"y_dot + {x}*c_dot + 0.13*b_dot"],
+            friction=0.8,
+            restitution=e,
+        )
+        for x, y in FEET
+    ]
+    energy = "1.7*(x_dot**2 + y_dot**2 + z_dot**2) + 0.08*a_dot**2 + 0.06*b_dot**2 + 0.1*c_dot**2 - 3.4*9.81*z"
+    return sc.compile_stepper(
+        sc.LagrangianSystem.from_text("table", ["x", "y", "z", "a", "b", "c"], energy, contacts=feet), "svi:2"
+    )
+
+
+def comes_to_rest_on_feet(run: Any, gaps: NDArray[Any], weight: float, mu: float) -> bool:
+    """Whether gaps stay open, energy decreases but for its error, and forces in the friction cones carry the weight."""
+    energy = run.energy()
+    with pytest.warns(sc.EventWarning, match="not unique"):
+        force = run.contact_forces()
+    friction = np.hypot(force[..., 1], force[..., 2])
+    return bool(
+        gaps.min() > -1e-12
+        and np.diff(energy).max() < 1e-14 * energy[0]
+        and np.abs(run.velocity[-1]).max() < 1e-12
+        and (friction <= mu * force[..., 0] * (1 + 1e-9) + 1e-9).all()
+        and abs(force[-1, :, 0].sum() - weight) < 1e-9 * weight
+    )
+
+
+@pytest.mark.parametrize("e", [0.0, 0.3])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_table_falls_on_four_feet_in_space_and_rests(e: float, seed: int) -> None:
+    velocity = np.random.default_rng(seed).normal(size=6) * [0.3, 0.3, 0, 0.5, 0.5, 0.5]
+    run = dining_table(e).integrate([0, 0, 0.3, 0, 0, 0], velocity=velocity, h=0.005, t_end=1.5)
+    gaps = run.q[:, 2, None] + run.q[:, 3:5] @ FEET.T
+    assert comes_to_rest_on_feet(run, gaps, 3.4 * 9.81, 0.8)
+    assert run.energy_error() < 1e-7
+
+
+def test_adaptive_steps_of_a_table_on_four_feet_end_at_the_same_place() -> None:
+    start = {"q": [0, 0, 0.3, 0, 0, 0], "velocity": [0.04, -0.2, 0, 0.1, -0.3, 0.2], "t_end": 1.0}
+    fixed, adaptive = (dining_table(0.0).integrate(**start, **k) for k in ({"h": 0.002}, {"tolerance": 1e-9}))
+    assert np.abs(adaptive.q[-1] - fixed.q[-1]).max() < 1e-6

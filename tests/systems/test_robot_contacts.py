@@ -131,3 +131,28 @@ def test_a_robot_falls_on_its_capsules_and_rests(tmp_path):
     assert run.energy_error() < 1e-6
     assert max(np.diff(run.energy()).max() / 1e-12, np.abs(run.velocity[-1]).max() / 1e-10) < 1
     assert run.contact_forces()[-1, :, 0].sum() == pytest.approx(7 * 9.81, rel=1e-6)
+
+
+FOOT = '<geom type="sphere" pos="{} -.1" size=".03" mass=".1" friction=".8"/>'
+STOOL = f"""<mujoco><worldbody><geom type="plane" size="5 5 .1" friction=".8"/>
+<body pos="0 0 .3"><freejoint name="seat"/> <geom type="box" size=".3 .12 .05" mass="3" contype="0" conaffinity="0"/>
+{"".join(map(FOOT.format, (".25 .15", "-.25 -.15", ".25 -.15", "-.25 .15")))}</body></worldbody></mujoco>"""
+
+
+@pytest.mark.rotated
+def test_a_free_body_falls_on_four_feet_and_rests(tmp_path):
+    (tmp_path / "stool.xml").write_text(STOOL)
+    stepper = sc.compile_stepper(sc.LagrangianSystem.from_mjcf(tmp_path / "stool.xml", contacts="planes"), "svi:2")
+    for seed in range(3):
+        spin = np.random.default_rng(seed).normal(size=3) / 2
+        velocity = {"x_seat": 0.3, "y_seat": 0.1 * seed, "z_seat": 0.0, "omega_seat": spin}
+        start = {"x_seat": 0, "y_seat": 0, "z_seat": 0.3, "R_seat": [1, 0, 0, 0]}
+        run = stepper.integrate(start, velocity=velocity, h=0.005, t_end=2.0)
+        feet = [run.q[:, 2] + run.rotation()[:, 2] @ [x, y, -0.1] - 0.03 for x in (-0.25, 0.25) for y in (-0.15, 0.15)]
+        with pytest.warns(sc.EventWarning, match="not unique"):
+            normal, *slips = np.moveaxis(run.contact_forces(), -1, 0)
+        assert np.min(feet) > -1e-12
+        assert np.diff(run.energy()).max() < 1e-4 * run.energy()[0]
+        assert np.abs(run.velocity[-1]).max() < 1e-10
+        assert (np.hypot(*slips) <= 0.8 * normal * (1 + 1e-9) + 1e-9).all()
+        assert normal[-1].sum() == pytest.approx(3.4 * 9.81)
