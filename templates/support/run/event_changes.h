@@ -98,21 +98,28 @@ static int rate_along(const event_step *step, int e, const event_sample *at, rea
 /* State of the crossings from `first` on. That of an impact is moved back along the flow by g / (dg/dt), at most the
  * resolution of a fraction of the step, so that large steps do not enter walls by many roundings; that of a kink either
  * way, since a force that jumps adds energy in each step that passes it. */
-static int refine_crossing(const event_step *step, long long first, event_sample *at, real *part)
+static int refine_crossing(const event_step *step, long long first, const event_sample *right, event_sample *at, real *part)
 {
   event_crossing *crossing = step->found + first;
   event_entries wall;
   solver_report own;
   real back = 0.0, least, *const q = step->memory, *const p = q + M;
   int status;
+  (void)right;
   at->t = crossing->t;
   copy_state(at->q, at->p, crossing->q, crossing->p);
+#ifdef EVENT_CONSTRAINTS /* a constrained step of the size of rounding is ill-conditioned: its state is interpolated */
+  for (int k = 0; k < M && fabs(*part) < EVENT_TIE * fabs(step->whole); k++) {
+    at->q[k] = step->q[k] + *part / step->h * (right->q[k] - step->q[k]);
+    at->p[k] = step->p[k] + *part / step->h * (right->p[k] - step->p[k]);
+  }
+  for (long long i = first; i < *step->filled; i++)
+    copy_state(step->found[i].q, step->found[i].p, at->q, at->p);
+  return evaluate_function(step, FUNCTION_OF(crossing), at);
+#endif
   status = evaluate_function(step, FUNCTION_OF(crossing), at);
   if (status != OK || !(IS_IMPACT[crossing->function] || is_kink(crossing->function)))
     return status;
-#ifdef EVENT_CONSTRAINTS
-  return status; /* a constrained step of the size of rounding is ill-conditioned */
-#endif
   if (is_kink(crossing->function)) {
     status = rate_along(step, FUNCTION_OF(crossing), at, &wall.rate);
   } else {
@@ -424,7 +431,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       while (step->found[group].fraction != step->found[*step->filled - 1].fraction)
         group++;
       part *= step->found[group].fraction;
-      status = refine_crossing(step, group, &at, &part);
+      status = refine_crossing(step, group, &right, &at, &part);
     }
     step->watch->time += part;
     cut &= !acts && !step->watch->ended;
