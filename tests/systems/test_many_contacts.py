@@ -228,6 +228,7 @@ def comes_to_rest_on_feet(run: Any, gaps: NDArray[Any], weight: float, mu: float
     )
 
 
+@pytest.mark.filterwarnings("ignore:a transition has several motions")
 @pytest.mark.parametrize("e", [0.0, 0.3])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_table_falls_on_four_feet_in_space_and_rests(e: float, seed: int) -> None:
@@ -238,6 +239,7 @@ def test_a_table_falls_on_four_feet_in_space_and_rests(e: float, seed: int) -> N
     assert run.energy_error() < 1e-7
 
 
+@pytest.mark.filterwarnings("ignore:a transition has several motions")
 def test_adaptive_steps_of_a_table_on_four_feet_end_at_the_same_place() -> None:
     start = {"q": [0, 0, 0.3, 0, 0, 0], "velocity": [0.04, -0.2, 0, 0.1, -0.3, 0.2], "t_end": 1.0}
     fixed, adaptive = (dining_table(0.0).integrate(**start, **k) for k in ({"h": 0.002}, {"tolerance": 1e-9}))

@@ -139,6 +139,7 @@ STOOL = f"""<mujoco><worldbody><geom type="plane" size="5 5 .1" friction=".8"/>
 {"".join(map(FOOT.format, (".25 .15", "-.25 -.15", ".25 -.15", "-.25 .15")))}</body></worldbody></mujoco>"""
 
 
+@pytest.mark.filterwarnings("ignore:a transition has several motions")
 @pytest.mark.rotated
 def test_a_free_body_falls_on_four_feet_and_rests(tmp_path):
     (tmp_path / "stool.xml").write_text(STOOL)

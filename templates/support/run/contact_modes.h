@@ -191,12 +191,11 @@ static int unload(contact_problem *in, const contact_mode *mode, const real *for
 }
 
 /* Modes of forces in the friction cones; those below their limits stick. Where others determine a slip its friction is
- * kept relative to the normal force. Returns whether a limit changed, that of a slip that begins, or a contact opens. */
+ * kept relative to the normal force. Returns whether a limit changed, that of a slip that begins. */
 static int modes_of_forces(contact_problem *in, int trial, const real *force, contact_mode *mode)
 {
   const contact_terms *const of = in->of;
   const contact_mode *const role = in->role;
-  contact_mode sliding[EVENT_CONTACTS];
   int changed = 0;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal;
@@ -207,9 +206,6 @@ static int modes_of_forces(contact_problem *in, int trial, const real *force, co
     if ((trial == 0 && in->begins[k]) ||
         (mode[k].sticks && tau >= (1.0 - CONTACT_ROUNDING) * friction_limit(of, k, in->limit[k], force)))
       mode[k].sticks = 0;
-    sliding[k] = mode[k];
-    for (int i = 0; i < CONTACTS[k].slips && role[k].sticks && tau > 0.0; i++)
-      sliding[k].direction[i] = mode[k].closed && !mode[k].sticks ? -force[CONTACTS[k].tangential + i] / tau : 0.0;
   }
   hold_contacts(in, mode);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
@@ -223,7 +219,7 @@ static int modes_of_forces(contact_problem *in, int trial, const real *force, co
       changed |= of->coefficient[3 * k] != of->coefficient[3 * k + 1];
     }
   }
-  return unload(in, sliding, force) || changed;
+  return changed;
 }
 
 /* Modes that a contact may have, of which the first ones stick; beside the best one only those that static friction does
@@ -296,19 +292,21 @@ static int relax_modes(contact_problem *in, real *force, contact_mode *best)
     memcpy(in->role, role, sizeof role);
     if (trial > 0)
       relax(in, CONTACT_COMPLIANCE, sweeps, force);
-    for (int changes = 0, changed = 1; changed && changes <= 2 * EVENT_CONTACTS; changes++) {
-      relax(in, 0.0, sweeps, force);
-      changed = modes_of_forces(in, trial, force, mode);
-    }
-    for (in->is_strict = 1; in->is_strict >= found; in->is_strict--)
-      if (is_consistent(in, mode, exact, after)) {
-        memcpy(best, mode, sizeof mode);
-        found = 1;
-        if (in->is_strict) {
-          memcpy(in->role, role, sizeof role);
-          return 1;
-        }
+    do { /* all contacts carry loads, else some do not */
+      for (int changes = 0, changed = 1; changed && changes <= EVENT_CONTACTS; changes++) {
+        relax(in, 0.0, sweeps, force);
+        changed = modes_of_forces(in, trial, force, mode);
       }
+      for (in->is_strict = 1; in->is_strict >= found; in->is_strict--)
+        if (is_consistent(in, mode, exact, after)) {
+          memcpy(best, mode, sizeof mode);
+          found = 1;
+          if (in->is_strict) {
+            memcpy(in->role, role, sizeof role);
+            return 1;
+          }
+        }
+    } while (!found && unload(in, mode, force));
     if (trial == 0)
       memset(force, 0, BYTES(CONTACT_ROWS));
   }
