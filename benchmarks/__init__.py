@@ -28,6 +28,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+from benchmarks.bath import run_bath
 from benchmarks.cases.unforced import CASES
 from benchmarks.comparison import run_race
 from benchmarks.contenders.peers import PEERS
@@ -68,6 +69,7 @@ SECTIONS: Mapping[str, Callable[[Plan, ReportActivity], CaseResult | ResultTable
     "newton": run_newton,
     "derivatives": run_derivatives,
     "builds": run_builds,
+    "bath": run_bath,
 }
 """Sections of the benchmark: name on the command line -> function that measures it."""
 

@@ -56,6 +56,7 @@ def main(
       by-hand                   a step of a ring and of a field beside C by hand
       transforms, newton        a step on Fourier meshes beside SciPy; Newton's method at large steps
       derivatives, builds       a step with tangent vectors and gradients; by compiler and processor
+      bath                      heat baths of trajectories and liquids; JAX, diffrax, OpenMM
 
     Install the peers by pip install -e '.[bench]'. Each section is printed, and written to the JSON file, when it is
     complete.

@@ -5,6 +5,8 @@ from scvi_codegen.analysis.advice.advice import advise as advise
 from scvi_codegen.analysis.advice.solve_ivp import OdeResult as OdeResult
 from scvi_codegen.analysis.advice.solve_ivp import solve_ivp as solve_ivp
 from scvi_codegen.analysis.chaos.indicators import ChaosIndicators as ChaosIndicators
+from scvi_codegen.analysis.estimation.averages import Average as Average
+from scvi_codegen.analysis.estimation.averages import average as average
 from scvi_codegen.analysis.estimation.fitting import Fit as Fit
 from scvi_codegen.analysis.estimation.fitting import fit as fit
 from scvi_codegen.analysis.orbits.equilibrium import Equilibrium as Equilibrium

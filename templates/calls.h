@@ -146,6 +146,9 @@ long long NAME(call_each)(NAME(each) *c, long long steps)
       break;
     if (c->segment < 0) {
       NAME(start)(c->run, c->t, c->control ? 0.0 : c->segment_h[0], c->q + j * m, c->p + j * m);
+#ifdef HAS_SEED
+      c->run->seed = c->seed, c->run->trajectory = c->trajectory + j, c->run->metropolis = c->metropolis;
+#endif
       c->segment = 0;
       c->left = c->control ? 0 : c->segment_steps[0];
 #ifdef HAS_H_LOW

@@ -38,6 +38,8 @@ typedef struct {
   double *workspace, t, t_low;
   long long words, coordinates, parameters_each, segments, every, capacity; /* words: of a time */
   long long rows, next, end, segment, left, requested; /* states in memory; present trajectory, its segment */
+  unsigned long long seed;
+  long long trajectory, metropolis; /* of the noise in a heat bath: stream of the first trajectory */
   long long pauses, entered; /* with `pauses`, calls end where a segment begins: parameters may change */
 } NAME(each);
 long long NAME(call_each)(NAME(each) *call, long long steps);

@@ -25,7 +25,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, cast
 
 from sympy import Expr
 
@@ -33,6 +33,7 @@ from scvi_codegen.codegen.ir.derivatives import PointDerivatives
 from scvi_codegen.codegen.ir.equations import Control
 from scvi_codegen.codegen.ir.program import ArrayProgram, Program
 from scvi_codegen.codegen.lowering.arrays import check_solver
+from scvi_codegen.codegen.lowering.bath import heat_bath_of
 from scvi_codegen.codegen.lowering.control import control_of, error_growth_of
 from scvi_codegen.codegen.lowering.derivatives import correction_of, derivatives_of
 from scvi_codegen.codegen.lowering.loops import transforms, with_sums
@@ -90,7 +91,7 @@ from scvi_codegen.systems.kinks import located_kinks
 from scvi_codegen.systems.legendre.of_arrays import SiteHamiltonian, site_hamiltonian
 from scvi_codegen.systems.legendre.transform import energy_of_states, equivalent_lagrangian
 from scvi_codegen.systems.symmetry.symmetry import SYMMETRIES, Symmetry, all_symmetries
-from scvi_codegen.systems.system import SYSTEM, MechanicalSystem
+from scvi_codegen.systems.system import BATH_ENERGY, SYSTEM, MechanicalSystem
 from scvi_codegen.systems.term_groups import roll_terms
 
 LONGEST_PREFIX = 64
@@ -153,6 +154,22 @@ def c_identifier(name: str) -> str:
     return f"{cleaned}_integrator" if len(cleaned) == 1 or cleaned in C_HEADERS else cleaned
 
 
+def with_bath(program: Program, system: MechanicalSystem, **others: Any) -> Program:
+    """Return the program in the heat bath of a system, without error estimates; steps alone conserve momentum maps.
+
+    ``others`` are arguments without which a bath is not available.
+    """
+    if system.bath is None:
+        return program
+    if passed := [name for name, value in others.items() if value not in (None, "double")]:
+        raise MethodError(f"{passed[0]}={others[passed[0]]!r} is not available with a heat bath: omit it")
+    maps = tuple(replace(each, exact=False) for each in program.quantities.momentum_maps)
+    quantities = replace(program.quantities, momentum_maps=maps)
+    equations = replace(program.equations, stage_curve=None)
+    bath = heat_bath_of(system)
+    return replace(program, bath=bath, polynomial_curves=False, quantities=quantities, equations=equations)
+
+
 def describe(
     program: Program,
     system: MechanicalSystem,
@@ -163,7 +180,7 @@ def describe(
 ) -> Interface:
     """Return the interface of a program; ``uses_fallback_library``: a separate library has Newton's iteration."""
     maps = program.quantities.momentum_maps
-    return _interface(
+    interface = _interface(
         system,
         method,
         prefix=program.prefix,
@@ -197,6 +214,11 @@ def describe(
             for argument, x in zip(value.arguments, table.axes, strict=True)
         ),
     )
+    if program.bath is None:
+        return interface
+    changes = " and ".join(filter(None, (BATH_ENERGY, interface.changes_energy)))
+    account: dict[str, Any] = {"conserves_energy": False, "changes_energy": changes, "balances_energy": False}
+    return replace(interface, **account, temperature=program.bath.temperature)
 
 
 def _interface(system: MechanicalSystem, method: Method, **of_kind: Any) -> Interface:
@@ -250,7 +272,7 @@ class Sources:
     ) -> None:
         self.method, self.solver, self.g, self.precision = method, solver, g, precision
         self._arguments = system, method, solver, prefix, symmetries, g, controller
-        self._locates = kinks == "located" and g is None
+        self._locates = kinks == "located" and g is None and system.bath is None
         self.symmetries = symmetries
         self.controller = controller_named(controller, in_tau=g is not None)
         self.prefix = c_identifier(prefix or f"{system.name}_{method.name}")
@@ -268,7 +290,7 @@ class Sources:
     def _derived(self, *, solver: str, fallback: bool = True) -> Program:
         """Return the lowered program; ``fallback``: with Newton's iteration as a fallback."""
         derive = lower_unrolled if self.precision == DOUBLE_DOUBLE else program_of
-        return derive(
+        program = derive(
             self.system,
             self.method,
             prefix=self.prefix,
@@ -277,6 +299,7 @@ class Sources:
             fallback=fallback,
             without_modes=self._without_modes,
         )
+        return with_bath(program, self._arguments[0], precision=self.precision, time_transformation=self.g)
 
     @cached_property
     def _in_double(self) -> Sources:
@@ -511,7 +534,7 @@ class ArraySources(Sources):
     def sites(self) -> SiteHamiltonian | None:
         """Hamiltonian by which the system is integrated, of a Lagrangian with other velocities than m v**2/2."""
         by_momenta = self.g is None and self.solver == "fixed-point" and self.system.coupled_terms
-        return site_hamiltonian(self.system) if by_momenta else None
+        return site_hamiltonian(self.system) if by_momenta and not self.system.bath else None
 
     def integrator(self, *, controlled: bool = True) -> tuple[Source, Interface]:
         """Return the C source and its interface; arguments as of :meth:`Sources.integrator`."""
@@ -562,6 +585,7 @@ class ArraySources(Sources):
             conserves_energy=not (system.momenta or system.changes_energy or system.inputs),
             solver="rattle" if system.constraints else self.solver,
             layout=layout,
+            temperature=system.text_of(system.bath.temperature) if system.bath else None,
         )
 
     def variant(self, variant: Variant) -> None:
@@ -605,11 +629,11 @@ def generate_source(
             events are combined with ``embedded="single"``.
     """
     method = as_method(method, system)
-    rows: tuple[ContactRows, ...] = ()
+    original, rows = system, cast("tuple[ContactRows, ...]", ())
     if system.has_contacts:
         system, rows = bound_contacts(system, system.contacts)
     form = discretised_form(system, method)
-    system, located = located_kinks(form) if kinks == "located" else (form, ())
+    system, located = located_kinks(form) if kinks == "located" and original.bath is None else (form, ())
     if embedded not in (None, *EMBEDDED):
         raise MethodError(f"embedded must be {' or '.join(EMBEDDED)}, not {embedded!r}")
     if embedded and solver == "fixed-point":
@@ -619,6 +643,7 @@ def generate_source(
     program = program_of(
         system, method, solver=solver, prefix=prefix, symmetries=symmetries, lanes=embedded is None, without_modes=form
     )
+    program = with_bath(program, original, embedded=embedded, time_transformation=time_transformation)
     g = time_transformation
     of_steps = controller_named(controller, in_tau=g is not None)
     control = control_of(program, of_steps, system, g) if controlled or g is not None else None

@@ -59,6 +59,7 @@ from scvi_codegen.runs.stepping.array_interface import RunSizes, interface_of_si
 from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.runs.stepping.features import check_together, require
 from scvi_codegen.runs.stepping.integrator import Integrator
+from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise
 from scvi_codegen.runs.stepping.projection import consistent, constraint_values, multipliers, projected
 from scvi_codegen.runs.stepping.saving import read_checkpoint
 from scvi_codegen.runs.stepping.state_functions import neither_or_both
@@ -129,6 +130,8 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         tables: Mapping[str, ArrayLike] | None = None,
         threads: int | None = None,
         action: bool = False,
+        seed: int | None = None,
+        metropolis: bool = False,
     ) -> Trajectory:
         """Integrate ``steps`` steps of h, or to t_end, and save every ``save_every``-th state and the initial one.
 
@@ -184,6 +187,9 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             action: sum the action along the run, for :meth:`Trajectory.action`, which otherwise computes the steps
                 again. Runs with events that change the state ignore this; arrays of run-time sizes are compiled with
                 the sizes of the call.
+            seed: of a system with a heat bath, key of the noise, a whole number, by default 0. Noise is a function of
+                the seed, the trajectory, the number of the step and the coordinate.
+            metropolis: accept or reject each step, so that averages have no error of the step size.
 
         Returns:
             A :class:`Trajectory` of steps // save_every + 1 states, fewer if an event ended it; with inputs states
@@ -236,7 +242,8 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             times = None if t_eval is None else stepper._output_times(t_eval, t, plan, count)
             output = Output(save_every, times, observe, progress)
         initial = tuple.__new__(InitialData, (q, p, velocity, t, parameters, options))  # without a call of Python
-        return stepper._integrated(initial, plan, count, output, segments, check_growth)
+        noise = Noise.checked(stepper, seed, metropolis)
+        return stepper._integrated(initial, plan, count, output, segments, check_growth, noise)
 
     def _integrated(
         self,
@@ -246,6 +253,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         output: Output,
         segments: InputSegments | None,
         check_growth: bool | None,
+        noise: Noise,
     ) -> Trajectory:
         """Return a run of validated steps, ``None`` to the target time, with its warnings; ``segments``: of inputs."""
         if initial.p is None or initial.velocity is not None or self.interface.constraints:
@@ -257,6 +265,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         except IndexError:  # all are in use
             run = Run._reusable(self)
         run._set_up(plan, initial)
+        run._noise = noise
         if segments is None:
             trajectory = run._integrated(initial, growth, steps, output)
         else:
@@ -320,6 +329,8 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         options: SolverOptions | None = None,
         tables: Mapping[str, ArrayLike] | None = None,
         threads: int | None = None,
+        seed: int | None = None,
+        metropolis: bool = False,
     ) -> Run:
         """Return a run from (q, p), or q and a velocity, at t, with fixed steps h or adaptive steps to t_end.
 
@@ -328,12 +339,12 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         self._check_not_of_run(tables, threads)
         initial = InitialData(*self._states.start(q, p, velocity), t, parameters, options)
         control = ErrorControl(tolerance, absolute_tolerance, max_step, first_step)
-        return self._started(initial, self._plan(h, t_end, control))
+        return self._started(initial, self._plan(h, t_end, control), Noise.checked(self, seed, metropolis))
 
-    def _started(self, initial: InitialData, plan: StepPlan) -> Run:
+    def _started(self, initial: InitialData, plan: StepPlan, noise: Noise = DEFAULT_NOISE) -> Run:
         """Return a run at its start, on the constraints."""
         (q, p), (*_, t, parameters, options) = self._consistent_state(initial), initial
-        return Run.started(self, q, p, plan=plan, t=t, parameters=parameters, options=options)
+        return Run.started(self, q, p, plan=plan, t=t, parameters=parameters, options=options, noise=noise)
 
     def _consistent_state(self, initial: InitialData) -> tuple[States, States]:
         """Return (q, p), or q and the momenta of a velocity, on the constraints."""
@@ -370,6 +381,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         return lru_cache(maxsize=64, typed=True)(partial(planned_steps, self._kind_of_steps))
 
     def _output_times(self, t_eval: ArrayLike, t: float, plan: StepPlan, steps: int | None) -> Array:
+        require(self, "t_eval")
         if self.interface.words > 1:
             check_doubles(t_eval=t_eval)
         if steps is None:
@@ -446,6 +458,8 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         device: str | None = None,
         action: bool = False,
         observe: str | None = None,
+        seed: int | None = None,
+        metropolis: bool = False,
     ) -> EnsembleTrajectory:
         """Run k trajectories on all cores, with common fixed steps (SIMD lanes) or with adaptive steps for each.
 
@@ -473,6 +487,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             observe: what to record of the states after all fixed steps, saved or not, in ``observed`` of the result:
                 ``"extremes"`` of q and p, of the ``"energy"``, or numbers of ``"events"`` of the stepper
                 (:meth:`with_events`), changes of sign between successive states. Requires SIMD lanes, no inputs.
+            seed, metropolis: as of :meth:`integrate`; trajectory k has stream k of the noise.
 
         Returns:
             An :class:`EnsembleTrajectory`, with ``device`` a
@@ -501,6 +516,8 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             error=error,
             device=device,
             observe=observe,
+            seed=seed,
+            metropolis=metropolis,
         )
         runs = runs_of(self._ensemble(q, p, settings, velocity=velocity, action=action))
         runs.run(progress=progress, threads=threads)

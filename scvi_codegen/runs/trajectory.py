@@ -46,6 +46,7 @@ from scvi_codegen.runs.states.rotation_quantities import named_quantities
 from scvi_codegen.runs.states.validation import columns_of_inputs
 from scvi_codegen.runs.states.words import TwoWords, Words, check_keeps_words, low_words, scalar
 from scvi_codegen.runs.stepping.features import refusal, require
+from scvi_codegen.runs.stepping.noise import NO_BATH, BathReport
 from scvi_codegen.runs.stepping.projection import constraint_values, multipliers
 from scvi_codegen.runs.stepping.step_plan import FixedSteps
 from scvi_codegen.systems.event import Crossings, Event, EventLike, Kink, Switches, as_events
@@ -91,6 +92,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         actions: (n,) action up to each state if the run summed it (``action=True``), else ``None``; see :meth:`action`.
         pieces: with inputs, the trajectories between their breakpoints, each with its parameters; the first state of
             each is the last of the previous one. ``parameters`` are then those of the first.
+        bath: seed of the noise, heat and acceptance up to the end in a heat bath, else ``None``.
 
     Positions and momenta of arrays are also indexed by name: ``q["u"]`` has the axes n and those of u.
     """
@@ -106,12 +108,14 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
     conserved: Array | None = field(default=None, repr=False)
     actions: Array | None = field(default=None, repr=False)
     pieces: tuple[Self, ...] = field(default=(), repr=False)
+    bath: BathReport | None = None
     _has_dense_output: ClassVar[bool] = True
 
     def __repr__(self) -> str:
         if self.pieces:
             return describe_states(self, f", breakpoints between: {len(self.pieces) - 1}")
-        return describe_states(self, describe_step_size(self.h, self.plan, tau=self.tau is not None))
+        seed = "" if self.bath is None else f", seed {self.bath.seed}"
+        return describe_states(self, describe_step_size(self.h, self.plan, tau=self.tau is not None) + seed)
 
     @overload
     def __getitem__(self, rows: slice) -> Self: ...
@@ -279,6 +283,17 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         sums = accumulated([actions_until(piece, piece.actions) for piece in self._runs])
         assert sums is not None  # since each piece has one
         return sums if cumulative else float(sums[-1])
+
+    def heat(self) -> float:
+        """Return the sum of the changes of the kinetic energy by the heat bath."""
+        if self.bath is None:
+            raise StateError(f"heat() {NO_BATH} '{self.stepper.interface.system}'")
+        return self.bath.heat
+
+    @property
+    def acceptance(self) -> float:
+        """Part of the steps that were accepted with ``metropolis=True``; 1 for other runs."""
+        return 1.0 if self.bath is None else self.bath.acceptance
 
     def shadow_energy(self, order: int = 12) -> Array:
         """Return (n,) energies of the shadow Hamiltonian, of which the states are an exact solution.

@@ -48,6 +48,7 @@ UNSUPPORTED = {
     "constraints": "half of the variables are momenta of the others, so that a constraint acts on momenta",
     "forces": "half of the variables are auxiliary, without momenta on which a force acts; a gradient belongs into H",
     "damping": "half of the variables are auxiliary, without momenta that decrease",
+    "bath": "half of the variables are auxiliary, without momenta on which noise acts",
 }
 """Arguments that a first-order system does not support, with the reason."""
 

@@ -76,6 +76,10 @@ class LagrangianSystem(MechanicalSystem):
         from scvi_codegen.systems.checks.definition import checked_gauge
 
         object.__setattr__(self, "gauge", checked_gauge(self))
+        if self.bath:
+            from scvi_codegen.systems.bath import check_bath
+
+            check_bath(self)
 
     auxiliaries = ()
 
@@ -118,6 +122,8 @@ class LagrangianSystem(MechanicalSystem):
         point_forces: Sequence[Mapping[str, Any]] = (),
         dissipation: str | None = None,
         damping: str | float | None = None,
+        temperature: str | float | None = None,
+        noise: Mapping[str, Any] | None = None,
         constraints: Sequence[str] = (),
         inputs: Sequence[str] = (),
         tables: Sequence[str] | Mapping[str, Any] = (),
@@ -152,6 +158,9 @@ class LagrangianSystem(MechanicalSystem):
             dissipation: Rayleigh's function D(q, q_dot, t), whose forces -dD/dq_dot are added to them.
             damping: damping rate of all momenta, a number or a formula of parameters
                 (:mod:`scvi_codegen.systems.forces`).
+            temperature: kT of a heat bath, a formula of parameters, inputs and t, of which damping and dissipation then
+                are the friction: noise keeps the system at this temperature (:mod:`scvi_codegen.systems.bath`).
+            noise: strength sigma by coordinate, a formula of coordinates and t, of further noise dp = sigma dW.
             constraints: formulas in coordinates and time that are 0, or equations ``"x**2 + y**2 = l**2"``;
                 formulas linear in velocities are nonholonomic (:mod:`scvi_codegen.systems.forces`).
             inputs: names of functions of time whose values are passed to each run
@@ -198,6 +207,8 @@ class LagrangianSystem(MechanicalSystem):
         point_forces: Sequence[Mapping[str, Any]] = (),
         dissipation: Expr | None = None,
         damping: Expr | float | None = None,
+        temperature: Expr | float | None = None,
+        noise: Mapping[Any, Any] | None = None,
         constraints: Sequence[Expr] = (),
         inputs: Sequence[Any] = (),
         tables: Sequence[str] | Mapping[str, Any] = (),
@@ -221,7 +232,7 @@ class LagrangianSystem(MechanicalSystem):
             time: the symbol for time; by default the argument of the coordinates, or the symbol called ``t``.
             parameters: default value by symbol, by name, or by a function of time that is constant.
             forces: expression by coordinate, which is a symbol, a function of time or a name.
-            dissipation, damping: as of :meth:`from_text`, expressions.
+            dissipation, damping, temperature, noise: as of :meth:`from_text`, expressions.
             constraints: expressions in coordinates, time and, linearly, velocities that are 0, or equations ``Eq``.
             inputs: functions of time, symbols or names whose values are passed to each run.
 

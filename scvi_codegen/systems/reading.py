@@ -9,6 +9,7 @@ from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.systems.arrays.elements import unrolled_fields
 from scvi_codegen.systems.arrays.reading import arrays_from_sympy, arrays_from_text, definition_of
 from scvi_codegen.systems.arrays.system import ArraySystem
+from scvi_codegen.systems.bath import bath_of, friction_without_bath
 from scvi_codegen.systems.checks.definition import warn_of_mistakes
 from scvi_codegen.systems.constraints import constraint_sides, constraints_of, rate_of_positions
 from scvi_codegen.systems.contact import contacts_of, names_in
@@ -50,9 +51,11 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
     turning = [arguments.get(key) for key in TURNING]
     declared = (parameters, arguments["tables"], *turning)
     if are_arrays(ordinary, *(declarations or () for declarations in declared)) or arguments.get("neighbours"):
+        if arguments.get("noise") is not None:
+            raise SystemDefinitionError("noise= of arrays is not supported: write their entries as coordinates")
         if arguments.get("point_forces"):
             raise SystemDefinitionError("point_forces of arrays are not supported: give torques and forces by index")
-        return _of_arrays(cls, arrays_from_text(arguments), arguments.get("contacts", ())), True
+        return _of_arrays(cls, arrays_from_text(arguments, bath_of), arguments.get("contacts", ())), True
     names = RotationNames.declared(*turning, momentum=of_momenta)
     coordinates, momenta = (*ordinary, *names.coordinates), arguments.get("momenta", ())
     momenta = default_momenta(ordinary) if momenta is None else tuple(momenta)
@@ -69,13 +72,13 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
     def read(text: str) -> Expr:
         return names.read(text, symbols).xreplace(driven)
 
-    damping = arguments["damping"]
+    numbers = {key: str(arguments[key]) for key in ("damping", "temperature") if arguments.get(key) is not None}
     return _system(
         cls,
         names,
         "hamiltonian" if of_momenta else "lagrangian",
         lambda _: read,
-        {**arguments, "damping": None if damping is None else str(damping)},
+        {**arguments, **numbers},
         name=arguments["name"],
         coordinates=ordinary,
         momenta=momenta,
@@ -115,9 +118,9 @@ def _system(
     read, members, time = reader("forces"), names.members, symbol(TIME)
     at_points = forces_at_points(formulas.get("point_forces") or (), coordinates, members, read)
     applied, torques, torques_space = (formulas.get(key) for key in ("forces", *TORQUES))
-    forces = names.forces_by_name(
-        coordinates, read, applied, torques, torques_space, formulas.get("dissipation"), at_points
-    )
+    bath = bath_of(formulas, read, names.in_coordinates, (*coordinates, *names.coordinates))
+    damping, dissipation = friction_without_bath(formulas)
+    forces = names.forces_by_name(coordinates, read, applied, torques, torques_space, dissipation, at_points)
     variables, parameters = (*coordinates, *names.coordinates), tuple(map(symbol, values))
     q = tuple(map(symbol, variables))
     constraints = constraints_of(
@@ -130,13 +133,15 @@ def _system(
         coordinates=q,
         **({"momenta": tuple(map(symbol, momenta))} if function == "hamiltonian" else {}),
         **names.fields(function, formula, forces, constraints, variables, parameters),
-        damping=damping_rate(formulas.get("damping"), reader("damping")),
+        damping=damping_rate(damping, reader("damping")),
         time=time,
         parameters=parameters,
         defaults=tuple(number(parameter, value) for parameter, value in values.items()),
+        **({"bath": bath} if bath else {}),
         **others,
     )
-    return system, warn_of_mistakes(system, map(symbol, names_in(item.table for item in others.get("contacts", ()))))
+    of_contacts = map(symbol, names_in(item.table for item in others.get("contacts", ())))
+    return system, warn_of_mistakes(system, (*of_contacts, *(bath.symbols if bath else ())))
 
 
 def system_from_sympy(
@@ -153,6 +158,8 @@ def system_from_sympy(
     forces: Mapping[Any, Any] | None = None,
     dissipation: Any = None,
     damping: Any = None,
+    temperature: Any = None,
+    noise: Mapping[Any, Any] | None = None,
     constraints: Sequence[Any] = (),
     inputs: Sequence[Any] = (),
     tables: Sequence[str] | Mapping[str, Any] = (),
@@ -166,7 +173,7 @@ def system_from_sympy(
     turning["rotations"], of_frames = rotations_of_frames(turning.get("rotations"))
     names = RotationNames.declared(*(turning.get(key) for key in TURNING), momentum=momenta is not None)
     if function == "Lagrangian" and are_arrays(q for q in coordinates if isinstance(q, str)):
-        if any((velocities, forces, dissipation, damping, constraints, inputs, *turning.values())):
+        if any((velocities, forces, dissipation, damping, temperature, noise, constraints, inputs, *turning.values())):
             raise SystemDefinitionError(
                 "from_sympy reads Lagrangian, parameters, tables and neighbours of a system with arrays: give the rest "
                 "as text to from_text"
@@ -183,6 +190,8 @@ def system_from_sympy(
     formula = expression_of(formula, function)
     rate = damping_rate(damping, lambda value: sympy_expression(value, "damping"))
     acting = _forces_of(expression_of, forces, dissipation, turning)
+    acting["temperature"] = None if temperature is None else expression_of(temperature, "temperature")
+    acting["noise"] = {key: expression_of(sigma, f"noise on {key}") for key, sigma in (noise or {}).items()}
     sides = [side for condition in constraints or () for side in constraint_sides(condition)[0]]
     input_names = tuple(map(name_of_key, inputs))
     constants = with_inputs(_named_parameters(parameters), input_names)
@@ -200,8 +209,12 @@ def system_from_sympy(
     ordinary = [q.name for q in translation.coordinates]
     if names.members:
         check_names(ordinary, tuple(constants), (), (*names.coordinates, *names.symbols))
-    by_name = {name_of_key(translation.rules.get(q, q)): force for q, force in acting["forces"].items()}
+    by_name, noise_by_name = (
+        {name_of_key(translation.rules.get(q, q)): value for q, value in acting[kind].items()}
+        for kind in ("forces", "noise")
+    )
     formulas = {**acting, function.lower(): formula, "forces": by_name, "constraints": constraints, "damping": rate}
+    formulas["noise"] = noise_by_name or None
     return _system(
         cls,
         names,

@@ -131,6 +131,8 @@ def are_arrays(*declarations: Any) -> bool:
     return any("[" in str(declaration) for group in declarations for declaration in group)
 
 
+BATH_ENERGY = "a heat bath exchanges it"
+"""Reason why the energy is not conserved; followed by those of further changes."""
 MAX_OPERATIONS = 200
 """Maximum number of operations of a formula shown in a notebook."""
 
@@ -191,6 +193,7 @@ class MechanicalSystem(Deferred, ABC):
         definition: the text with arrays or rotations that the system was read from, for model files; else empty.
         rotations: rotations, directions and spins, whose coordinates follow the ordinary ones
             (:mod:`scvi_codegen.systems.formulas.rotations`).
+        bath: heat bath of a Lagrangian, with its friction (:mod:`scvi_codegen.systems.bath`).
     """
 
     name: str
@@ -212,6 +215,7 @@ class MechanicalSystem(Deferred, ABC):
     definition: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
     rotations: tuple[Homogeneous, ...] = ()
     lengths: tuple[tuple[str, ...], ...] = ()
+    bath: Any = None
 
     @property
     @abstractmethod
@@ -455,6 +459,8 @@ class MechanicalSystem(Deferred, ABC):
                 yield f"force on {name}", plain(", ".join(map(self.text_of, components)))
         if self.damping != 0:
             yield "damping", plain(self.text_of(self.damping))
+        if self.bath:
+            yield "temperature", plain(self.text_of(self.bath.temperature))
         for g in self.constraint_texts:
             yield "constraint", plain(f"{g} = 0")
 

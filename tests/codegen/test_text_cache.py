@@ -98,6 +98,8 @@ ARGUMENTS = {
     "neighbours": [{"near": {"of": "q", "cutoff": 1.0}}],
     "contacts": [[{"gap": "q"}]],
     "functions": [{"F": sc.Table([0, 1], [0, 1])}],
+    "temperature": ["a", "b"],
+    "noise": [{"q": "a"}, {"r": "a"}],
 }
 TEXT = {
     "name": "pair",
@@ -118,6 +120,8 @@ TEXT = {
     "neighbours": None,
     "contacts": (),
     "functions": None,
+    "temperature": None,
+    "noise": None,
 }
 
 

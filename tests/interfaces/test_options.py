@@ -29,6 +29,8 @@ RUNS = {
     "max_iterations": 30,
     "threads": 2,
     "action": True,
+    "seed": 7,
+    "metropolis": True,
     "q": [0.5],
     "p": [0.25],
     "velocity": [0.125],

@@ -83,6 +83,7 @@ def array_with_constraint(method):
 
 LOBATTO = {"method": sc.SVI(1, "gauss-lobatto:2"), "coordinates": ["q", "r"], "lagrangian": "(q_dot**2 + r_dot**2)/2"}
 SITUATIONS = {
+    "in a heat bath": lambda: stepper_of(damping=0.1, temperature=1.0),
     "with a time transformation": lambda: stepper_of(g="1/(1 + q**2)"),
     "in transformed time": lambda: stepper_of(tau="1/(1 + q**2)"),
     "in transformed time of a first-order system": lambda: stepper_of(tau="1/(1 + q**2)", **FIRST_ORDER),

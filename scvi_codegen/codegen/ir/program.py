@@ -7,6 +7,7 @@ around the kernels (gather, scatter, Newton's method, fixed-point iterations, th
 the same for every method and system, and is in the templates.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from scvi_codegen.codegen.ir.equations import (
@@ -174,11 +175,33 @@ class Quantities:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class HeatBath:
+    """Heat bath between steps.
+
+    Attributes:
+        temperature: kT as text.
+        kernel: kT, m momenta at rest, entries of masses, friction and normals, and strengths of noise.
+        constant: whether they are functions of parameters alone.
+        blocks: coordinates that are coupled.
+        sizes: numbers of the terms by their names in C.
+        entries: block, row and column of the entries, by names.
+    """
+
+    temperature: str
+    kernel: Kernel
+    constant: bool
+    blocks: tuple[tuple[int, ...], ...]
+    sizes: Mapping[str, int]
+    entries: Mapping[str, tuple[tuple[int, int, int], ...]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RolledTerms:
     """Terms of a system of arrays, each in its loops.
 
     Attributes:
         forces, masses: of the equations of motion.
+        frictions, heats: of a heat bath, coefficients R of velocities and kT m.
         constants: terms of L, or of -H, without coordinates and momenta, which the energy needs.
         constrained: constrained steps, instead of an iteration or a splitting.
         products, diagonals: the Jacobian of the forces times a direction, and its diagonal, if Newton's method replaces
@@ -195,6 +218,8 @@ class RolledTerms:
 
     forces: tuple[RolledKernel, ...] = ()
     masses: tuple[RolledKernel, ...] = ()
+    frictions: tuple[RolledKernel, ...] = ()
+    heats: tuple[RolledKernel, ...] = ()
     constants: tuple[RolledKernel, ...] = ()
     constrained: ConstrainedSteps | None = None
     products: tuple[RolledKernel, ...] = ()
@@ -233,6 +258,7 @@ class Program:
         damping: the rate of a uniform damping, if there is one.
         summed: whether the action is summed also where it is no function of both ends of a step.
         acts_along: whether runs sum the action of their steps.
+        bath: heat bath before and after each step of a run, or ``None``.
     """
 
     prefix: str
@@ -251,6 +277,7 @@ class Program:
     damping: Kernel | None = None
     summed: bool = False
     acts_along: bool = False
+    bath: HeatBath | None = None
 
     @property
     def dimension(self) -> int:
@@ -270,6 +297,11 @@ class Program:
         if self.fixed_point:
             return self.fixed_point.error_power
         return self.equations.stage_curve.power if self.equations.stage_curve else 0
+
+    @property
+    def has_bath(self) -> bool:
+        """Whether steps are those in a heat bath."""
+        return bool(self.bath or (isinstance(self, ArrayProgram) and self.loops.heats))
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
@@ -292,6 +324,7 @@ class Program:
                 constraints and constraints.reactions,
                 constraints and constraints.coefficients,
                 self.damping,
+                self.bath and self.bath.kernel,
                 *(rattle.kernels if rattle else ()),
             ),
         )

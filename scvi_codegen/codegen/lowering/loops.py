@@ -35,7 +35,13 @@ def rolled_terms(system: ArraySystem, constrained: ConstrainedSteps | None, *, n
     masses = [
         (f"mass of {access}", mass, number) for number, mass in enumerate(system.masses) for access, _ in mass.targets
     ]
+    frictions, heats = (
+        tuple(_added(system, f"{name}_{number}", term, (), "", f"{name}.") for number, term in enumerate(terms))
+        for name, terms in zip(("friction", "heat"), system.bath_terms, strict=True)
+    )
     return RolledTerms(
+        frictions=frictions,
+        heats=heats,
         forces=(
             *(_potential(system, *part, number) for number, part in enumerate(potentials)),
             *(

@@ -246,7 +246,7 @@ def lower_arrays(
         splitting=splitting,
         increments=sums,
         loops=loops,
-        polynomial_curves=bool(fixed_point and (fixed_point.points > 1 or not velocities)),
+        polynomial_curves=bool(fixed_point and (fixed_point.points > 1 or not velocities) and not system.bath),
     )
 
 

@@ -539,8 +539,8 @@ def render_ensemble(
 ) -> Source | None:
     """Return source that integrates many trajectories at once, one per lane, by fixed-point iteration or explicitly.
 
-    ``None`` for other steps, for rigid bodies turned in closed form, and with integrals: with a time transformation,
-    trajectories have no common times.
+    ``None`` for other steps, for rigid bodies turned in closed form, in a heat bath, and with integrals: with a time
+    transformation, trajectories have no common times.
 
     Args:
         program: the program.
@@ -549,7 +549,7 @@ def render_ensemble(
         tangents: number of tangent vectors among the coordinates.
     """
     fixed_point, split, headers = program.fixed_point, program.splitting, dict[str, str]()
-    if program.quantities.integrals:
+    if program.quantities.integrals or program.bath:
         return None
     if split is not None and not split.bodies:
         kernels, points, source = split.kernels, 1, splitting_source(split, observed)

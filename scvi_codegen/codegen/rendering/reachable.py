@@ -241,7 +241,8 @@ def _without_unused_numbers(parts: Sequence[Part]) -> list[Part]:
 def _ordered(parts: Sequence[Part]) -> list[Part]:
     """Return parts with the step and what it needs first; in their order if a name has several declarations."""
     by_name = {name: part for part in parts for name in part.names}
-    if sum(len(part.names) for part in parts) > len(by_name):
+    declared = [name for part in parts for leaf in part.leaves if leaf.lines[0][0] != "#" for name in leaf.names]
+    if sum(len(part.names) for part in parts) > len(by_name) or len(declared) > len({*declared}):
         return [*parts]
     order: dict[Part, None] = {}
 

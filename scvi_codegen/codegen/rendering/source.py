@@ -391,6 +391,7 @@ class Interface:
         modes: parameter, switching function, "jumps" or "", masks of contacts, and sides of powers of located kinks
             (:mod:`scvi_codegen.systems.kinks`).
         contacts: places of each contact (:mod:`scvi_codegen.systems.contacts.modes`).
+        temperature: formula of kT of a heat bath, ``None`` without one.
     """
 
     prefix: str
@@ -433,6 +434,7 @@ class Interface:
     kinks: tuple[str, ...] = ()
     modes: tuple[tuple[str, ...], ...] = ()
     contacts: tuple[ContactRows, ...] = ()
+    temperature: str | None = None
 
     @property
     def mode_names(self) -> tuple[str, ...]:

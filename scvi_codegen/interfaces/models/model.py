@@ -402,6 +402,8 @@ class Model(TimeSpan):
             **control | {"h": abs(h) if h is not None and to_end else h} | ({} if h is None else {"tolerance": None}),
             t_end=self.t + self.covered if to_end else None,
             parameters=self.parameters_at_start(stepper),
+            seed=self.seed,
+            metropolis=self.metropolis,
             **common,
         )
 

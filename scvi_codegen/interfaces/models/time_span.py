@@ -124,11 +124,9 @@ class TimeSpan(RunOptions):
 
     def _run_section(self) -> dict[str, Any]:
         section = {option.key: getattr(self, option.field) for option in options_of("run")}
-        if not self.action:  # the default
-            del section["action"]
         if self.time_transformation is not None and self.controller is None:
             section["controller"] = default_controller(in_tau=True)
-        return {key: value for key, value in section.items() if value is not None}
+        return {key: value for key, value in section.items() if value is not None and value is not False}
 
     @property
     def _control(self) -> dict[str, Any]:

@@ -188,6 +188,8 @@ def _check(model: Model, ranges: Mapping[str, tuple[float, float]]) -> None:
     for input_name, value in model.inputs.items():
         if isinstance(value, tuple):
             raise MethodError(f"a slider sets the input {input_name} of {name}, which is a table: give a number")
+    if model.system.bath:
+        raise MethodError(f"a page has no heat bath, unlike {name}: use runs and films, or a generated program")
     if model.h is None and model.tolerance is None:
         raise MethodError(f"a page requires a step size or tolerance; {name} has neither: give [run] step or tolerance")
     if model.h is None and model.has_time_transformation:

@@ -131,6 +131,7 @@ class TrajectoryDerivatives(SavedStates):
         Raises:
             StateError: if the directions have another shape, or the states are not at whole steps.
         """
+        require(self.stepper, "tangent")
         size = 2 * self.stepper.dimension
         columns = np.eye(size) if directions is None else finite(directions, "directions")
         tangents, parts = self._initial_tangents(columns), list[Array]()
@@ -162,6 +163,7 @@ class TrajectoryDerivatives(SavedStates):
         Raises:
             StateError: if the shape is another, or the states are not at whole steps.
         """
+        require(self.stepper, "pullback")
         derivatives = checked_cotangents(self.stepper, len(self), cotangents)
         seeds = seeds_of(self.stepper, derivatives)
         now, by_runs = np.zeros_like(seeds[0]), list[Array]()

@@ -20,6 +20,7 @@ from scvi_codegen.runs.states.validation import Array, Parameters, States
 from scvi_codegen.runs.states.words import scalar
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.memory import FIRST_STEPS, Memory, alone
+from scvi_codegen.runs.stepping.noise import BathReport, report_of
 from scvi_codegen.runs.stepping.projection import constraint_values, multipliers
 from scvi_codegen.runs.stepping.step_plan import Fixed, StepPlan, Until
 from scvi_codegen.runs.trajectory import Trajectory
@@ -103,7 +104,7 @@ class Run(Memory, AttitudeHistory):
         plan, h, save_every, short = self._plan, self._h, output.save_every, self._rows
         most = FIRST_STEPS if save_every == 1 else self._first_steps(save_every)
         fits = steps is None if h is None else steps is not None and steps <= most
-        special = short is None or self._has_tau or self._unset_inputs or self.stepper.searched
+        special = self._takes_noise or short is None or self._has_tau or self._unset_inputs or self.stepper.searched
         is_plain = output is ALL_STATES or output.has_states_alone
         if special or not (fits and is_plain and (isinstance(plan, Fixed) or initial.t != plan.t_end)):
             self._start_from(initial, growth)
@@ -130,6 +131,11 @@ class Run(Memory, AttitudeHistory):
         if velocity is not None:
             p = self.stepper.initial_momentum(q, velocity, t, self._parameters)
         self._begin(q, cast(States, p), t, growth)
+
+    @property
+    def bath(self) -> BathReport | None:
+        """Seed of the noise, heat and acceptance of a run in a heat bath; else ``None``."""
+        return report_of(self._memory)
 
     @property
     def velocity(self) -> Array:

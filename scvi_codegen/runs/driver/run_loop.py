@@ -20,6 +20,7 @@ from scvi_codegen.runs.states.validation import BINARY64, FEW, NUMBERS, SEQUENCE
 from scvi_codegen.runs.states.words import block_of, from_block
 from scvi_codegen.runs.stepping.chunks import drive
 from scvi_codegen.runs.stepping.memory import FIRST_STEPS, Memory
+from scvi_codegen.runs.stepping.noise import report_of
 from scvi_codegen.runs.stepping.step_plan import Adaptive, FixedSteps, InTau, ending_at
 from scvi_codegen.runs.trajectory import Trajectory
 from scvi_codegen.systems.event import Crossings
@@ -354,6 +355,7 @@ def plain_trajectory(
         trajectory.step_error = trajectory.worst_step_time = math.nan
     trajectory.parameters = memory._parameters.copy()
     trajectory.events = trajectory.transitions = trajectory.pieces = ()
+    trajectory.bath = report_of(memory._memory) if memory._takes_noise else None
     trajectory.modes = trajectory.tau = trajectory.confirmation = trajectory.observed = trajectory.conserved = None
     return trajectory
 

@@ -135,6 +135,8 @@ class Batch:
         if isinstance(t0, Word):
             struct.t_low = t0.low
         struct.pauses = bool(self.ensemble.inputs)
+        if self.ensemble.stepper.interface.temperature is not None:
+            self.ensemble.noise.store(struct)
         self.take = binding.each(struct)
 
     def completed(self) -> float:

@@ -38,6 +38,7 @@ from scvi_codegen.runs.states.validation import (
 from scvi_codegen.runs.states.words import check_doubles, hashed, stacked
 from scvi_codegen.runs.stepping.features import check_together, require
 from scvi_codegen.runs.stepping.integrator import Integrator
+from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise, check_temperature
 from scvi_codegen.runs.stepping.projection import make_consistent
 from scvi_codegen.runs.stepping.state_functions import neither_or_both
 from scvi_codegen.runs.stepping.step_plan import Adaptive, ErrorControl, KindOfSteps, check_max_step, planned_steps
@@ -118,6 +119,9 @@ class EnsembleSettings:
     error: float | None = None
     device: str | None = None
     observe: str | None = None
+    seed: int | None = None
+    metropolis: bool = False
+    trajectory: int = 0
 
     @property
     def control(self) -> ErrorControl:
@@ -179,6 +183,7 @@ class Ensemble:
         ends: (k,) final times of adaptive steps.
         save_every: steps between saved states.
         t_eval: output times of adaptive steps, ``None`` to save the ends of steps.
+        noise: stream of the first trajectory; those of the others follow.
     """
 
     stepper: Any
@@ -193,6 +198,7 @@ class Ensemble:
     ends: Array = field(default_factory=lambda: np.empty(0))
     save_every: int = 1
     t_eval: Array | None = None
+    noise: Noise = DEFAULT_NOISE
 
     @classmethod
     def of(
@@ -223,7 +229,10 @@ class Ensemble:
             plan: dict[str, Any] = {"steps": steps, "t_end": t_end, "inputs": inputs, "save_every": save_every}
             fixed = CommonSteps(t0, settings.h, **plan, words=layout.words)
         positions, momenta, values = start_of_ensemble(stepper, q, momenta, t0, parameters)
-        start = {"t0": t0, "q": positions, "p": momenta, "parameters": values}
+        noise = Noise.checked(stepper, settings.seed, settings.metropolis, settings.trajectory)
+        start: dict[str, Any] = {"t0": t0, "q": positions, "p": momenta, "parameters": values, "noise": noise}
+        for member in np.unique(values, axis=0) if stepper.interface.temperature is not None else ():
+            check_temperature(stepper, t0, member)
         ensemble = cls(stepper=stepper, settings=settings, **start, inputs=inputs, fixed=fixed, save_every=save_every)
         if not stepper._has_energy(parameters):
             for member, at, momentum in zip(values, positions, momenta, strict=True):
@@ -269,4 +278,5 @@ class Ensemble:
         settings = replace(
             self.settings, parameters=self.parameters[part], inputs=inputs_of_slice(self.inputs, part) or None
         )
+        settings = replace(settings, trajectory=self.noise.trajectory + part.start)
         return settings if self.fixed is not None else replace(settings, t_end=self.ends[part])

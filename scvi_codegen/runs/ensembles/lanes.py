@@ -319,6 +319,7 @@ def _started(common: CommonRuns, departure: Departure) -> Memory | None:
     segment, time = common.steps.at(step)
     parameters = ensemble.values_at(segment.middle, slice(j, j + 1))[0]
     arguments: dict[str, Any] = {"t": ensemble.t0, "parameters": parameters, "options": ensemble.settings.options}
+    arguments["noise"] = ensemble.noise._replace(trajectory=ensemble.noise.trajectory + j)
     try:
         run = Memory.started(ensemble.stepper, q, p, plan=Fixed(segment.h), **arguments)
     except StateError:  # a sum of finite terms has overflowed

@@ -25,6 +25,7 @@ from scvi_codegen.runs.results.output import Output
 from scvi_codegen.runs.results.saved_states import ROUNDINGS, SavedStates, parameters_on_sides
 from scvi_codegen.runs.results.time_transformation import part_of_step, states_in_transformed_time
 from scvi_codegen.runs.states.words import Words, fraction_of, low_words, split, with_low
+from scvi_codegen.runs.stepping.features import require
 from scvi_codegen.runs.stepping.memory import Memory
 from scvi_codegen.runs.stepping.step_plan import Fixed, FixedSteps, StepPlan, ending_at
 
@@ -39,6 +40,7 @@ def states_at(states: SavedStates, times: Array) -> tuple[Array, Array]:
 
 def states_and_steps_at(states: SavedStates, times: Array) -> tuple[Array, Array, Array]:
     """Return the states of :func:`states_at` and (n,) values of the independent variable of the steps, tau or t."""
+    require(states.stepper, "dense_output")
     times = within(times, states.t[0], states.t[-1])
     if states.tau is not None:
         _check_on_grid(states)

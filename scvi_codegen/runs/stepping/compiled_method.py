@@ -132,6 +132,8 @@ class CompiledMethod:
 
     def _load(self) -> None:
         interface, events = self.interface if self.origin is None else self.origin.interface, self.searched
+        if events and interface.temperature is not None:
+            require(self, "events")
         if interface.words > 1:
             events = ()  # located by the integrator in double
         if events:

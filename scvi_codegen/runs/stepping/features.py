@@ -60,6 +60,7 @@ PROPERTIES: dict[str, Callable[[Any], bool]] = {
     "in transformed time": lambda stepper: stepper.in_tau,
     "in transformed time of a first-order system": lambda stepper: bool(stepper.in_tau and stepper.interface.variables),
     "for a first-order system": lambda stepper: bool(stepper.interface.variables),
+    "in a heat bath": lambda stepper: stepper.interface.temperature is not None,
     "with events that change the state": lambda stepper: stepper.changes_states,
     "with constraints": lambda stepper: bool(
         len(stepper.interface.constraints) > stepper.interface.masked or stepper.interface.layout.constraints
@@ -105,10 +106,16 @@ _IN_DOUBLE = (
     "check_growth device observe_ensemble work discrete_lagrangian "
     f"chaos_ensemble periodic_orbit energy fit flow {_ACTIONS}"
 )
+_RUNS = "chaos chaos_ensemble periodic_orbit fit flow work check_growth"
 _ORIGINAL = "compile the original system, with fixed steps h, or with time_transformation=... or t_end=..."
 FEATURES = {
     (operation, property_): remedy
     for property_, operations, remedy in (
+        (
+            "in a heat bath",
+            f"adaptive error t_eval dense_output events advice tangent pullback sensitivity hessian {_RUNS} {_ACTIONS}",
+            "give h and steps, and use saved states and averages of them; steps alone have derivatives",
+        ),
         (
             "with a time transformation",
             "ensembles device observe_ensemble chaos_ensemble periodic_orbit fit flow",

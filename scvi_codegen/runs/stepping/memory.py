@@ -31,6 +31,7 @@ from scvi_codegen.runs.states.words import Word, Words, stacked, with_low, word
 from scvi_codegen.runs.stepping.chunks import drive
 from scvi_codegen.runs.stepping.features import require
 from scvi_codegen.runs.stepping.integrator import Integrator
+from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise, check_temperature
 from scvi_codegen.runs.stepping.projection import check_reachable, singular_position
 from scvi_codegen.runs.stepping.saving import checkpoint
 from scvi_codegen.runs.stepping.step_plan import (
@@ -127,6 +128,8 @@ class Memory:
         self._options: SolverOptions | None = None
         self._has_defaults = False  # whether no parameter differs from its default
         self._watch: Any = None  # state of the search for events in C
+        self._noise = DEFAULT_NOISE
+        self._takes_noise = stepper.interface.temperature is not None
         self._rows: Any = None  # memory for the states of short runs
         self._starts_at_origin = False
         self._ends: tuple[float, float] | None = None  # energies at both ends of a short run
@@ -180,8 +183,10 @@ class Memory:
         t: float = 0.0,
         parameters: Parameters = None,
         options: SolverOptions | None = None,
+        noise: Noise = DEFAULT_NOISE,
     ) -> None:
         """Start at (q, p) and t; nothing of an earlier run remains."""
+        self._noise = noise
         initial = InitialData(q, p, None, self.stepper._states.time(t), parameters, options)
         self._set_up(plan, initial)
         self._begin(q, p, initial.t)
@@ -197,6 +202,9 @@ class Memory:
             self._memory.t_low = t.low
         if growth and self._can_measure_growth:
             self._memory.measures_growth = growth
+        if self.stepper.interface.temperature is not None:
+            check_temperature(self.stepper, t, self._parameters)
+            self._noise.store(self._memory)
 
     def _set_up(self, plan: StepPlan, initial: InitialData) -> None:
         """Set what holds for all steps of a run; momenta are required in transformed time only."""
@@ -514,6 +522,7 @@ class Memory:
         drive(self._taken, steps, ended=lambda: self.arrived or stop(), progress=progress)
 
     def _failure(self, status: int) -> StepFailedError:
+        check_temperature(self.stepper, self.t + self._step_size, self._parameters)
         remark = singular_position(self.stepper, self._q, self.t, self._parameters)
         failures = self.stepper.binding.failures
         return step_failure(status, self._report, step=self.steps, h=self._step_size, remark=remark, failures=failures)

@@ -109,9 +109,9 @@ def _formulas(system: ArraySystem, written: EntryRules, constants: Sequence[Symb
         for arrays in (system.coordinates, system.momenta)
     )
     coordinates = (*coordinates, *map(symbol, turning.coordinates))
-    summands, constraints = (
+    summands, constraints, friction = (
         [term.formula.xreplace(rule) for term in terms for _, rule in written.rules(term)]
-        for terms in (system.terms, system.constraints)
+        for terms in (system.terms, system.constraints, system.friction)
     )
     total = {q: Add(*formulas) for q, formulas in written.forces(system.forces).items()}
     forces = _forces_by_name(turning, total)
@@ -119,6 +119,8 @@ def _formulas(system: ArraySystem, written: EntryRules, constants: Sequence[Symb
     fields = turning.fields(system.function.lower(), Add(*summands), forces, constraints, names, constants)
     if system.function == "Hamiltonian":
         fields["momenta"] = (*momenta, *momenta_of(turning.coordinates))
+    if system.bath:
+        fields["bath"] = replace(system.bath, dissipation=turning.in_coordinates(Add(*friction)))
     return {"coordinates": coordinates, **fields}
 
 

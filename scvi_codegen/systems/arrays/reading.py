@@ -1,6 +1,6 @@
 """Systems of arrays read from text or from SymPy expressions."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,7 +32,8 @@ LISTED = ("coordinates", "directions", "spins", "momenta", "constraints", "input
 """Arguments that are lists."""
 DEFINING = (
     *("coordinates", "rotations", "directions", "spins", "momenta", "lagrangian", "hamiltonian", "dissipation"),
-    *("damping", "constraints", "inputs", "tables", "neighbours", "forces", "torques", "torques_space", "point_forces"),
+    *("damping", "temperature", "noise", "constraints", "inputs", "tables", "neighbours"),
+    *("forces", "torques", "torques_space", "point_forces"),
 )
 """Arguments that define a system, in the order of model files."""
 
@@ -51,8 +52,8 @@ def definition_of(arguments: Mapping[str, Any]) -> dict[str, Any]:
     return {key: list(value) if key in LISTED else value for key, value in defining.items()}
 
 
-def arrays_from_text(arguments: Mapping[str, Any]) -> ArraySystem:
-    """Return the system of the arguments of ``from_text`` of a Lagrangian or a Hamiltonian.
+def arrays_from_text(arguments: Mapping[str, Any], bath_of: Callable[..., Any] | None = None) -> ArraySystem:
+    """Return the system of the arguments of ``from_text`` of a Lagrangian or a Hamiltonian, in the bath of ``bath_of``.
 
     >>> print(arrays_from_text({
     ...     "name": "chain", "coordinates": ["q[N]"], "parameters": {"k": 2},
@@ -84,7 +85,9 @@ def arrays_from_text(arguments: Mapping[str, Any]) -> ArraySystem:
     lengths = {key: names.symbols[key] for key in scalars}
     neighbours = parse_neighbours(arguments.get("neighbours") or {}, coordinates, lengths)
     forces = [*_forces(arguments, coordinates, rotations, names)]
-    if (dissipation := arguments.get("dissipation")) is not None:
+    damping, dissipation = arguments.get("damping"), arguments.get("dissipation")
+    in_bath = bath_of is not None and arguments.get("temperature") is not None
+    if dissipation is not None and not in_bath:
         rates = dict(zip(velocities, coordinates, strict=False))
         for rotation in rotations:
             rates |= zip(rotation.rates, rotation.torques(), strict=False)
@@ -97,6 +100,10 @@ def arrays_from_text(arguments: Mapping[str, Any]) -> ArraySystem:
         for constraint in arguments.get("constraints") or ()
     ]
     kind = ArrayLagrangian if hamiltonian is None else ArrayHamiltonian
+
+    def read(formula: Any) -> Expr:
+        return parse_expression(str(formula), names.symbols).xreplace(of_inputs)
+
     system = kind(
         name=arguments["name"],
         coordinates=coordinates,
@@ -113,7 +120,9 @@ def arrays_from_text(arguments: Mapping[str, Any]) -> ArraySystem:
         functions=functions,
         inputs=tuple(inputs),
         constraints=tuple(constraints),
-        damping=damping_rate(arguments.get("damping"), lambda formula: parse_expression(str(formula), names.symbols)),
+        damping=damping_rate(None if in_bath else damping, read),
+        bath=bath_of({**arguments, "dissipation": None}, read, read, ()) if bath_of and in_bath else None,
+        friction=parse_sums(dissipation, *names, neighbours) if in_bath and dissipation is not None else (),
         rotations=rotations,
         definition=definition_of(arguments),
         data={parse_array(key).name: value for key, value in data.items()},

@@ -27,7 +27,7 @@ def momentum_maps(system: ArraySystem) -> tuple[ArrayMap, ...]:
     moving = {array.name + DOT for array in system.coordinates}
     if any(access.array.name in moving for term in system.constraints for _, access in term.slots):
         return ()  # nonholonomic
-    if system.coupled_terms and system.damping != 0:
+    if system.bath or (system.coupled_terms and system.damping != 0):
         return ()
     return tuple(momentum_map for array in system.coordinates for momentum_map in _maps(system, array))
 

@@ -46,7 +46,7 @@ from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED, Access, Array,
 from scvi_codegen.systems.formulas.neighbours import Neighbours
 from scvi_codegen.systems.formulas.rotations import MemberArray
 from scvi_codegen.systems.formulas.symbols import DOT, check_names, input_formulas, symbol
-from scvi_codegen.systems.system import MechanicalSystem
+from scvi_codegen.systems.system import BATH_ENERGY, MechanicalSystem
 
 Term = TypeVar("Term", ArrayTerm, ArrayForce)
 
@@ -248,6 +248,7 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
         neighbours: lists of the pairs closer than a cutoff.
         terms: of the Lagrangian or the Hamiltonian.
         forces: generalised forces of coordinates, velocities (momenta of a Hamiltonian) and time.
+        friction: terms of the dissipation function of a heat bath.
         constraints: g = 0 at every element of loops (:mod:`scvi_codegen.systems.arrays.system`).
         rotations: rotations, directions and spins, which require known sizes.
         arrays: coordinates, those of rotations, momenta, fields, tables.
@@ -264,6 +265,7 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
     terms: tuple[ArrayTerm, ...]
     neighbours: tuple[Neighbours, ...] = ()
     forces: tuple[ArrayForce, ...] = ()
+    friction: tuple[ArrayTerm, ...] = ()
     constraints: tuple[ArrayTerm, ...] = ()
     rotations: tuple[MemberArray, ...] = ()  # type: ignore[assignment]  # each stands for many
     arrays: tuple[Array, ...] = field(init=False, compare=False, repr=False)
@@ -337,6 +339,7 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
             inputs = "|".join(f"{name}_[0123t]" for name in self.inputs)
             for term in self.constraints:
                 check_constraint(term, self.coordinates, self.fields, inputs)
+            self._check_bath()
             if self.damping != 0 and self.momenta:
                 raise SizesRequiredError("damping of a Hamiltonian requires known sizes: write it as forces")
             moving = (*self.state, *self.velocities)
@@ -350,6 +353,29 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
                     raise SizesRequiredError(f"of the axes of {array} only the last may be a number: name the others")
         except SizesRequiredError as error:
             raise SizesRequiredError(f"{error}. This concerns '{self.name}': {SIZES_REQUIRED}") from error
+
+    def _check_bath(self) -> None:
+        """Raise :class:`SizesRequiredError` for a heat bath that arrays of run-time sizes do not have."""
+        if self.bath is None:
+            return
+        is_plain = all(has_constant_mass(term, self.coordinates, self.time) for term in self.friction)
+        if self.constraints or self.velocities or not is_plain or self.bath.symbols.difference(self.parameters):
+            raise SizesRequiredError(
+                "a heat bath of arrays of run-time sizes has no constraints, no forces of velocities but those of "
+                "c*v**2/2, c constant, and a temperature and a damping that depend on parameters only"
+            )
+
+    @property
+    def bath_terms(self) -> tuple[tuple[ArrayForce, ...], tuple[ArrayForce, ...]]:
+        """Friction coefficients of velocities, and kT times their masses, of a heat bath."""
+        if self.bath is None:
+            return (), ()
+        own = tuple(chain(*(masses_of(term, self._velocities) for term in self.friction)))
+        damped, heated = (
+            tuple(replace(mass, targets=tuple((at, factor * m) for at, m in mass.targets)) for mass in self.masses)
+            for factor in (self.bath.damping, self.bath.temperature)
+        )
+        return (*own, *damped), heated
 
     @property
     def sizes(self) -> tuple[str, ...]:
@@ -408,7 +434,7 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
     @property
     def accesses(self) -> tuple[tuple[Access, tuple[Loop, ...]], ...]:
         """Array accesses, each with its enclosing loops."""
-        slots = [(access, term.loops) for term in self.terms for _, access in term.slots]
+        slots = [(access, term.loops) for term in (*self.terms, *self.friction) for _, access in term.slots]
         slots += [(access, force.loops) for force in self.applied_forces for _, access in force.slots]
         slots += [(access, term.loops) for term in self.constraints for _, access in term.slots]
         return (*slots, *((access, force.loops) for force in self.applied_forces for access, _ in force.targets))
@@ -421,6 +447,8 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
     @property
     def changes_energy(self) -> str | None:
         """Reason why energy is not conserved; ``None`` if it is."""
+        if self.bath:
+            return BATH_ENERGY
         if self.forces:
             return "forces act"
         if self.damping != 0:
@@ -504,7 +532,7 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
     @property
     def balances_energy(self) -> bool:
         """True if the energy changes by the work of forces or damping only."""
-        return (bool(self.forces) or self.damping != 0) and not self.depends_on_time
+        return (bool(self.forces) or self.damping != 0) and not (self.depends_on_time or self.bath)
 
     @property
     def depends_on_time(self) -> bool:
@@ -542,8 +570,10 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
         """Warn of parameters and inputs that occur in no formula and not among ``others``, and of negative masses."""
         terms = [*self.terms, *self.constraints]
         formulas = [term.formula for term in terms] + [f for force in self.forces for _, f in force.targets]
-        formulas.append(self.damping)
-        used = {symbol(access.array.name) for access, _ in self.accesses}.union(
+        formulas += [self.damping, *(term.formula for term in self.friction)]
+        used = (self.bath.symbols if self.bath else set()) | {
+            symbol(access.array.name) for access, _ in self.accesses
+        }.union(
             *(f.free_symbols for f in formulas),
             (symbol(convolution.coefficients.name) for sums in self.sums for convolution in sums),
             others,

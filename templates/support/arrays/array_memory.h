@@ -91,6 +91,9 @@ static long long divide_memory(run_memory *run, double *memory)
     run->compared_factors = next_numbers(memory, &end, numbers_of_factors(run->pattern, n));
 #endif
   run->inverse_mass = next_numbers(memory, &end, n);
+#ifdef HEAT_BATH
+  run->bath = next_numbers(memory, &end, 5 * n);
+#endif
   run->values = next_numbers(memory, &end, parameters_of(&run->data));
   run->phase_state = next_numbers(memory, &end, 2 * n);
 #ifdef CONSTRAINTS_OF_ARRAYS

@@ -113,13 +113,20 @@ static int perform_steps(run_memory *run, const problem *arrays, const work_arra
 }
 #endif
 
+#ifdef HEAT_BATH
+#include "array_bath.h"
+#define PERFORM perform_in_bath
+#else
+#define PERFORM perform_steps
+#endif
+
 static int take_steps(run_memory *run, const job *way, solver_report *report)
 {
   const work_arrays work = bind_work_arrays(run, coordinates_of(way->arrays));
   while (report->steps < way->steps) {
     const long long left = way->steps - report->steps;
     const long long next = way->every ? way->every - run->step % way->every : left;
-    const int status = perform_steps(run, way->arrays, &work, way->options, report, next < left ? next : left);
+    const int status = PERFORM(run, way->arrays, &work, way->options, report, next < left ? next : left);
     if (status != OK)
       return status;
     store_state(run, way, report, work.n, 0);
@@ -140,6 +147,10 @@ static int perform(run_memory *run, job way, const double *parameters, const sol
   status = use_parameters(run, parameters);
   if (status != OK)
     return status;
+#ifdef HEAT_BATH
+  if (!prepare_bath(run))
+    return NOT_FINITE;
+#endif
   way.arrays = &run->data;
   way.options = options || way.control ? options : &standard;
 #ifdef CONSTRAINTS_OF_ARRAYS

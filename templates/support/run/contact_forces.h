@@ -69,8 +69,8 @@ static real friction_limit(const contact_terms *of, int k, int which, const real
   return of->coefficient[3 * k + which] * (CONTACTS[k].normal < 0 ? 1.0 : force[CONTACTS[k].normal]);
 }
 
-/* Unknown forces of modes, of which the imposed rows count: their rows, contacts whose friction they are (-1: none), and
- * forces of the rows by them as columns. Sliding without a gap is not among them: `force`, which is 0 otherwise. */
+/* Unknown forces of modes, of which the imposed rows count: their rows, contacts whose friction they are (-1: none),
+ * and forces of the rows by them as columns. Sliding without a gap is not among them: `force`, which is 0 otherwise. */
 typedef struct {
   int count, row[CONTACT_ROWS], owner[CONTACT_ROWS];
   real column[CONTACT_ROWS][CONTACT_ROWS];

@@ -129,8 +129,8 @@ static int push(const event_step *step, event_sample *at, contact_terms *of, con
   return terms_at(step, at, of);
 }
 
-/* Removes the rates of low rebounds from contacts that touch, with slips that rest: slips that remain have the direction
- * of their friction. */
+/* Removes the rates of low rebounds from contacts that touch, with slips that rest: slips that remain have the
+ * direction of their friction. */
 static int settle(const event_step *step, event_sample *at, contact_terms *of, const contact_change *now)
 {
   contact_mode mode[EVENT_CONTACTS];

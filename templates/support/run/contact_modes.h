@@ -160,8 +160,8 @@ static void relax(const contact_problem *in, real compliance, int sweeps, real *
     }
 }
 
-/* Opens a contact, if other forces give the same rates of the imposed rows but not of all: the first of those that carry
- * no load along such forces. Returns whether there is one. */
+/* Opens a contact, if other forces give the same rates of the imposed rows but not of all: the first of those that
+ * carry no load along such forces. Returns whether there is one. */
 static int unload(contact_problem *in, const contact_mode *mode, const real *force)
 {
   const contact_terms *const of = in->of;
@@ -222,8 +222,8 @@ static int modes_of_forces(contact_problem *in, int trial, const real *force, co
   return changed;
 }
 
-/* Modes that a contact may have, of which the first ones stick; beside the best one only those that static friction does
- * not distinguish from it. Slips in space at rest have no other direction. Returns their number. */
+/* Modes that a contact may have, of which the first ones stick; beside the best one only those that static friction
+ * does not distinguish from it. Slips in space at rest have no other direction. Returns their number. */
 static int list_modes(const contact_problem *in, int k, const contact_mode *best, contact_mode *mode)
 {
   const real *const friction = in->of->coefficient + 3 * k;

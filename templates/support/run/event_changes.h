@@ -98,7 +98,8 @@ static int rate_along(const event_step *step, int e, const event_sample *at, rea
 /* State of the crossings from `first` on. That of an impact is moved back along the flow by g / (dg/dt), at most the
  * resolution of a fraction of the step, so that large steps do not enter walls by many roundings; that of a kink either
  * way, since a force that jumps adds energy in each step that passes it. */
-static int refine_crossing(const event_step *step, long long first, const event_sample *right, event_sample *at, real *part)
+static int refine_crossing(const event_step *step, long long first, const event_sample *right, event_sample *at,
+    real *part)
 {
   event_crossing *crossing = step->found + first;
   event_entries wall;
@@ -332,8 +333,8 @@ static int renew_sides(const event_step *step, long long first, const event_samp
 #endif
 
 #ifdef CONTACTS_IN_SPACE
-/* Cuts a part of a fixed step to one that resolves slips in space, and to the longest whose iterations converge; the first
- * part was taken by the run unless it is replaced, in other modes. */
+/* Cuts a part of a fixed step to one that resolves slips in space, and to the longest whose iterations converge; the
+ * first part was taken by the run unless it is replaced, in other modes. */
 static int shorten_part(const event_step *step, const event_sample *left, event_sample *right, real end, int changes,
     real longest, real *part)
 {

@@ -103,7 +103,8 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
     lengths = [*map(product_text, layout.fields)]
     terms = [(rolled, rolled.scalar) for rolled in loops.forces if rolled.scalar]
     terms += [(rolled, rolled.kernel) for rolled in loops.constants]
-    scalars = [rolled.kernel for rolled in loops.masses] + [scalar for _, scalar in terms]
+    constants = (*loops.masses, *loops.frictions, *loops.heats)
+    scalars = [rolled.kernel for rolled in constants] + [scalar for _, scalar in terms]
     if fixed_point is None:
         scalars += [rolled.kernel for rolled in loops.forces]
     if constrained:
@@ -115,7 +116,7 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
         "cut": is_divided((*scalars, *(rolled.kernel for rolled in loops.applied))),
         "forces": [_force_text(program, rolled) for rolled in loops.applied],
         "energies": [_energy_text(program, rolled, scalar, declared=rolled in pairs) for rolled, scalar in terms],
-        "masses": [_mass_text(program, rolled) for rolled in loops.masses],
+        "masses": [_mass_text(program, rolled) for rolled in constants],
         "lists": [(name, _list_text(program, count, lengths)) for name, count, lengths in loops.neighbours],
         "circulants": {rolled.kernel.name: _circulant_text(program, rolled) for rolled in pairs},
         "sums": len(sums),

@@ -12,6 +12,7 @@ import numpy as np
 from scvi_codegen.common.errors import ModelFileError
 from scvi_codegen.interfaces.models.model import Model
 from scvi_codegen.interfaces.models.options import FURTHER, STATE
+from scvi_codegen.systems.bath import FRICTION
 from scvi_codegen.systems.first_order import FirstOrderSystem
 from scvi_codegen.systems.formulas.indices import Array
 from scvi_codegen.systems.system import MechanicalSystem
@@ -109,11 +110,23 @@ def _formulas(system: MechanicalSystem, names: Sequence[str]) -> dict[str, Any]:
         document["forces"] = applied
     if system.damping != 0:
         document["system"]["damping"] = system.text_of(system.damping)
+    if system.bath:
+        document["system"] |= _bath(system, names)
     if system.constraints:
         document["system"]["constraints"] = [system.text_of(g) for g in system.constraints]
     if system.inputs:
         document["system"]["inputs"] = list(system.inputs)
     return document
+
+
+def _bath(system: MechanicalSystem, names: Sequence[str]) -> dict[str, Any]:
+    """Return the keys of a heat bath."""
+    bath, text = system.bath, system.text_of
+    noise = {name: text(sigma) for name, sigma in zip(names, bath.noise, strict=False) if sigma != 0}
+    friction = {name: text(value) for name in FRICTION if (value := getattr(bath, name)) != 0}
+    return (
+        friction | ({"temperature": text(bath.temperature)} if friction else {}) | ({"noise": noise} if noise else {})
+    )
 
 
 def _declared_parameters(model: Model) -> dict[str, Any]:

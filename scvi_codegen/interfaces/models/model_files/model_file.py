@@ -56,6 +56,7 @@ from scvi_codegen.systems.time_transformation import time_rescaling_function
 
 SYSTEM_KEYS = (
     *("name", "coordinates", *TURNING, "momenta", *FORMULAS, "inputs", "neighbours", "point_forces"),
+    *("temperature", "noise"),
     *("catalogue", *ROBOT_KEYS, *chain(*FORMAT_KEYS.values())),
 )
 FIELD_KEYS = (

@@ -29,7 +29,7 @@ from scvi_codegen.systems.legendre.transform import lagrangian_of
 from scvi_codegen.systems.system import MechanicalSystem
 
 KEYS: Final = {
-    "system": "lagrangian hamiltonian damping dissipation constraints time_transformation inputs",
+    "system": "lagrangian hamiltonian damping dissipation temperature noise constraints time_transformation inputs",
     "field": "density space boundary discretisation",
 }
 LISTS: Final = ("events", "contacts")
@@ -381,6 +381,8 @@ def read_system(document: Document, named: MechanicalSystem | None = None) -> Me
     arguments["lagrangian"] = text_of(section, "lagrangian", "[system]")
     arguments["point_forces"] = section.get("point_forces", ())
     arguments["dissipation"] = text_of(section, "dissipation", "[system]") if "dissipation" in section else None
+    arguments["temperature"] = formula_of(section, "temperature", "[system]") if "temperature" in section else None
+    arguments["noise"] = section.get("noise")
     arguments["contacts"] = tables_in(document.get("contacts", []), "contacts")
     return in_section("[system]", lambda: LagrangianSystem.from_text(**arguments, constraints=constraints))
 

@@ -256,6 +256,8 @@ def _start(model: Model, interface: Interface) -> ExampleRun:
     """Return the initial state, with velocities or momenta as in the model, and the step size."""
     if any(event.terminal for event in model.events) and not any(event.changes_state for event in model.events):
         raise ModelFileError("events of an FMU must change the state: omit terminal ones, and stop in the importer")
+    if interface.temperature is not None:
+        raise ModelFileError("an FMU has no heat bath: omit temperature and noise in [system]")
     if model.h is None or model.has_time_transformation:
         raise ModelFileError(
             "an FMU requires a fixed step size in time: give a step h (--step, [run] step), without a time "

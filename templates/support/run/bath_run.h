@@ -1,0 +1,162 @@
+/* Runs in a heat bath: steps O(h/2) Phi_h O(h/2), Phi the step without friction (phi_advance, run.h) and O half a
+ * step of the bath. Noise is a function of (seed, trajectory, number of the step, half, coordinate). With
+ * `metropolis` Phi is that of s h, s = 1 or -1 a variable of the run, and is accepted with probability min(1,
+ * e^(-dH/kT)); otherwise the state stays and s changes its sign (Lelievre, Rousset & Stoltz, Free Energy
+ * Computations, 2010, sec. 2.2). Requires: run.h, bath.h, energies.h. */
+
+#define MOST_PARTS 64 /* of a failed step */
+#define LARGEST_RETURN_ERROR 1e-8 /* of Phi_-h(Phi_h(q)) relative to |q| and the step: it is reversible */
+#define RETURN_ROUNDING 1e-14 /* relative to the largest coordinate, in which others may round */
+
+enum {
+  DRAWN = M + STRENGTHS, /* normals of a half step */
+  STEPS_DRAWN = DRAWN < NORMALS_AT_ONCE ? NORMALS_AT_ONCE / DRAWN : 1 /* whose normals are computed at once */
+};
+
+/* Arguments of the steps of a run. */
+typedef struct {
+  const double *parameters;
+  const solver_options *options;
+  solver_report *report;
+  double *workspace;
+} bath_call;
+
+/* Half a step of the bath. Iterations start from the state alone: earlier velocities are those before the noise. */
+static void half_of_bath(run_memory *run, const bath_factors *bath, const double *numbers)
+{
+  add_compensated(&run->heat, &run->heat_low, exchange_heat(bath, numbers, run->p, run->carry_p), 0);
+#ifndef EXPLICIT_RUN
+  run->guess = 0;
+#endif
+}
+
+/* Repeats a failed step from a state as 2, 4, .. steps: a function of the state alone. */
+static int step_in_parts(const bath_call *call, const state *before, double h, double *q, double *p)
+{
+  int status = NOT_CONVERGED;
+  for (int parts = 2; status != OK && parts <= MOST_PARTS; parts *= 2) {
+    memcpy(q, before->q, sizeof before->q);
+    memcpy(p, before->p, sizeof before->p);
+    status = OK;
+    for (int n = 0; n < parts && status == OK; n++) {
+      double q0[M], p0[M];
+      memcpy(q0, q, sizeof q0);
+      memcpy(p0, p, sizeof p0);
+      status = NAME(step)(before->t + n * h / parts, h / parts, q0, p0, call->parameters, call->options, q, p,
+          call->report, call->workspace);
+    }
+  }
+  return status;
+}
+
+/* Returns 1 if a step of h to the present state is accepted. */
+static int is_accepted(const bath_call *call, const run_memory *run, const state *before, double h, double temperature)
+{
+  const double chance = uniform_number(run->seed, (uint64_t)run->step, ACCEPTANCE, (uint32_t)run->trajectory);
+  double energy[2], q[M], p[M], size[M], largest = 0;
+  int reversible = 1;
+  if (NAME(energy)(before->t, before->q, before->p, call->parameters, &energy[0], call->workspace) != OK ||
+      NAME(energy)(before->t, run->q, run->p, call->parameters, &energy[1], call->workspace) != OK ||
+      !(log(chance) <= (energy[0] - energy[1]) / temperature))
+    return 0;
+#ifndef EXPLICIT_RUN
+  solver_report unread;
+  if (NAME(step)(run->t, -h, run->q, run->p, call->parameters, call->options, q, p, &unread, call->workspace) != OK)
+    return 0;
+  for (int i = 0; i < M; i++) {
+    size[i] = fabs(before->q[i]) + fabs(run->q[i] - before->q[i]);
+    largest = fmax(largest, size[i]);
+  }
+  for (int i = 0; i < M; i++)
+    reversible &= fabs(q[i] - before->q[i]) <= LARGEST_RETURN_ERROR * size[i] + RETURN_ROUNDING * largest;
+#else
+  (void)h, (void)q, (void)p, (void)size, (void)largest;
+#endif
+  return reversible;
+}
+
+/* Phi: in parts if it fails, or of s h, accepted or rejected. */
+static int step_of_bath(const bath_call *call, run_memory *run, double temperature)
+{
+  const double h = run->h, signed_h = run->reversed ? -h : h;
+  double t[1], q[M], p[M];
+  int iterations[1], status;
+  state before;
+  memcpy(&before, run, sizeof before);
+  run->h = signed_h;
+  status = phi_advance(
+      run, 1, LLONG_MAX, call->parameters, call->options, t, q, p, iterations, call->report, call->workspace);
+  run->h = h;
+#ifdef LIBRARY_FALLBACK
+  if (status == STATUS(FALLBACK_REQUIRED))
+    return status;
+#endif
+  if (status == OK && !run->metropolis)
+    return OK;
+  run->step -= status == OK; /* as before the step */
+  if (run->metropolis) {
+    if (status == OK && is_accepted(call, run, &before, signed_h, temperature))
+      run->accepted++;
+    else {
+      memcpy(run, &before, sizeof before);
+      run->reversed = !run->reversed;
+    }
+  } else {
+    status = step_in_parts(call, &before, h, q, p);
+    if (status != OK)
+      return status;
+    memcpy(run->q, q, sizeof q);
+    memcpy(run->p, p, sizeof p);
+    memset(run->carry_q, 0, sizeof run->carry_q);
+    memset(run->carry_p, 0, sizeof run->carry_p);
+  }
+  run->guess = 0;
+  run->t = before.t, run->t_low = before.t_low;
+  add_compensated(&run->t, &run->t_low, h, 0);
+  run->step++;
+  return OK;
+}
+
+int NAME(advance)(run_memory *run, long long steps, long long every, const real *parameters,
+    const solver_options *options, real *t, real *q, real *p, int *iterations, solver_report *report, real *workspace)
+{
+  bath_factors bath;
+  solver_report total = {0}, of_step;
+  const bath_call call = {parameters, options, &of_step, workspace};
+  double first[STEPS_DRAWN][DRAWN], second[STEPS_DRAWN][DRAWN];
+  long long stored = 0;
+  int status = steps == 0 || prepare_bath(&bath, run->t, run->h, run->q, parameters) ? OK : NOT_FINITE;
+  for (int k = 0; total.steps < steps && status == OK; k = (k + 1) % STEPS_DRAWN) {
+    const double heat = run->heat, heat_low = run->heat_low;
+    state now;
+    memcpy(&now, run, sizeof now);
+    total.t = now.t, total.duration = run->h;
+    if (k == 0)
+      normals(run->seed, (uint64_t)run->step, STEPS_DRAWN, HEAT, 0, DRAWN, (uint32_t)run->trajectory, 1, first[0],
+          second[0]);
+    half_of_bath(run, &bath, first[k]);
+    status = step_of_bath(&call, run, bath.terms[0]);
+    total.iterations += of_step.iterations, total.fallback_steps += of_step.fallback_steps;
+    total.change = of_step.change, total.noise = of_step.noise;
+#ifndef CONSTANT_BATH
+    if (status == OK && !prepare_bath(&bath, run->t, run->h, run->q, parameters))
+      status = NOT_FINITE;
+#endif
+    if (status != OK) { /* the state before the step */
+      memcpy(run, &now, sizeof now);
+      run->heat = heat, run->heat_low = heat_low;
+      break;
+    }
+    half_of_bath(run, &bath, second[k]);
+    total.steps++;
+    if (run->step % every == 0) {
+      memcpy(&now, run, sizeof now);
+      store_row(&now, stored, t, q, p);
+      iterations[stored++] = (int)run->iterations;
+      run->iterations = 0;
+    }
+  }
+  if (report)
+    *report = total;
+  return status;
+}

@@ -1,0 +1,118 @@
+#include <math.h>
+#include <stdint.h>
+
+/* Normally distributed numbers that are functions of (seed, trajectory, step, purpose, index) alone: Philox4x32-10
+ * (Salmon, Moraes, Dror, Shaw, SC11) of the counter (step, trajectory, purpose and index) keyed by the seed, then the
+ * transform of Box and Muller (Ann. Math. Stat. 29 (1958) 610). Loops without branches, which compilers vectorise; sums
+ * of products are fused explicitly, so that the bits depend neither on vectors nor on the compiler's contraction. */
+enum { HEAT = 0,
+  ACCEPTANCE = 1,
+  COLOURED_INPUT = 2 }; /* purposes; an index is below 2^30 */
+enum { NORMALS_AT_ONCE = 64 };
+
+typedef uint32_t noise_words[4][NORMALS_AT_ONCE]; /* counters, then random words */
+
+/* Philox4x32-10 of counters (x[0][i], .., x[3][i]), round by round, so that no counter waits for its own product. */
+static inline void philox(uint64_t seed, int count, noise_words x)
+{
+  uint32_t low_key = (uint32_t)seed, high_key = (uint32_t)(seed >> 32);
+  for (int round = 0; round < 10; round++) {
+    for (int i = 0; i < count; i++) {
+      const uint32_t a = x[0][i], b = x[1][i], c = x[2][i], d = x[3][i];
+      x[0][i] = (uint32_t)(((uint64_t)0xCD9E8D57u * c) >> 32) ^ b ^ low_key;
+      x[1][i] = 0xCD9E8D57u * c;
+      x[2][i] = (uint32_t)(((uint64_t)0xD2511F53u * a) >> 32) ^ d ^ high_key;
+      x[3][i] = 0xD2511F53u * a;
+    }
+    low_key += 0x9E3779B9u, high_key += 0xBB67AE85u; /* golden ratio and sqrt 3 - 1, as fractions of 2^32 */
+  }
+}
+
+/* Uniform in (0, 1]: (k + 1) / 2^53 of the upper 53 bits k of two words, without rounding. */
+static inline double uniform_of_words(uint32_t high, uint32_t low)
+{
+  const double upper = (double)(int32_t)(high ^ 0x80000000u) + 0x1p31, lower = (double)(int32_t)(low >> 11);
+  return fma(upper, 0x1p21, lower + 1.0) * 0x1p-53;
+}
+
+/* log x for normal x > 0: x = 2^k m with m in [sqrt(1/2), sqrt 2), log m = 2 artanh s = 2 s sum_n s^(2 n) / (2 n + 1)
+ * with s = (m - 1) / (m + 1), |s| < .172, so that the rest after n = 9 is 5e-17 of the first term, ln 2 in 2 words. */
+static inline double log_of_uniform(double x)
+{
+  union {
+    double value;
+    uint64_t bits;
+  } whole = {x}, part;
+  const uint64_t root_half = 0x3fe6a09e667f3bcdu, moved = whole.bits - root_half;
+  part.bits = (moved & 0xfffffffffffffu) + root_half;
+  const double k = (double)((int32_t)(moved >> 32) >> 20), s = (part.value - 1.0) / (part.value + 1.0), square = s * s;
+  double sum = 2.0 / 19;
+#pragma GCC unroll 8
+  for (int n = 17; n > 1; n -= 2)
+    sum = fma(sum, square, 2.0 / n);
+  const double rest = fma(s * square, sum, k * 0x1.abc9e3b39803fp-56); /* ln 2 less its high word */
+  return fma(k, 0x1.62e42fefa39efp-1, fma(2.0, s, rest));
+}
+
+/* cos and sin of 2 pi k / 2^53, k the upper 53 bits of two words: the nearest quarter of a turn, and the series of
+ * Taylor in the rest, |y| <= pi / 4, whose first omitted terms are below 5e-17 of the sums. */
+static inline void cos_and_sin_of_words(uint32_t high, uint32_t low, double *cosine, double *sine)
+{
+  const uint32_t quarter = (high + 0x20000000u) >> 30;
+  const double turns = fma((double)(int32_t)(high - (quarter << 30)), 0x1p21, (double)(int32_t)(low >> 11)) * 0x1p-53;
+  const double y = 6.283185307179586 * turns, square = y * y;
+  double c = 1.0 / 20922789888000, s = -1.0 / 1307674368000;
+  c = fma(c, square, -1.0 / 87178291200), s = fma(s, square, 1.0 / 6227020800);
+  c = fma(c, square, 1.0 / 479001600), s = fma(s, square, -1.0 / 39916800);
+  c = fma(c, square, -1.0 / 3628800), s = fma(s, square, 1.0 / 362880);
+  c = fma(c, square, 1.0 / 40320), s = fma(s, square, -1.0 / 5040);
+  c = fma(c, square, -1.0 / 720), s = fma(s, square, 1.0 / 120);
+  c = fma(c, square, 1.0 / 24), s = fma(s, square, -1.0 / 6);
+  c = fma(fma(c, square, -0.5), square, 1.0), s = fma(s * square, y, y);
+  const double odd = (double)(int32_t)(quarter & 1), even = 1.0 - odd;
+  const double sign_of_sine = 1.0 - (double)(int32_t)(quarter & 2);
+  const double sign_of_cosine = 1.0 - (double)(int32_t)((quarter + 1) & 2);
+  *cosine = sign_of_cosine * fma(even, c, odd * s);
+  *sine = sign_of_sine * fma(even, s, odd * c);
+}
+
+/* Normals of `steps` steps from a step on, of indices begin .. begin + count - 1 and of `width` trajectories: first[k]
+ * and second[k], one for the half step before and one for the half step after the step, with k = ((step) count + index)
+ * width + trajectory. They are fused with 0, so that no product is part of a caller's sum. */
+static inline void normals(uint64_t seed, uint64_t step, int steps, uint32_t purpose, int begin, int count,
+    uint32_t trajectory, int width, double *restrict first, double *restrict second)
+{
+  noise_words x;
+  double length[NORMALS_AT_ONCE];
+  const int total = steps * count * width;
+  for (int from = 0, index = 0, lane = 0, size; from < total; from += size, first += size, second += size) {
+    size = total - from < NORMALS_AT_ONCE ? total - from : NORMALS_AT_ONCE;
+    for (int i = 0; i < size; i++) {
+      x[0][i] = (uint32_t)step, x[1][i] = (uint32_t)(step >> 32), x[2][i] = trajectory + (uint32_t)lane;
+      x[3][i] = purpose << 30 | (uint32_t)(begin + index);
+      lane = lane + 1 < width ? lane + 1 : 0;
+      index += lane == 0;
+      step += index == count;
+      index = index < count ? index : 0;
+    }
+    philox(seed, size, x);
+    for (int i = 0; i < size; i++)
+      length[i] = -2.0 * log_of_uniform(uniform_of_words(x[0][i], x[1][i]));
+    for (int i = 0; i < size; i++)
+      length[i] = sqrt(length[i]);
+    for (int i = 0; i < size; i++) {
+      double cosine, sine;
+      cos_and_sin_of_words(x[2][i], x[3][i], &cosine, &sine);
+      first[i] = fma(length[i], cosine, 0.0), second[i] = fma(length[i], sine, 0.0);
+    }
+  }
+}
+
+/* Uniform in (0, 1] of a purpose in a step. */
+static inline double uniform_number(uint64_t seed, uint64_t step, uint32_t purpose, uint32_t trajectory)
+{
+  noise_words x;
+  x[0][0] = (uint32_t)step, x[1][0] = (uint32_t)(step >> 32), x[2][0] = trajectory, x[3][0] = purpose << 30;
+  philox(seed, 1, x);
+  return uniform_of_words(x[0][0], x[1][0]);
+}

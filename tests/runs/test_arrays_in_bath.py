@@ -1,0 +1,95 @@
+"""Arrays of run-time sizes in a heat bath: equal to named coordinates, temperatures, bits, refusals."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import scvi_codegen as sc
+
+CHAIN = {
+    "name": "warm_chain",
+    "coordinates": ["q[N]"],
+    "parameters": {"m[N]": 1.0, "c[N]": 1.0, "kT": 0.7, "gamma": 0.3},
+    "lagrangian": "sum(i in N, m[i]*q_dot[i]**2/2 - q[i]**2/4) - sum(i in N-1, (q[i+1] - q[i])**2/2)",
+    "dissipation": "sum(i in N, c[i]*q_dot[i]**2/2)",
+    "damping": "gamma",
+    "temperature": "kT",
+}
+VALUES = {"m": np.array([1.0, 2.0, 0.5, 1.0]), "c": np.array([0.0, 1.0, 0.2, 3.0])}
+VALUES_AND_KT = {"m[N]": 1.0, "c[N]": 1.0, "kT": 0.7}
+START = np.array([0.1, -0.2, 0.3, 0.4])
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("method", ["stoermer-verlet", "svi:2"])
+def test_motion_is_that_of_named_coordinates(method):
+    """The same normal numbers: positions, momenta and heat differ by rounding errors and tolerances."""
+    chain = sc.LagrangianSystem.from_text(**CHAIN)
+    settings = {"h": 0.2, "steps": 200, "seed": 11}
+    run = sc.compile_stepper(chain, method).integrate(START, np.zeros(4), **settings, parameters=VALUES)
+    entries = {f"{name}_{i}": x for name, values in VALUES.items() for i, x in enumerate(values)}
+    named = sc.unroll_sums(chain, {"N": 4})
+    exact = sc.compile_stepper(named, method).integrate(START, np.zeros(4), **settings, parameters=entries)
+    assert_allclose(run.p["q"], np.asarray(exact.p), atol=1e-9)
+    assert run.heat() == pytest.approx(exact.heat(), abs=1e-9)
+    assert not run.momentum_maps().size
+
+
+@pytest.mark.second
+def test_temperatures_of_a_mixture_of_atoms_and_bits():
+    """Friction on one of two species heats both to kT, within four standard errors; total momentum is not conserved."""
+    square = "sum(a in 3, wrap(r[i, a] - r[j, a], box)**2)"
+    mixture = sc.LagrangianSystem.from_text(
+        name="warm_mixture",
+        coordinates=["r[N, 3]"],
+        parameters={"box": 5.0, "cut": 2.0, "m[N]": 1.0, "c[N]": 1.0, "kT": 1.3},
+        neighbours={"near": {"of": "r", "cutoff": "cut", "box": "box", "skin": 0.4}},
+        lagrangian=f"sum(i in N, sum(a in 3, m[i]*r_dot[i, a]**2)/2)"
+        f"- sum(i < j in near, 20*positive_part(1 - {square}/cut**2)**4)",
+        dissipation="sum(i in N, sum(a in 3, c[i]*r_dot[i, a]**2))/2",
+        temperature="kT",
+    )
+    stepper, count = sc.compile_stepper(mixture, "stoermer-verlet"), 64
+    heavy = np.arange(count) % 2
+    values = {"m": 1.0 + 3.0 * heavy, "c": 2.0 * heavy}
+    r = np.stack(np.meshgrid(*[np.arange(4)] * 3), -1).reshape(-1, 3) * 1.25
+    settings = {"h": 0.02, "save_every": 20, "parameters": values, "seed": 5}
+    run = stepper.integrate(r, np.zeros((count, 3)), steps=20_000, **settings)
+    kinetic = (run.p["r"] ** 2).sum(axis=2) / values["m"]
+    temperatures = np.stack([kinetic[:, heavy == k].mean(axis=1) / 3 for k in (0, 1)], axis=-1)
+    mean, error, _ = sc.average(run, temperatures)
+    assert (error < 0.02).all()
+    assert (abs(mean - 1.3) < 4 * error).all()
+    assert_allclose(sc.temperature(run), kinetic.sum(axis=1) / (3 * count), rtol=1e-12)
+    shared = stepper.integrate(r, np.zeros((count, 3)), steps=400, threads=2, **settings)
+    assert_array_equal(shared.p["r"], run.p["r"][:21])
+    resumed = stepper.start(r, np.zeros((count, 3)), h=0.02, parameters=values, seed=5)
+    resumed.advance(150)
+    resumed = stepper.from_checkpoint(resumed.checkpoint())
+    resumed.advance(250)
+    assert_array_equal(resumed.p["r"], run.p["r"][20])
+    assert resumed.bath.heat == shared.heat()
+
+
+@pytest.mark.second
+def test_other_baths_are_compiled_for_the_sizes_of_a_call():
+    """Dashpots between neighbours, and a temperature that varies in time: friction does not act on p_1 + .. + p_N."""
+    dissipation = "sum(i in N-1, c[i]*(q_dot[i+1] - q_dot[i])**2/2)"
+    free = "sum(i in N, m[i]*q_dot[i]**2/2) - sum(i in N-1, (q[i+1] - q[i])**2/2)"
+    changed = {"dissipation": dissipation, "temperature": "kT*(1 + t)", "damping": 0, "lagrangian": free}
+    chain = sc.LagrangianSystem.from_text(**{**CHAIN, **changed, "name": "dashpots", "parameters": VALUES_AND_KT})
+    run = sc.compile_stepper(chain, "svi:1").integrate(START, np.ones(4), h=0.1, steps=200)
+    assert_allclose(run.p["q"].sum(axis=1), 4.0, atol=1e-10)
+    assert np.ptp(run.p["q"][-1]) > 0.1
+
+
+def test_refusals_name_the_reason():
+    stepper = sc.compile_stepper(sc.LagrangianSystem.from_text(**CHAIN), "stoermer-verlet")
+    with pytest.raises(sc.SystemDefinitionError, match="noise= of arrays is not supported"):
+        sc.LagrangianSystem.from_text(**CHAIN, noise={"q": "1"})
+    with pytest.raises(sc.MethodError, match="metropolis"):
+        stepper.integrate(START, np.zeros(4), h=0.1, steps=1, metropolis=True, parameters=VALUES)
+    with pytest.raises(sc.ScviCodegenError):
+        stepper.integrate(START, np.zeros(4), t_end=1.0, parameters=VALUES)
+    with pytest.raises(sc.StateError, match="is -1 at t = 0"):
+        stepper.integrate(START, np.zeros(4), h=0.1, steps=1, parameters={**VALUES, "kT": -1.0})

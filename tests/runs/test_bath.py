@@ -1,0 +1,286 @@
+"""Heat bath: exact covariances, averages beside quadrature, bits, Metropolis, refusals.
+
+Averages have fixed seeds, and bounds of four standard errors, which are those of 16 independent trajectories.
+"""
+
+import subprocess
+
+import numpy as np
+import pytest
+from samples import QUICK_FLAGS
+from scipy.linalg import expm, solve_discrete_lyapunov
+
+import scvi_codegen as sc
+
+MASS = np.array([[1, 0.5, 0], [0.5, 2, 0], [0, 0, 1]])
+STIFFNESS = np.array([[2, -1, 0], [-1, 2, -1], [0, -1, 2.0]])
+CHAIN = {
+    "coordinates": ["a", "b", "c"],
+    "lagrangian": "(a_dot**2 + 2*b_dot**2 + c_dot**2 + a_dot*b_dot)/2 - (a**2 + (b-a)**2 + (c-b)**2 + c**2)/2",
+    "parameters": {"kT": 1.3, "g": 0.7},
+}
+WELL = {
+    "coordinates": ["x"],
+    "lagrangian": "x_dot**2/2 - (x**2 - 1)**2 - x/2",
+    "parameters": {"kT": 1, "g": 1},
+    "damping": "g",
+    "temperature": "kT",
+}
+RODS = {"parameters": {"g": 1, "m": 2, "kT": 2}, "damping": 1.0, "temperature": "kT"}
+
+
+def compiled(method, name="body", **arguments):
+    return sc.compile_stepper(sc.LagrangianSystem.from_text(name, **arguments), method, flags=QUICK_FLAGS)
+
+
+def averages(stepper, q, h, steps, observe, **arguments):
+    """Means of 16 trajectories from rest, without the first hundredth, and their standard errors."""
+    start = np.tile(np.asarray(q, dtype=float), (16, 1))
+    runs = stepper.integrate_ensemble(start, np.zeros_like(start), h=h, steps=steps, seed=5, **arguments)
+    assert (runs.status == "ok").all()
+    means = observe(runs.q[steps // 100 :]).mean(axis=0)
+    return means.mean(axis=0), means.std(axis=0, ddof=1) / 4
+
+
+def agrees(mean, error, exact, largest_error):
+    assert (error < largest_error).all()
+    return (np.abs(mean - exact) < 4 * error).all()
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("dissipation", ["g*a_dot**2/2", "g*(a_dot**2 + 2*b_dot**2 + c_dot**2 + a_dot*b_dot)/2"])
+def test_half_steps_are_exact_and_harmonic_covariances_have_no_error(dissipation):
+    # E of two half steps from C, B from fluctuation and dissipation; covariance of O Phi O by Lyapunov's equation
+    h, kT = 0.8, 1.3
+    chain = compiled("svi:2", **CHAIN, dissipation=dissipation, temperature="kT")
+    free = compiled("svi:2", **{**CHAIN, "lagrangian": CHAIN["lagrangian"].split(" - ")[0]}, dissipation=dissipation,
+                    temperature="kT")  # fmt: skip
+    still = {"h": h / 2, "steps": 1, "parameters": {"kT": 0, "g": 0.7}}
+    decay = np.array([free.integrate(np.zeros(3), p, **still).p[-1] for p in np.eye(3)]).T  # E(h/2) of two quarters
+    friction = np.diag([0.7, 0, 0]) if "2*b_dot" not in dissipation else 0.7 * MASS
+    assert np.abs(decay - expm(-friction @ np.linalg.inv(MASS) * h / 2)).max() < 1e-15
+    step = chain.jacobian(np.zeros(3), np.zeros(3), h)
+    zero = np.zeros((3, 3))
+    half = np.block([[np.eye(3), zero], [zero, decay]])
+    noise = np.block([[zero, zero], [zero, kT * (MASS - decay @ MASS @ decay.T)]])
+    covariance = solve_discrete_lyapunov(half @ step @ half, half @ step @ noise @ step.T @ half.T + noise)
+    assert np.abs(covariance[:3, :3] - kT * np.linalg.inv(STIFFNESS)).max() < 1e-13
+    assert np.abs(covariance[3:, 3:] - kT * MASS).max() < 1e-13
+    end = chain.integrate(np.ones(3), np.ones(3), **{**still, "h": h})
+    whole = half @ step @ half @ np.ones(6)
+    assert np.abs(np.r_[end.q[-1], end.p[-1]] - whole).max() < 1e-14
+
+
+@pytest.mark.second
+def test_noise_of_a_step_has_the_covariance_of_fluctuation_and_dissipation():
+    h, kT, count = 0.9, 1.3, 40000
+    free = compiled("svi:1", **{**CHAIN, "lagrangian": CHAIN["lagrangian"].split(" - ")[0]},
+                    dissipation="g*(a_dot - c_dot)**2/2", temperature="kT")  # fmt: skip
+    rest = np.zeros((count, 3))
+    p = free.integrate_ensemble(rest, rest, h=h, steps=1, seed=3).p[-1]
+    friction = 0.7 * np.outer([1, 0, -1], [1, 0, -1])
+    decay = expm(-friction @ np.linalg.inv(MASS) * h)
+    expected = kT * (MASS - decay @ MASS @ decay.T)
+    assert np.abs(p.T @ p / count - expected).max() < 4 * kT * np.sqrt(2 / count)
+    assert np.abs(p.mean(axis=0)).max() < 4 * np.sqrt(kT / count)
+
+
+def test_noise_is_a_function_of_seed_trajectory_and_step():
+    well = compiled("svi:2", "well", **WELL)
+    every = well.integrate([1.0], [0.0], h=0.3, steps=60, seed=7)
+    assert "seed 7" in repr(every)
+    saved = well.integrate([1.0], [0.0], h=0.3, steps=60, seed=7, save_every=7)
+    assert (every.q[::7] == saved.q).all()
+    assert (every.q[1:] != well.integrate([1.0], [0.0], h=0.3, steps=60).q[1:]).all()
+    run = well.start([1.0], [0.0], h=0.3, seed=7)
+    run.advance(23)
+    resumed = well.from_checkpoint(run.checkpoint())
+    resumed.advance(37)
+    assert (resumed.q[0], resumed.p[0], resumed.bath.heat) == (every.q[-1, 0], every.p[-1, 0], every.heat())
+    start = np.tile([1.0], (9, 1))
+    runs = well.integrate_ensemble(start, 0 * start, h=0.3, steps=60, seed=7, threads=1)
+    assert (runs.q == well.integrate_ensemble(start, 0 * start, h=0.3, steps=60, seed=7, threads=4).q).all()
+    assert (runs.q[:, 0] == every.q).all()
+    assert len(np.unique(runs.q[-1])) == 9
+
+
+@pytest.mark.second
+def test_zero_temperature_is_plain_damping_and_heat_balances_the_energy():
+    well = compiled("composition:4", "well", **WELL)
+    cold = [well.integrate([1.0], [0.3], h=0.01, steps=300, seed=seed, parameters={"kT": 0}) for seed in (1, 2)]
+    assert (cold[0].q == cold[1].q).all()
+    plain = {key: value for key, value in WELL.items() if key != "temperature"}
+    damped = compiled("svi:4", "damped", **plain).integrate([1.0], [0.3], h=0.01, steps=300)
+    assert np.abs(cold[0].q - damped.q).max() < 1e-5  # the splitting has order 2
+    warm = well.integrate([1.0], [0.3], h=0.01, steps=300)
+    energy = warm.energy()
+    assert abs(energy[-1] - energy[0] - warm.heat()) < 1e-7 < abs(warm.heat())
+
+
+@pytest.mark.second
+def test_metropolised_and_plain_averages_in_a_double_well():
+    x = np.linspace(-5, 5, 4001)
+    weight = np.exp(-((x**2 - 1) ** 2) - x / 2)
+    exact = np.array([(weight * f).sum() / weight.sum() for f in (x, x**2)])
+
+    def observe(q):
+        return np.stack([q[..., 0], q[..., 0] ** 2], axis=-1)
+
+    well = compiled("stoermer-verlet", "well", **WELL)
+    assert agrees(*averages(well, [1.0], 0.4, 10000, observe, metropolis=True), exact, 0.01)
+    smooth = compiled("composition:4", "well", **WELL)
+    assert agrees(*averages(smooth, [1.0], 0.3, 10000, observe), exact, 0.02)
+    assert 0.8 < well.integrate([1.0], [0.0], h=0.4, steps=2000, metropolis=True).acceptance < 0.95
+
+
+@pytest.mark.second
+def test_metropolis_with_a_magnetic_field_has_a_direction_variable():
+    # a charge in B = 2 and an asymmetric potential; flipped momenta would bias <x> by -.155 and <y^2> by .67
+    charge = compiled(
+        "svi:1",
+        "charge",
+        coordinates=["x", "y"],
+        lagrangian="(x_dot**2 + y_dot**2)/2 + x*y_dot - y*x_dot - (x**2 + y**2)/2 - x**4/4 - 7*y*x**2/20",
+        parameters={"kT": 1},
+        damping=0.5,
+        temperature="kT",
+    )
+    grid = np.linspace(-6, 6, 601)
+    x, y = np.meshgrid(grid, grid, indexing="ij")
+    weight = np.exp(-(x**2 + y**2) / 2 - x**4 / 4 - 7 * y * x**2 / 20)
+    exact = np.array([(weight * f).sum() / weight.sum() for f in (x, x**2, y**2)])
+
+    def observe(q):
+        return np.stack([q[..., 0], q[..., 0] ** 2, q[..., 1] ** 2], axis=-1)
+
+    assert agrees(*averages(charge, [0, 0], 0.8, 6000, observe, metropolis=True), exact, 0.02)
+
+
+@pytest.mark.second
+def test_rods_by_constraints_and_by_angles_agree_with_quadrature():
+    angle = (np.arange(800) + 0.5) * np.pi / 400
+    a, b = np.meshgrid(angle, angle, indexing="ij")
+    weight = np.exp((3 * np.cos(a) + 2 * np.cos(b)) / 2) * np.sqrt(6 - (2 * np.cos(a - b)) ** 2)
+    exact = np.array([(weight * f).sum() / weight.sum() for f in (np.cos(a), np.cos(b), np.cos(a - b))])
+    lagrangian = "((1+m)*a_dot**2 + m*b_dot**2 + 2*m*a_dot*b_dot*cos(a-b))/2 + g*((1+m)*cos(a) + m*cos(b))"
+    angles = compiled("svi:2", "angles", coordinates=["a", "b"], lagrangian=lagrangian, **RODS)
+    rods = compiled(
+        "svi:2",
+        "rods",
+        coordinates=["x1", "y1", "x2", "y2"],
+        lagrangian="(x1_dot**2 + y1_dot**2 + m*(x2_dot**2 + y2_dot**2))/2 - g*(y1 + m*y2)",
+        constraints=["x1**2 + y1**2 = 1", "(x2 - x1)**2 + (y2 - y1)**2 = 1"],
+        **RODS,
+    )
+
+    def of_angles(q):
+        return np.cos(np.stack([q[..., 0], q[..., 1], q[..., 0] - q[..., 1]], axis=-1))
+
+    def of_rods(q):
+        x1, y1, x2, y2 = np.moveaxis(q, -1, 0)
+        return np.stack([-y1, y1 - y2, y1 * (y2 - y1) + x1 * (x2 - x1)], axis=-1)
+
+    assert agrees(*averages(angles, [0, 0], 0.2, 6000, of_angles), exact, 0.02)
+    assert agrees(*averages(rods, [0, -1, 0, -2], 0.2, 6000, of_rods, metropolis=True), exact, 0.02)
+    run = rods.integrate([0, -1, 0, -2], [0, 0, 0, 0], h=0.2, steps=300)
+    assert np.abs(rods.constraint_values(run.q, run.p)).max() < 1e-13
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("friction", [{"damping": 1.0}, {"dissipation": "omega_1**2 + omega_2**2/2"}])
+def test_rigid_dipole_has_the_average_of_langevin(friction):
+    dipole = compiled(
+        "svi:1",
+        "dipole",
+        rotations={"R": "omega"},
+        lagrangian="(omega_1**2 + 2*omega_2**2 + 5*omega_3**2/2)/2 + 2*R_33",
+        parameters={"kT": 1},
+        temperature="kT",
+        **friction,
+    )
+    exact = np.array([1 / np.tanh(2) - 0.5])
+
+    def observe(q):
+        return (q[..., :1] ** 2 + q[..., 3:] ** 2) * 2 - 1  # R_33 of unit quaternions
+
+    assert agrees(*averages(dipole, [1, 0, 0, 0], 0.4, 4000, observe, metropolis=True), exact, 0.02)
+
+
+def test_additive_noise_heats_at_its_rate():
+    # E H = H0 + sigma^2 t / 2, which SVI preserve for quadratic H
+    noisy = compiled(
+        "svi:2", "noisy", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2", parameters={"s": 0.5}, noise={"x": "s"}
+    )
+    rest = np.zeros((4000, 1))
+    runs = noisy.integrate_ensemble(rest, rest, h=0.5, steps=40, seed=1)
+    energy = (runs.q[-1] ** 2 + runs.p[-1] ** 2) / 2
+    assert abs(energy.mean() - 0.5**2 * 20 / 2) < 4 * energy.std() / np.sqrt(4000)
+
+
+@pytest.mark.second
+def test_failed_steps_are_repeated_in_parts():
+    stiff = {**WELL, "lagrangian": "x_dot**2/2*(1 + x**2) - 50*x**4", "parameters": {"kT": 20, "g": 1}}
+    run = compiled("svi:1", "stiff", **stiff).integrate([1.0], [0.0], h=0.6, steps=200, seed=2)
+    assert np.isfinite(run.q).all()
+    assert len(run) == 201
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"temperature": "x"}, "depends on 'x'"),
+        ({"damping": None}, "requires friction"),
+        ({"damping": None, "dissipation": "x_dot**4"}, "quadratic in velocities"),
+        ({"lagrangian": "x_dot**4 - x**2"}, "masses depend on velocities"),
+        ({"noise": {"z": "1"}}, "noise on 'z'"),
+        (
+            {"coordinates": ["x", "y"], "lagrangian": "x_dot**2 + y_dot**2", "constraints": ["x_dot - x*y_dot"]},
+            "nonholon",
+        ),
+    ],
+)
+def test_systems_without_an_invariant_measure_are_refused(arguments, message):
+    with pytest.raises(sc.SystemDefinitionError, match=message):
+        sc.LagrangianSystem.from_text("well", **{**WELL, **arguments})
+
+
+def test_what_a_heat_bath_excludes_is_refused_by_name(tmp_path):
+    well = compiled("svi:2", "well", **WELL)
+    run = well.integrate([1.0], [0.0], h=0.1, steps=3)
+    state = [1.0], [0.0]
+    for operation in (
+        lambda: well.integrate(*state, t_end=1.0),
+        lambda: well.integrate(*state, t_end=1.0, error=1e-6),
+        lambda: well.integrate(*state, h=0.1, t_end=1.0, events="x"),
+        run.shadow_energy,
+        run.sensitivity,
+        run.tangent,
+        lambda: run.at([0.15]),
+    ):
+        with pytest.raises(sc.MethodError, match="in a heat bath"):
+            operation()
+    with pytest.raises(sc.StateError, match=r"kT = kT is -1 at t = 0"):
+        well.integrate(*state, h=0.1, steps=3, parameters={"kT": -1})
+    forced = compiled("svi:2", "forced", **WELL, forces={"x": "cos(t)"})
+    with pytest.raises(sc.MethodError, match="metropolis=True is not available"):
+        forced.integrate(*state, h=0.1, steps=3, metropolis=True)
+    with pytest.raises(sc.StateError, match="seed= requires a heat bath"):
+        compiled("svi:2", "plain", coordinates=["x"], lagrangian="x_dot**2 - x**2").integrate(
+            *state, h=0.1, steps=3, seed=1
+        )
+    system = sc.LagrangianSystem.from_text("well", **WELL)
+    with pytest.raises(sc.MethodError, match="precision='double-double' is not available with a heat bath"):
+        sc.compile_stepper(system, "svi:2", precision="double-double")
+
+
+@pytest.mark.second
+def test_model_files_and_generated_programs_have_the_same_noise(tmp_path):
+    model = sc.Model(system=sc.LagrangianSystem.from_text("well", **WELL), method="svi:2", q=[1.0], p=[0.0], h=0.1,
+                     steps=50, save_every=50, seed=0)  # fmt: skip
+    sc.save_model(model, tmp_path / "well.toml")
+    again = sc.load_model(tmp_path / "well.toml").integrate()
+    assert (again.q == model.integrate().q).all()
+    subprocess.run(
+        ["scvi-codegen", "generate", "well.toml", "-o", "program"], cwd=tmp_path, check=True, capture_output=True
+    )
+    subprocess.run(["make", "run"], cwd=tmp_path / "program", check=True, capture_output=True)
