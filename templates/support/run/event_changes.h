@@ -109,11 +109,9 @@ static int refine_crossing(const event_step *step, long long first, const event_
   (void)right;
   at->t = crossing->t;
   copy_state(at->q, at->p, crossing->q, crossing->p);
-#ifdef EVENT_CONSTRAINTS /* a constrained step of the size of rounding is ill-conditioned: its state is interpolated */
-  for (int k = 0; k < M && fabs(*part) < EVENT_TIE * fabs(step->whole); k++) {
-    at->q[k] = step->q[k] + *part / step->h * (right->q[k] - step->q[k]);
+#ifdef EVENT_CONSTRAINTS /* momenta of constrained steps of the size of rounding are ill-conditioned: interpolated */
+  for (int k = 0; k < M && fabs(*part) < EVENT_TIE * fabs(step->whole); k++)
     at->p[k] = step->p[k] + *part / step->h * (right->p[k] - step->p[k]);
-  }
   for (long long i = first; i < *step->filled; i++)
     copy_state(step->found[i].q, step->found[i].p, at->q, at->p);
   return evaluate_function(step, FUNCTION_OF(crossing), at);
