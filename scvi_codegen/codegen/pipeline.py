@@ -163,7 +163,7 @@ def with_bath(program: Program, system: MechanicalSystem, **others: Any) -> Prog
         return program
     if passed := [name for name, value in others.items() if value not in (None, "double")]:
         raise MethodError(f"{passed[0]}={others[passed[0]]!r} is not available with a heat bath: omit it")
-    maps = tuple(replace(each, exact=False) for each in program.quantities.momentum_maps)
+    maps = tuple(replace(momentum, exact=False) for momentum in program.quantities.momentum_maps)
     quantities = replace(program.quantities, momentum_maps=maps)
     equations = replace(program.equations, stage_curve=None)
     bath = heat_bath_of(system)

@@ -284,3 +284,20 @@ def test_model_files_and_generated_programs_have_the_same_noise(tmp_path):
         ["scvi-codegen", "generate", "well.toml", "-o", "program"], cwd=tmp_path, check=True, capture_output=True
     )
     subprocess.run(["make", "run"], cwd=tmp_path / "program", check=True, capture_output=True)
+
+
+def test_acceptance_does_not_depend_on_units():
+    """In a unit of length of 1e-10 the same implicit steps are accepted; a quarter is rejected."""
+    runs = []
+    for unit in (1.0, 2.0**-33):
+        well = sc.LagrangianSystem.from_text(
+            *("well", ["x"], "x_dot**2/2 - k*x**4/4"),
+            parameters={"kT": unit**2, "k": 1 / unit**2, "gamma": 1.0},
+            damping="gamma",
+            temperature="kT",
+        )
+        runs.append(
+            sc.compile_stepper(well, "svi:2").integrate([0.0], [0.0], h=3.0, steps=300, seed=1, metropolis=True)
+        )
+    assert runs[0].acceptance == runs[1].acceptance < 0.9
+    assert np.array_equal(runs[0].q, runs[1].q * 2.0**33)

@@ -247,10 +247,10 @@ class Family:
             raise StateError(
                 f"the orbits of '{os.fspath(path)}' are none of this '{stepper.title}', but of another one"
             )
-        found = zip(arrays["kinds"], arrays["bifurcations"], others, strict=True)
+        saved = zip(arrays["kinds"], arrays["bifurcations"], others, strict=True)
         return cls(
             orbits=tuple(orbits),
-            bifurcations=tuple(Bifurcation(str(kind), int(k), at, continuation) for kind, k, at in found),
+            bifurcations=tuple(Bifurcation(str(kind), int(k), at, continuation) for kind, k, at in saved),
             ended=settings["ended"],
             _first=first,
             _last=replace(last, step=settings["next step"], largest=settings["largest"]),

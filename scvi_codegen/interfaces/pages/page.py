@@ -176,8 +176,8 @@ def page_of(model: Model, document: Mapping[str, Any], settings: Mapping[str, An
     adaptive = model.h is None or model.time_transformation is not None
     acting = tuple(event for event in model.events if event.changes_state or event.terminal)
     model = replace(model, events=acting)  # others do not affect the motion
-    known = adaptive or acting or model.system.has_contacts
-    result = Page(model.with_known_sizes() if known else model, document, adaptive=adaptive)
+    of_fixed_sizes = adaptive or acting or model.system.has_contacts
+    result = Page(model.with_known_sizes() if of_fixed_sizes else model, document, adaptive=adaptive)
     result.html  # noqa: B018  (reports errors here)
     return result
 
