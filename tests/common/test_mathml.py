@@ -3,8 +3,11 @@
 import importlib
 import io
 import math
+import os
 import re
+import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -12,6 +15,7 @@ import numpy as np
 import pytest
 import sympy
 from printed_formulas import mp, names, trees_of_mathml, value
+from programs import needs
 from sympy import Float, Function, Matrix, Mul, Pow, Rational, Symbol, cos, exp, pi, sin, sqrt, symbols
 
 from scvi_codegen import SCVI, SVI, Gauss, SpectralCollocation, derive, problem
@@ -192,37 +196,66 @@ def test_latex_names_are_parsed_like_mathml_names(name, latex):
 
 
 DOCS = Path(__file__).parents[2] / "docs"
+HEIGHT = 300
+"""Pixels of a formula of 100 pixels an em in a screenshot."""
+
+
+def pieces_of(ink):
+    """Return the number of rows of ink of a picture, and the widths of the gaps between its columns in em."""
+    gaps = np.diff(np.flatnonzero(ink.any(axis=0)))
+    return int((np.diff(ink.any(axis=1).astype(int)) == 1).sum()), (gaps[gaps > 1] / 100).tolist()
+
+
+def screenshot_by_chromium(browser, page, height):
+    """Return a picture of a page whose font is loaded."""
+    view = browser.new_page(viewport={"width": 1200, "height": height})
+    view.goto(page.as_uri())
+    view.evaluate("document.fonts.ready")
+    assert view.evaluate("[...document.fonts].map(f => f.status)") == ["loaded"]
+    picture = view.screenshot()
+    view.close()
+    return picture
+
+
+def screenshot_by_firefox(page, height):
+    """Return a picture of a page by a Firefox of its own profile."""
+    picture = page.with_suffix(".png")
+    options = ["--headless", "--profile", str(page.parent), f"--window-size=1200,{height}"]
+    command = ["firefox", *options, "--screenshot", str(picture), page.as_uri()]
+    subprocess.run(command, check=True, capture_output=True, timeout=240, env={**os.environ, "HOME": str(page.parent)})
+    return picture.read_bytes()
 
 
 @pytest.mark.second
 class TestInABrowser:
     """Formulas in the font that pages bring along, whatever the machine has: ink is counted in a screenshot."""
 
-    @pytest.fixture
-    def pieces(self, browser):
-        """Return a function from a formula to the number of its rows of ink, and the widths of its gaps in em."""
+    @pytest.fixture(params=["chromium", "firefox"])
+    def pieces(self, request, tmp_path):
+        """Return a function from formulas to the numbers of their rows of ink, and the widths of their gaps in em."""
         image = pytest.importorskip("PIL.Image")
-        view = browser.new_page(viewport={"width": 1200, "height": 300})
+        if request.param == "chromium":
+            screenshot = partial(screenshot_by_chromium, request.getfixturevalue("browser"))
+        else:
+            needs("firefox")
+            screenshot = screenshot_by_firefox
 
-        def look(formula: str, font: str = str(mathematics_font())) -> tuple[int, list[float]]:
-            style = f'{font} math {{ font: 100px "STIX Two Math", serif }} body {{ margin: 60px }}'
-            view.set_content(f"<!DOCTYPE html><style>{style}</style><math>{formula}</math>")
-            view.evaluate("document.fonts.ready")
-            assert view.evaluate("[...document.fonts].map(f => f.status)") == ["loaded"]
-            dark = np.asarray(image.open(io.BytesIO(view.screenshot())).convert("L")) < 128
-            rows, columns = dark.any(axis=1), np.flatnonzero(dark.any(axis=0))
-            gaps = np.diff(columns)
-            return int((np.diff(rows.astype(int)) == 1).sum()), (gaps[gaps > 1] / 100).tolist()
+        def look(*formulas: str) -> list[tuple[int, list[float]]]:
+            style = f'{mathematics_font()} math {{ font: 100px "STIX Two Math", serif }} body {{ margin: 0 }}'
+            style += f" div {{ height: {HEIGHT}px; padding: 60px; box-sizing: border-box }}"
+            blocks = "".join(f"<div><math>{formula}</math></div>" for formula in formulas)
+            page = tmp_path / "page.html"
+            page.write_text(f'<!DOCTYPE html><meta charset="utf-8"><style>{style}</style>{blocks}', encoding="utf-8")
+            shot = image.open(io.BytesIO(screenshot(page, HEIGHT * len(formulas)))).convert("L")
+            return [pieces_of(np.asarray(shot)[HEIGHT * n : HEIGHT * (n + 1)] < 128) for n in range(len(formulas))]
 
-        yield look
-        view.close()
+        return look
 
     def test_dots_of_velocities_are_visible(self, pieces):
-        for name in ("q", "x", "theta", "m"):
-            assert pieces(mathml(Symbol(name)))[0] == 1
-            assert pieces(mathml(Symbol(f"{name}_dot")))[0] == 2
+        names = [Symbol(name + dot) for dot in ("", "_dot") for name in ("q", "x", "theta", "m")]
+        assert [rows for rows, _ in pieces(*map(mathml, names))] == [1] * 4 + [2] * 4
 
-    def test_letters_come_from_the_font(self, browser, pieces):
+    def test_letters_come_from_the_font(self, browser):
         view = browser.new_page()
         view.set_content(f'<!DOCTYPE html><style>{mathematics_font()} b {{ font: 100px "STIX Two Math" }}</style>')
         width = """text => {
@@ -237,14 +270,14 @@ class TestInABrowser:
         view.close()
 
     def test_functions_stand_apart_from_factors(self, pieces):
-        close = pieces("<mi>r</mi><mi>cos</mi>")[1]
-        apart = pieces(mathml(Symbol("r") * cos(Symbol("a")))[6:-7])[1]
+        product = mathml(Symbol("r") * cos(Symbol("a")))[6:-7]
+        (_, close), (_, apart) = pieces("<mi>r</mi><mtext>cos</mtext>", product)
         assert apart[0] > close[0] + 0.14
 
-    @pytest.mark.parametrize(("latex", "rows"), [(r"\dot q", 2), (r"\ddot q_1", 2), (r"\dot\theta_k", 2), (r"q_1", 1)])
-    def test_formulas_of_the_site_do_as_well(self, pieces, monkeypatch, latex, rows):
+    def test_formulas_of_the_site_do_as_well(self, pieces, monkeypatch):
         pytest.importorskip("sphinx", reason="the site is made by the extra docs")
         monkeypatch.syspath_prepend(str(DOCS / "_extensions"))
         monkeypatch.delitem(sys.modules, "mathml", raising=False)
-        translated = importlib.import_module("mathml")._mathml(latex, as_block=False)
-        assert pieces(translated)[0] == rows
+        translated = importlib.import_module("mathml")._mathml
+        formulas = (r"\dot q", r"\ddot q_1", r"\dot\theta_k", "q_1")
+        assert [rows for rows, _ in pieces(*(translated(x, as_block=False) for x in formulas))] == [2, 2, 2, 1]
