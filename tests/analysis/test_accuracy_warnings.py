@@ -115,6 +115,7 @@ class TestLostEnergy:
         energy = far.energy()
         assert abs(energy[-1] - energy[0]) > 1e-3
 
+    @pytest.mark.second
     @pytest.mark.filterwarnings("error")
     def test_no_report_if_energy_is_conserved_or_need_not_be(self, kepler):
         kepler.integrate([1.0, 0.0], [0.0, 1e-3], t_end=3.0, check_growth=False)
@@ -148,6 +149,7 @@ class TestLostEnergy:
 
 
 class TestTolerances:
+    @pytest.mark.second
     def test_near_collision_is_integrated_or_rejected(self):
         words = "run kepler --q 1.999,0 --velocity 0,0.022366272 --span 18.849555921538759"
         assert re.search(r"q1 =\s+1\.99", output_of(words, "--tolerance", "1e-9"))

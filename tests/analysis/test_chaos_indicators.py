@@ -106,7 +106,7 @@ def test_regular_and_chaotic_trajectories_are_distinguished(galaxy):
     assert 0.0 < chaotic.sali()[1000] < 1e-2 < regular.sali()[-1]
 
 
-@pytest.mark.quick
+@pytest.mark.second
 def test_maximal_growth_between_saved_states_is_found(galaxy):
     """Between states that are kept, too: of a regular motion, whose changes come and go."""
     run, start = galaxy.integrate(*REGULAR, h=0.2, steps=60), ([REGULAR[0]], [REGULAR[1]])

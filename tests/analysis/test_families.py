@@ -288,6 +288,7 @@ def test_eigenvalues_have_their_error(method, error):
     assert abs(rest.frequencies[0] - 1) <= rest.error < error
 
 
+@pytest.mark.second
 def test_starts_without_a_family_are_refused(pendulum):
     with pytest.raises(sc.OrbitError, match="no orbit has this amplitude= beside the equilibrium; reduce it"):
         sc.family(pendulum, sc.equilibrium(pendulum, [0.0]), amplitude=4.0)

@@ -215,6 +215,7 @@ def test_parameter_at_a_bound_has_no_standard_error():
         assert found.standard_errors[name] == pytest.approx(error, rel=1e-3)
 
 
+@pytest.mark.second
 def test_constraints_are_not_fitted():
     bars = sc.compile_stepper(linkage(), sc.SVI(1, "gauss-lobatto:2"), flags=QUICK_FLAGS)
     with pytest.raises(sc.MethodError, match="fit is not available with constraints"):

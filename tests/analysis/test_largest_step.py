@@ -55,6 +55,7 @@ def test_integrate_runs_in_transformed_time() -> None:
         sc.solve_ivp(stepper(), (0.0, 1.0), [*START[0], *START[1]], h=0.1, time_transformation="frequency")
 
 
+@pytest.mark.second
 def test_unsuitable_time_transformation_is_detected_later() -> None:
     """Slow for hundreds of steps far out, with a rate that hardly changes; then the comet is at the sun."""
     far = [2.0 - 1e-4, 0.0, 0.0, (1e-4 / (2.0 - 1e-4)) ** 0.5]

@@ -67,7 +67,6 @@ def test_several_starts_lead_to_several_paths(kepler):
     assert all(np.abs(path.run().q[-1] - ends[1]).max() < 1e-11 for path in (left, right))
 
 
-@pytest.mark.quick
 def test_continuation_finds_what_the_straight_line_does_not(kepler):
     q1 = kepler.integrate([1.0, 0.0], [0.0, 1.0], h=0.1, steps=140).q[-1]
     h = np.full(56, 0.25)
@@ -80,7 +79,6 @@ def test_continuation_finds_what_the_straight_line_does_not(kepler):
     assert np.abs(kepler.path([1.0, 0.0], q1, 14.0, steps=56).q - found.q).max() < 1e-9
 
 
-@pytest.mark.quick
 def test_a_path_through_a_singularity_is_dropped(kepler):
     """Half of an ellipse with the semi-major axis a = 5/4; the mean of L over it is 3/(2 a) by the virial theorem."""
     a, T = 1.25, np.pi * 1.25**1.5
@@ -123,7 +121,6 @@ def test_error_of_a_path_is_that_of_finer_steps(kepler):
         assert max(away) / 3 < path.error < 10 * max(away)
 
 
-@pytest.mark.quick
 @pytest.mark.parametrize("amplitude", [1.0, 1e-9])
 @pytest.mark.parametrize("origin", [0.0, 1000.0])
 @pytest.mark.parametrize("gauge", ["0", "1"])
@@ -156,7 +153,6 @@ def test_morse_index_of_the_oscillator(oscillator, T, index):
         assert before <= k * np.pi <= after
 
 
-@pytest.mark.quick
 def test_hessian_by_both_ends_is_that_of_the_run():
     stepper = sc.compile_stepper(sc.problem("henon-heiles").system, "svi:4")
     run = stepper.integrate([0.1, 0.2], [0.3, 0.1], h=0.4, steps=25)

@@ -69,6 +69,7 @@ def test_a_halo_orbit_is_the_published_one(restricted):
     assert len(orbit.run(save_every=50)) == 5
 
 
+@pytest.mark.rotated
 def test_the_error_of_equal_steps_is_reported(restricted):
     """A near-rectilinear halo orbit about L2 in 60 steps, compared with adaptive ones, which DOP853 closes."""
     guess = {"velocity": [0.0, -0.1033, 0.0], "period": 1.5112, "fixed": ["y", "z"]}
@@ -291,6 +292,7 @@ def test_nonautonomous_orbits_have_a_period_of_the_system():
     assert_allclose(np.append(twice.q, twice.p), np.append(once.q, once.p), rtol=0, atol=1e-12)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("amplitude", "origin"), [(1.0, 0.0), (1e-3, 0.0), (1e-9, 0.0), (1.0, 1e3), (1e-3, 1e3), (1e-6, 1e3)]
 )

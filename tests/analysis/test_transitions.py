@@ -69,6 +69,7 @@ def test_an_error_of_a_run_is_detected(name: str, before: float, q: float, p: fl
     assert violated in found if violated else not found
 
 
+@pytest.mark.second
 def test_a_stepper_with_other_contacts_is_refused() -> None:
     plain = sc.LagrangianSystem.from_text("belt", ["x"], SYSTEMS["belt"][1])
     with pytest.raises(sc.StateError, match=r"'belt' has other contacts than .* pass a system with them, contacts="):

@@ -98,6 +98,7 @@ def test_the_value_at_a_common_end_is_that_of_each_element():
     assert lost == pytest.approx(mesh.weights[share == 0.5][0] * 0.5, rel=1e-4)
 
 
+@pytest.mark.second
 def test_jumps_in_the_plane_along_ends_of_elements():
     """The mass of a membrane, a quarter of which is four times as heavy."""
     density = "(1 + 3*unit_step(x - 1/2)*unit_step(y - 1/2))*u_t**2/2 - u_x**2/2 - u_y**2/2"

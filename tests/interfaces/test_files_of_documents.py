@@ -134,6 +134,7 @@ def test_includes_in_folders_that_a_user_names_may_be_anywhere(folders):
     assert load_model(own / "robot.xml", folders=[other]).dimension == 1
 
 
+@pytest.mark.second
 def test_model_is_read_from_standard_input(folders, monkeypatch):
     own, _ = folders
     monkeypatch.chdir(own)

@@ -140,7 +140,7 @@ VARYING = {
 }
 
 
-@pytest.mark.tiers(1, 1)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("kind", "s"), [("angles", 4), ("damped", 8), ("all", 2), ("all", 1)])
 def test_masses_of_positions_and_damping_need_no_newton_iteration(kind, s):
     """Compare with the states of Newton's iteration, for weak and for strong damping, also with adaptive steps."""
@@ -161,6 +161,7 @@ def test_masses_of_positions_and_damping_need_no_newton_iteration(kind, s):
         assert np.abs(one.constraint_values()).max() < 2e-14
 
 
+@pytest.mark.second
 def test_damping_of_constrained_momenta_and_energies_are_exact():
     """The angular momentum decays by e^(-gamma h), and without damping the energy has no drift."""
     system = sc.LagrangianSystem.from_text(
@@ -209,6 +210,7 @@ def test_adaptive_steps_are_rejected_where_the_iteration_of_multipliers_fails():
     assert np.array_equal(thinned.q[-1], run.q[-1])
 
 
+@pytest.mark.second
 def test_adaptive_steps_pass_a_dead_point_or_name_fixed_steps_which_do():
     """A parallelogram passes a point where G M^-1 G^T is singular, and goes on as the pendulum that it is."""
     rods = sc.LagrangianSystem.from_text(
@@ -236,6 +238,7 @@ def test_adaptive_steps_pass_a_dead_point_or_name_fixed_steps_which_do():
             assert np.abs(default.q[-1] - fixed.q[-1]).max() < 1e-9
 
 
+@pytest.mark.rotated
 def test_predictor_uses_the_velocity_at_the_end_of_the_step():
     """Two rods in space, RATTLE: 6.7 iterations a step where velocities and multipliers were guessed to stay."""
     rods = two_rods(axes="xyz", m=1.0)
@@ -321,6 +324,7 @@ def test_initial_states_are_projected_or_rejected():
     assert np.abs(stepper.constraint_values(moved.q, moved.p)).max() < 1e-15
 
 
+@pytest.mark.second
 def test_states_far_from_constraints_with_sines_are_projected():
     """Far beyond a state, sines are small against terms that are linear, so that their constraints seem linear."""
     links = lagrange(
@@ -337,7 +341,7 @@ def test_states_far_from_constraints_with_sines_are_projected():
         stepper.integrate(far, p, h=0.1, steps=1)
 
 
-@pytest.mark.tiers(2)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("s", [1, 2, 3, 4])
 def test_error_estimate_uses_the_velocity_at_the_end_of_the_step(s):
     """An estimate by the curve alone was 1500 times too large for degree 3 (median), and 0 for degree 1."""
@@ -354,6 +358,7 @@ def test_error_estimate_uses_the_velocity_at_the_end_of_the_step(s):
     assert np.abs(free.q[-1] - on_circle(angle)).max() < 3e-4
 
 
+@pytest.mark.second
 def test_positions_do_not_follow_discontinuous_constraints():
     """A pendulum whose hook moves by data: a kink is an impulse, the same for all steps, and a jump is refused."""
     system = lagrange("hook", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["(x - u)**2 + y**2 = 1"], inputs="u")

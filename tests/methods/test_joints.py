@@ -83,6 +83,7 @@ def test_a_point_slides_on_its_line():
     assert_allclose(run.q[:, 2:], line + 0.5 * np.column_stack([np.sin(f), -np.cos(f)]), rtol=0, atol=1e-8)
 
 
+@pytest.mark.second
 def test_welded_bodies_tumble_as_one():
     run = ran(JOINTS.welded_plates())
     (x1, y1, a1, x2, y2, a2), t = run.q.T, run.t
@@ -111,6 +112,7 @@ def by_joints() -> np.ndarray:
     return pulls
 
 
+@pytest.mark.second
 def test_member_forces_of_a_bridge_equal_the_method_of_joints():
     run = JOINTS.bridge().run(0.1, 1, "svi:1")
     pulls = JOINTS.pulls(run)

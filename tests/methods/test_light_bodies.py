@@ -36,6 +36,7 @@ def angle():
     return sc.compile_stepper(of_angle, "svi:8")
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("m", MASSES)
 def test_the_default_solver_has_the_digits_of_newtons_method(pendulum, angle, m):
     """Within 10 roundings of it, and right, by fixed and adaptive steps; counted where the multipliers lose them."""

@@ -127,6 +127,7 @@ def test_holonomic_and_moving_nonholonomic_constraints_combine():
     assert_allclose(run.multipliers()[:, 0], -np.sin(run.t), rtol=0, atol=1e-13)
 
 
+@pytest.mark.second
 def test_a_blade_of_prescribed_direction_does_no_work():
     """Constraint forces do work only if the rates of constraints at rest are not 0, also where they contain time."""
     system = lagrange("blade", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["x_dot*sin(t) = y_dot*cos(t)"])

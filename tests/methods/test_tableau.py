@@ -117,6 +117,7 @@ def test_the_stability_function_of_radau_loses_its_leading_coefficient() -> None
         np.testing.assert_allclose(np.array(Q, float), [1, -3 / 5, 3 / 20, -1 / 60], rtol=1e-15)
 
 
+@pytest.mark.tiers(7, 9)
 @pytest.mark.parametrize("degree", range(1, 12))
 def test_collocation_without_the_left_end_is_a_stable_by_its_eigenvalues(degree: int) -> None:
     """SC of the paper, Chebyshev-Lobatto without node 0: not A-stable from degree 3 on."""
@@ -160,6 +161,7 @@ def test_the_theta_method_is_a_stable_from_one_half_on(theta: Fraction) -> None:
     assert tableau_of(((theta,),), (1,)).is_a_stable == (theta >= HALF)
 
 
+@pytest.mark.second
 @settings(max_examples=60, deadline=None)
 @example(roots=[(-2, 2), (-1, 1), (2, 2)], sign=1)  # quotients with rounding where a coefficient is 0
 @given(

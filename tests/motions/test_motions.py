@@ -16,6 +16,9 @@ CASES = [
     if applies(Case(problem, method, situation))
 ]
 
+DEAR = ("two_words", "packages", "work_and_impulses")
+"""Properties that compile more than one integrator."""
+
 pytestmark = pytest.mark.long
 
 
@@ -26,8 +29,8 @@ def identity(name: str, case: Case) -> str:
 
 
 def sample() -> list[object]:
-    """Quick cases with each property of each kind of run, each situation and each system; the others rotate, those of a
-    stepper, which is compiled once, together."""
+    """Cases with each property of each kind of run, each situation and each system, dear ones in the second tier, the
+    others in the quick one; those beyond rotate, the cases of a stepper, which is compiled once, together."""
     kinds, names = [(name, problem.kind) for name in PROPERTIES for problem in PROBLEMS], [x.name for x in PROBLEMS]
     combinations = {
         (
@@ -37,10 +40,15 @@ def sample() -> list[object]:
         ): (name, case)
         for name, case in reversed(CASES)
     }
-    first = [combinations[x] for x in sorted(cover(sorted(combinations)))]
-    steppers = [*dict.fromkeys((case.problem, case.method) for _, case in CASES)]
-    marks = [[] if x in first else [pytest.mark.rotated(steppers.index((x[1].problem, x[1].method)))] for x in CASES]
-    return [pytest.param(*case, id=identity(*case), marks=of) for case, of in zip(CASES, marks, strict=True)]
+    first = {combinations[x] for x in cover(sorted(combinations))}
+    steppers = {x: i for i, x in enumerate(dict.fromkeys((case.problem, case.method) for _, case in CASES))}
+
+    def tier(name: str, case: Case) -> pytest.MarkDecorator:
+        if (name, case) not in first:
+            return pytest.mark.rotated(steppers[case.problem, case.method])
+        return pytest.mark.second if name in DEAR else pytest.mark.quick
+
+    return [pytest.param(*case, id=identity(*case), marks=tier(*case)) for case in CASES]
 
 
 @pytest.mark.parametrize(("name", "case"), sample())

@@ -10,7 +10,7 @@ def identity(cell: Cell, chart: str) -> str:
     return "-".join([cell.kind, cell.method, cell.precision, cell.stepping, chart])
 
 
-@pytest.mark.tiers(1, 1)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(30)
 @pytest.mark.parametrize(("cell", "chart"), [pytest.param(*case, id=identity(*case)) for case in CASES])
 def test_motions_are_the_same_in_all_charts(cell: Cell, chart: str) -> None:

@@ -121,7 +121,7 @@ OTHER_SYSTEMS = {"pumped-cart-pole": LOW, "forced-cart-pole": FORCED, "radial-fr
 FEW = {"pumped-cart-pole": LOW[:25:12], "forced-cart-pole": FORCED[:2], "damped-pair": DAMPED[1:3]}
 
 
-@pytest.mark.tiers(1, 1)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(
     ("name", "method"), [pair(name, method) for name, methods in FEW.items() for method in methods]
 )

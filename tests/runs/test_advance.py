@@ -42,7 +42,7 @@ def test_target_times_and_parameters_may_be_changed_during_a_run(pushed):
     assert run.q == pytest.approx(second.q[-1], abs=1e-8)
 
 
-@pytest.mark.quick
+@pytest.mark.second
 @pytest.mark.parametrize("save_every", [3, 4001, 10**9])
 def test_the_end_is_saved_if_whole_steps_reach_it(save_every):
     problem = sc.problem("kepler")

@@ -119,6 +119,7 @@ def test_squares_of_states_neither_overflow_nor_underflow(method, solver, h, exp
     assert scaled.iterations == pytest.approx(one.iterations, rel=0.02, abs=2)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("exponent", [-660, 660])
 @pytest.mark.parametrize(("method", "solver"), [way for way in WAYS if way[0] != "stoermer-verlet"])
 def test_adaptive_steps_are_controlled_at_every_scale(method, solver, exponent):

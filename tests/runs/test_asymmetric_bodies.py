@@ -125,6 +125,7 @@ def test_a_free_body_takes_one_drift(stepper):
     assert "LEAPS = 2 }" in stepper.source.code
 
 
+@pytest.mark.second
 def test_short_steps_add_up_without_loss(stepper):
     moments, h = (1, 2, 2.5), 2.0**-40
     p0 = [float(x) for x in momenta(ATTITUDE, [0.3, -1.0, 5.0])]

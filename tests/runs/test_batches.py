@@ -102,6 +102,7 @@ def test_threads_and_calls_do_not_change_results(name: str, plan: str, monkeypat
     assert reported[-1] == (33 if name == "rod" else COUNT)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     "arguments", [{"t_end": 0.2, "tolerance": 1e-9, "save_every": 10**9}, {"h": 0.05, "steps": 2, "threads": 1}]
 )

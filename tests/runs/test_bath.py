@@ -206,6 +206,7 @@ def test_rigid_dipole_has_the_average_of_langevin(friction):
     assert agrees(*averages(dipole, [1, 0, 0, 0], 0.4, 4000, observe, metropolis=True), exact, 0.02)
 
 
+@pytest.mark.second
 def test_additive_noise_heats_at_its_rate():
     # E H = H0 + sigma^2 t / 2, which SVI preserve for quadratic H
     noisy = compiled(
@@ -286,6 +287,7 @@ def test_model_files_and_generated_programs_have_the_same_noise(tmp_path):
     subprocess.run(["make", "run"], cwd=tmp_path / "program", check=True, capture_output=True)
 
 
+@pytest.mark.second
 def test_acceptance_does_not_depend_on_units():
     """In a unit of length of 1e-10 the same implicit steps are accepted; a quarter is rejected."""
     runs = []

@@ -99,6 +99,7 @@ MASSES = {
 }
 
 
+@pytest.mark.second
 @pytest.mark.covering
 @pytest.mark.parametrize("method", [sc.StoermerVerlet(), sc.SVI(2, "gauss-lobatto:2")])
 @pytest.mark.parametrize(

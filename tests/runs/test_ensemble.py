@@ -299,6 +299,7 @@ def test_rows_in_transformed_time_keep_their_tau() -> None:
     assert np.array_equal(by_steps.t, by_steps.times)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("t_eval", [[2.0, 5.0], [0.5, 2.0, 5.0]])
 def test_ends_with_output_times_are_those_of_terminal_events(t_eval: list[float]) -> None:
     stepper = stepper_for("kepler", sc.SVI(5)).with_events(sc.Event("q1 - 1/2", -1, terminal=True))

@@ -790,7 +790,7 @@ def test_lyapunov_exponent_of_the_stadium_billiard(point):
     assert abs(exponents[0] + exponents[3]) < 1e-10
 
 
-@pytest.mark.quick
+@pytest.mark.second
 @pytest.mark.parametrize("turns", [0, 10_000])
 def test_derivatives_through_impacts_do_not_depend_on_the_turns_of_an_angle(turns):
     """Differences of states over a step of 61 rad, about 10,000 turns times 2^-10, were no derivatives."""

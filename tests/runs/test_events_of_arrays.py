@@ -47,7 +47,7 @@ def test_a_box_of_particles(gas):
     assert abs(np.sum(run.p["r"][-1] ** 2) / np.sum(v**2) - 1.0) < 1e-14
 
 
-@pytest.mark.quick
+@pytest.mark.second
 def test_a_restored_run_continues_with_its_events(gas):
     run = gas.with_events(BOX).start({"r": [[0.3, 0.6], [0.8, 0.2]]}, velocity={"r": [[0.5, -0.3], [1.0, 0.7]]}, h=0.1)
     run.advance(20)

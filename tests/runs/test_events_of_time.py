@@ -30,6 +30,7 @@ def test_every_kick_is_found(then: dict[str, str] | None, steps: dict[str, Any])
     assert run.p[-1, 0] == (500 if then else 0)
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize(
     ("function", "zeros"),
     [
@@ -48,6 +49,7 @@ def test_zeros_of_polynomials_are_found_along_steps() -> None:
     assert_allclose(run.events[0].t, [1.0, 2.0, 3.0], rtol=1e-12)
 
 
+@pytest.mark.second
 def test_backward_terminal_and_continued_runs() -> None:
     back = times("sin(pi*t)", KICK, t_end=-20.5)
     assert_allclose(back.events[0].t, -np.arange(1.0, 21.0), rtol=4e-16)
@@ -60,6 +62,7 @@ def test_backward_terminal_and_continued_runs() -> None:
     assert run.record().p[-1, 0] == 30.0
 
 
+@pytest.mark.second
 def test_coincident_events_and_ensembles() -> None:
     both = [sc.Event("sin(pi*t)"), sc.Event("sin(2*pi*t)", then=KICK), sc.Event("x - 10")]
     run = free().integrate([0.0], [0.0], events=both, t_end=10.2, check_growth=False)

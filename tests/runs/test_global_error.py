@@ -178,6 +178,7 @@ class TestMotions:
         first, *others = np.random.default_rng(0).standard_normal((1 + comparisons, 10**6))
         assert np.mean(safety * np.max([abs(first - each) for each in others], axis=0) < abs(first)) < 1e-3
 
+    @pytest.mark.second
     def test_a_third_comparison_is_made_where_two_do_not_suffice(self):
         stepper, start = motion_stepper("kepler .6")
         found = {

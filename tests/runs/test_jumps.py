@@ -21,6 +21,7 @@ def end(run):
     return np.concatenate([run.q[-1], run.p[-1]])
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("plan", [{"t_end": 5.0}, {"h": 0.17, "steps": 30}], ids=["adaptive", "fixed"])
 def test_snells_law_total_reflection_and_scattering(plan):
     """Index of refraction n = sqrt(1 - 2 V): sin(a) = n sin(b) up to the critical angle."""
@@ -40,6 +41,7 @@ def test_snells_law_total_reflection_and_scattering(plan):
         assert run.energy_error() < 1e-15
 
 
+@pytest.mark.rotated
 def test_a_square_well_and_a_moving_step():
     well = compiled("x_dot**2/2 - V*(1 - unit_step(x + 1)*unit_step(1 - x))", "x", V=2.0)
     run = well.integrate([0.3], [1.1], t_end=400 / 1.1)
@@ -115,6 +117,7 @@ def test_corners_starts_and_grazes():
     assert [len(run.switches[0]) for run in runs] == [0, 0, 6]
 
 
+@pytest.mark.second
 @pytest.mark.filterwarnings("error::scvi_codegen.common.errors.AccuracyWarning")
 def test_starts_on_a_jump_have_the_energy_of_their_side():
     fall = compiled("x_dot**2/2 - x/4 - V*unit_step(x)", "x", V=0.3)

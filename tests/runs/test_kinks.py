@@ -37,7 +37,7 @@ def without_end(case: Case) -> dict:
     return {name: value for name, value in case.arguments.items() if name != "t_end"}
 
 
-@pytest.mark.tiers(5, 5)
+@pytest.mark.tiers(1, 1)
 @families
 def test_motions_across_kinks_are_within_tolerances(family):
     assert not wrong(family, [1], ["svi:4"], [kind for kind in KINDS if kind != "order"])
@@ -57,6 +57,7 @@ def test_methods_of_other_orders_are_within_tolerances(family):
     assert not [*wrong(family, [2], ["svi:2"], kinds), *wrong(family, [4], ["svi:8"], kinds)]
 
 
+@pytest.mark.rotated
 def test_motions_at_rest_on_a_surface():
     """A rounding error beside it, which they leave after a first step within rounding; touching it again and again."""
     assert not [*wrong("rope", [85], ["svi:4"], ["error="]), *wrong("floor", [133], ["svi:4"], ["order"])]
@@ -153,6 +154,7 @@ def test_derivatives_across_kinks_are_those_of_the_motion(family):
         assert np.abs(change * step - (after - before) / 2).max() < 1e-11 * max(1.0, case.growth) * case.ranges.max()
 
 
+@pytest.mark.second
 def test_functions_of_nested_kinks_follow_their_sides():
     """Outer functions are smooth in a step only with the sides of the inner ones."""
     nested = sc.compile_stepper(lagrange("nested", "x", "x_dot**2/2 - abs(max(x, -x/3) - 1)"), "svi:4")
@@ -162,6 +164,7 @@ def test_functions_of_nested_kinks_follow_their_sides():
         assert square.integrate(q, p, t_end=20.0).energy_error() < 1e-13
 
 
+@pytest.mark.second
 def test_the_first_of_many_crossings_in_a_step_is_found():
     saw = lagrange("saw", "x", "x_dot**2/2", forces={"x": "e*sign(sin(w*x))"}, e=1e-3, w=20.0)
     run = sc.compile_stepper(saw, "svi:4").integrate([0.01], [1.0], t_end=30.0)
@@ -179,6 +182,7 @@ def test_kinks_of_time_at_starts_and_ends_of_steps(periods, steps):
     assert abs(run.q[-1, 0] - 3 * period**2 / 8) < 1e-13 * (1 + periods)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("width", [1e-3, 1e-6, 1e-9])
 @pytest.mark.parametrize("steps", [{}, {"h": 0.7}], ids=["adaptive", "fixed"])
 def test_short_visits_of_the_other_side_count(width, steps):
@@ -189,6 +193,7 @@ def test_short_visits_of_the_other_side_count(width, steps):
     assert [len(switches) for switches in run.switches] == [2, 1]
 
 
+@pytest.mark.second
 def test_steps_across_many_kinks_do_not_add_energy():
     """After whole periods x = 0 and |v| is that of the start: 112 jumps of a force."""
     relay = lagrange("relay", "x", "x_dot**2/2", forces={"x": "f*(1 - 2*unit_step(x)) + c"}, f=2.875, c=-0.125)
@@ -198,6 +203,7 @@ def test_steps_across_many_kinks_do_not_add_energy():
     assert abs(run.p[-1, 0]) == pytest.approx(0.375, rel=1e-11)
 
 
+@pytest.mark.second
 def test_members_of_ensembles_have_dense_output_across_kinks():
     floor = lagrange("floor", "y", "y_dot**2/2 - y - k*positive_part(-y)**2/2", k=1e3)
     stepper = sc.compile_stepper(floor, "svi:4")
@@ -220,6 +226,7 @@ def test_steps_across_kinks_are_verified():
     assert sc.verify(spring, "svi:1", stepper=sc.compile_stepper(spring, "svi:1", kinks="as formulas")).passed
 
 
+@pytest.mark.rotated
 def test_modes_may_be_left_out_of_parameters_in_order():
     spring = lagrange("spring", "x", "x_dot**2/2 - k*positive_part(x)**2 - x**2", k=1.0)
     stepper = sc.compile_stepper(spring, "svi:4")
@@ -232,6 +239,7 @@ def test_modes_may_be_left_out_of_parameters_in_order():
         sc.compile_stepper(spring, "svi:4", kinks="exact")
 
 
+@pytest.mark.rotated
 def test_a_stiffness_is_fitted_across_kinks():
     floor = lagrange("floor", "y", "y_dot**2/2 - 9.8*y - k*positive_part(-y)**2", k=1e3)
     stepper, times = sc.compile_stepper(floor, "svi:4"), np.arange(0.1, 2.01, 0.05)
@@ -241,6 +249,7 @@ def test_a_stiffness_is_fitted_across_kinks():
     assert fit.parameters["k"] == pytest.approx(1.2e3, rel=1e-9)
 
 
+@pytest.mark.rotated
 def test_periodic_orbits_between_springy_walls():
     """Of any velocity v: 4/v in flight and half a period of each spring."""
     walls = lagrange("walls", "x", "x_dot**2/2 - 50*(positive_part(x - 1)**2 + positive_part(-x - 1)**2)")
@@ -255,6 +264,7 @@ def duration_of_contact(v: float) -> float:
     return 4.0 * np.sqrt(d) * quad(lambda z: 1.0 / np.sqrt(rate(z)), 0.0, 1.0, epsabs=0.0, epsrel=1e-13)[0]
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize(
     ("method", "tolerance", "bound"), [("svi:4", 1e-8, 1e-6), ("svi:8", 1e-8, 2e-7), ("svi:8", None, 1e-12)]
 )

@@ -8,6 +8,7 @@ from samples import QUICK_FLAGS
 import scvi_codegen as sc
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("plan", [{"t_end": 3.0}, {"h": 5.0, "steps": 1}], ids=["adaptive", "fixed"])
 def test_changes_that_chatter_are_named(plan):
     """At irregular intervals, which decrease to 1e-12."""
@@ -26,6 +27,7 @@ def test_bounces_that_accumulate_slowly_end_in_rest():
     assert closes == (pytest.approx(end, rel=1e-7), ("slip",))
 
 
+@pytest.mark.second
 def test_kinks_that_runs_do_not_locate_are_shown_in_short():
     apart = " + ".join(f"(r[i, {k}] - r[j, {k}] - 10*rint((r[i, {k}] - r[j, {k}])/10))**2" for k in (0, 1))
     pairs = f"sum(i in N, (r_dot[i, 0]**2 + r_dot[i, 1]**2)/2) - sum(i < j in N, positive_part(1 - sqrt({apart}))**2)"
@@ -44,6 +46,7 @@ PULSES = {
 }
 
 
+@pytest.mark.tiers(2, 4)
 @pytest.mark.parametrize("plan", [{}, {"h": 0.7}], ids=["adaptive", "fixed"])
 @pytest.mark.parametrize("u", PULSES)
 def test_all_zeros_of_functions_of_time_are_found(u, plan):

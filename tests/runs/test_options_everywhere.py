@@ -183,7 +183,7 @@ def check_equal(runs: Any, stepper: sc.Stepper, arguments: dict[str, Any]) -> No
             assert abs(runs.action()[j] - one.action()) < 1e-13
 
 
-@pytest.mark.tiers(5, 5)
+@pytest.mark.tiers(2, 5)
 @pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
 @pytest.mark.covering
 @pytest.mark.parametrize("option", OPTIONS)

@@ -151,6 +151,7 @@ def test_gradients_are_the_transpose_of_sensitivities(name, changes):
     assert gradient.h is None
 
 
+@pytest.mark.second
 def test_hessians_of_adaptive_runs_are_symmetric():
     run = MOTIONS["driven"].run(**ADAPTIVE)
     directions = np.eye(7)[:, :6]  # the step sizes are constant

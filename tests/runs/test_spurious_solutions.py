@@ -63,6 +63,7 @@ def test_unresolved_vibrations_are_no_spurious_solutions(solver: str) -> None:
     assert np.ptp(run.energy()) < 1e-3
 
 
+@pytest.mark.second
 def test_explicit_stages_have_no_spurious_solutions() -> None:
     """A step of Euler's method from rest does not move, its halves do: q1 = q + h v, then v1 = v + h a."""
     stepper, q, h, steps = sc.compile_stepper(PENDULUM, "explicit-euler"), np.array([0.3, 0.7]), 1e-3, 500

@@ -18,6 +18,7 @@ def little_memory(monkeypatch):
     monkeypatch.setattr(capacity, "usable_memory", lambda: 6e6)
 
 
+@pytest.mark.tiers(1, 2)
 @pytest.mark.parametrize("settings", [{}, {"events": sc.Event("x")}, {"precision": "double-double"}])
 def test_member_with_too_many_states_ends_and_the_others_are_returned(settings, little_memory):
     stepper = sc.compile_stepper(OSCILLATOR, "svi:4", **settings)

@@ -67,6 +67,7 @@ def test_first_step_is_the_one_requested() -> None:
     assert_allclose(far.q[-1], [np.cos(5.0), np.sin(5.0)], atol=1e-5)
 
 
+@pytest.mark.second
 def test_absolute_tolerances_by_name_of_coordinate_array_and_rotation() -> None:
     interface = kepler().interface
     assert absolute_tolerances(interface, 2, 0.5).tolist() == [0.5, 0.5]
@@ -124,6 +125,7 @@ def test_arguments_of_scipy() -> None:
         sc.solve_ivp(kepler(), **arguments, atol=-1.0)
 
 
+@pytest.mark.rotated
 def test_partial_steps_in_double_double_are_shorter_than_a_high_word() -> None:
     oscillator = sc.LagrangianSystem.from_text("oscillator", ["x"], "x_dot**2/2 - x**2/2")
     stepper = sc.compile_stepper(oscillator, "svi:12", precision="double-double")

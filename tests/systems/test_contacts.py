@@ -155,7 +155,7 @@ PLANE = "(x_dot**2 + y_dot**2)/2"
 METHODS = pytest.mark.parametrize("degree", [1, 2, 3])
 
 
-@pytest.mark.quick
+@pytest.mark.tiers(1, 1)
 @METHODS
 def test_a_sliding_ball_rolls(degree: int) -> None:
     table = sc.contact("y - r", slip="x_dot - r*a_dot", friction=0.3)
@@ -192,7 +192,7 @@ def test_an_oscillator_on_a_belt_sticks_and_slips(degree: int, error: float) -> 
     assert times[-1] - times[-2] == pytest.approx(period, abs=error)
 
 
-@pytest.mark.quick
+@pytest.mark.tiers(1, 2)
 @pytest.mark.parametrize(("degree", "error"), [(1, 4e-6), (2, 1e-9), (3, 1e-13)])
 @pytest.mark.parametrize("gap", [True, False])
 def test_an_oscillator_stops_after_four_swings(degree: int, error: float, gap: bool) -> None:
@@ -221,7 +221,6 @@ def test_a_falling_rod_sticks_and_slides(degree: int, error: float) -> None:
     assert np.abs(adaptive - true).max() < 1e-11
 
 
-@pytest.mark.quick
 def test_a_block_on_a_slope_creeps_nowhere() -> None:
     for degrees, slides in ((20, False), (35, True)):
         a = np.deg2rad(degrees)
