@@ -104,6 +104,45 @@ def test_noise_is_a_function_of_seed_trajectory_and_step():
     assert len(np.unique(runs.q[-1])) == 9
 
 
+CHAIN_OF_TWO = {
+    "coordinates": ["x", "y"],
+    "lagrangian": "x_dot**2/2 + y_dot**2 - (x**2 - 1)**2 - x*y/2 - y**4",
+    "parameters": {"kT": 1, "g": 1, "s": 1},
+    "dissipation": "g*(x_dot - y_dot)**2/2",
+    "noise": {"y": "s/(1 + x**2)"},
+}
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("temperature", ["kT", "kT*(2 - t)"])
+def test_lanes_have_the_bits_of_single_runs_and_return_to_the_state_before_a_failure(temperature):
+    pair = compiled("stoermer-verlet", "pair", **CHAIN_OF_TWO, temperature=temperature)
+    assert pair.ensemble is not None
+    q, p = np.random.default_rng(1).normal(size=(2, 13, 2))
+    values = {"kT": np.linspace(0.5, 2, 13), "s": np.linspace(0, 1, 13)}
+    settings = {"h": 0.07, "steps": 40, "seed": 3, "parameters": values}
+    runs = pair.integrate_ensemble(q, p, **settings, threads=2)
+    own = {name: column[0] for name, column in values.items()}
+    arguments = q[0], p[0], {**settings, "parameters": own}
+    if temperature == "kT":
+        single = pair.integrate(*arguments[:2], **arguments[2])
+    else:
+        with pytest.raises(sc.StepFailedError, match="must not be negative") as failure:
+            pair.integrate(*arguments[:2], **arguments[2])
+        single = failure.value.trajectory
+    assert (runs.status == ("ok" if temperature == "kT" else "not finite")).all()
+    assert len(single) - 1 == runs.steps[0] == (40 if temperature == "kT" else 28)
+    assert (runs.q[: len(single), 0] == single.q).all()
+    saved = pair.integrate_ensemble(q, p, **settings, save_every=4)
+    assert np.array_equal(saved.q, runs.q[::4], equal_nan=True)
+    extremes = pair.integrate_ensemble(q, p, **{**settings, "steps": 20}, observe="extremes").observed
+    assert (extremes[1, :, :2] == runs.q[:21].max(axis=0)).all()
+    reverse = {name: column[::-1] for name, column in values.items()}  # the middle member has its stream
+    others = pair.integrate_ensemble(q[::-1], p[::-1], **{**settings, "parameters": reverse})
+    assert np.array_equal(others.q[:, 6], runs.q[:, 6], equal_nan=True)
+    assert (others.q[1:20] != runs.q[1:20, ::-1]).any(axis=(0, 2)).sum() == 12
+
+
 @pytest.mark.second
 def test_zero_temperature_is_plain_damping_and_heat_balances_the_energy():
     well = compiled("composition:4", "well", **WELL)

@@ -78,6 +78,8 @@ Larger ones are slower inlined: six bodies by 3 per cent, a chain of 64 masses b
 """
 
 
+LARGEST_BATH_IN_LANES = 1024
+"""Largest number of factors of a heat bath of which each lane has its own, on the stack."""
 LARGEST_IN_LANES = 256
 """Largest number of values at the points of a step in two words in which trajectories, not points, are SIMD lanes.
 
@@ -539,8 +541,8 @@ def render_ensemble(
 ) -> Source | None:
     """Return source that integrates many trajectories at once, one per lane, by fixed-point iteration or explicitly.
 
-    ``None`` for other steps, for rigid bodies turned in closed form, in a heat bath, and with integrals: with a time
-    transformation, trajectories have no common times.
+    ``None`` for other steps, for rigid bodies turned in closed form, for implicit steps in a heat bath, and with
+    integrals: with a time transformation, trajectories have no common times.
 
     Args:
         program: the program.
@@ -549,7 +551,8 @@ def render_ensemble(
         tangents: number of tangent vectors among the coordinates.
     """
     fixed_point, split, headers = program.fixed_point, program.splitting, dict[str, str]()
-    if program.quantities.integrals or program.bath:
+    bath = program.bath
+    if program.quantities.integrals or (bath and not (split and bath.sizes["BATH_FACTORS"] <= LARGEST_BATH_IN_LANES)):
         return None
     if split is not None and not split.bodies:
         kernels, points, source = split.kernels, 1, splitting_source(split, observed)
@@ -574,6 +577,7 @@ def render_ensemble(
         "cut": is_divided((*kernels, *((observed,) if observed else ()))),
         "needs_velocities": velocities,
         "hot": "static",
+        "inverse_roots": inverse_roots([bath.kernel]) if bath else (),
         "fixed_point": source,
         "own_headers": headers,
         "scratch": scratch_size(program),

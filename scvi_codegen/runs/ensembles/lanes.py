@@ -109,7 +109,7 @@ class CommonRuns:
         binding = None
         if observation is not None:
             binding = observation.binding
-        elif not (constrained and (self.ensemble.inputs or stepper.sums_action)):
+        elif not (constrained and (self.ensemble.inputs or stepper.sums_action)) and not self.ensemble.noise.metropolis:
             binding = stepper._ensemble_binding
         if binding is not None:
             lanes = LaneRuns(binding, self.ensemble, self._fields(), common=self)

@@ -113,7 +113,8 @@ FEATURES = {
     for property_, operations, remedy in (
         (
             "in a heat bath",
-            f"adaptive error t_eval dense_output events advice tangent pullback sensitivity hessian {_RUNS} {_ACTIONS}",
+            "adaptive error t_eval dense_output events advice device tangent pullback sensitivity hessian "
+            f"{_RUNS} {_ACTIONS}",
             "give h and steps, and use saved states and averages of them; steps alone have derivatives",
         ),
         (

@@ -31,7 +31,7 @@ from scvi_codegen.runs.states.words import Word, Words, stacked, with_low, word
 from scvi_codegen.runs.stepping.chunks import drive
 from scvi_codegen.runs.stepping.features import require
 from scvi_codegen.runs.stepping.integrator import Integrator
-from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise, check_temperature
+from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise, check_temperature, negative_temperature
 from scvi_codegen.runs.stepping.projection import check_reachable, singular_position
 from scvi_codegen.runs.stepping.saving import checkpoint
 from scvi_codegen.runs.stepping.step_plan import (
@@ -522,8 +522,9 @@ class Memory:
         drive(self._taken, steps, ended=lambda: self.arrived or stop(), progress=progress)
 
     def _failure(self, status: int) -> StepFailedError:
-        check_temperature(self.stepper, self.t + self._step_size, self._parameters)
-        remark = singular_position(self.stepper, self._q, self.t, self._parameters)
+        if remark := negative_temperature(self.stepper, self.t + self._step_size, self._parameters):
+            remark = f". Cause: {remark}"
+        remark = remark or singular_position(self.stepper, self._q, self.t, self._parameters)
         failures = self.stepper.binding.failures
         return step_failure(status, self._report, step=self.steps, h=self._step_size, remark=remark, failures=failures)
 

@@ -59,13 +59,18 @@ def report_of(memory: Any) -> BathReport | None:
     return BathReport(int(memory.seed), float(memory.heat), accepted)
 
 
-def check_temperature(stepper: Any, t: float, parameters: Array) -> None:
-    """Raise :class:`StateError` if kT is negative at a time; without the values of inputs it is not checked."""
+def negative_temperature(stepper: Any, t: float, parameters: Array) -> str:
+    """Return a sentence on a negative kT at a time, or ""; without the values of inputs it is not checked."""
     interface = stepper.interface
     evaluate, names = evaluation(interface.temperature or "0")
     values = {"t": float(t), **dict(zip(interface.parameters, map(float, parameters), strict=False))}
     with suppress(KeyError):
         if (kT := evaluate([values[name] for name in names])) < 0.0:
-            raise StateError(
-                f"the temperature kT = {interface.temperature} is {kT:g} at t = {t:g}: it must not be negative"
-            )
+            return f"the temperature kT = {interface.temperature} is {kT:g} at t = {t:g}: it must not be negative"
+    return ""
+
+
+def check_temperature(stepper: Any, t: float, parameters: Array) -> None:
+    """Raise :class:`StateError` if kT is negative at a time."""
+    if message := negative_temperature(stepper, t, parameters):
+        raise StateError(message)

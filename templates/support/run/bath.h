@@ -11,10 +11,20 @@
 #define NO_FRICTION 1e-14 /* relative to the largest k: it is 0 but for rounding */
 #define JACOBI_SWEEPS 30
 
-/* W and V of each block, n rows of n numbers, and the decay e^(-k tau) - 1 and the strength of the noise of each y. */
-typedef struct {
-  double tau, terms[BATH_TERMS], w[BATH_FACTORS], v[BATH_FACTORS], decay[M], strength[M];
-} bath_factors;
+/* W and V of each block, n rows of n numbers, the decay e^(-k tau) - 1 and the strength of the noise of each y, and the
+ * root of tau: of a trajectory, or of those in SIMD lanes. */
+#define FACTORS_OF(number)                                                                   \
+  struct {                                                                                   \
+    number terms[BATH_TERMS], w[BATH_FACTORS], v[BATH_FACTORS], decay[M], strength[M], root; \
+  }
+typedef FACTORS_OF(double) bath_factors;
+#ifdef MANY_TRAJECTORIES
+typedef lanes bath_number;
+typedef FACTORS_OF(lanes) present_factors;
+#else
+typedef double bath_number;
+typedef bath_factors present_factors;
+#endif
 
 static inline void rotate(double *x, double *y, double c, double s)
 {
@@ -116,7 +126,8 @@ static int prepare_bath(bath_factors *bath, double t, double h, const double *q,
   double *w = bath->w, *v = bath->v;
   memset(w, 0, sizeof bath->w);
   memset(v, 0, sizeof bath->v);
-  bath->tau = fabs(h) / 2;
+  const double tau = fabs(h) / 2;
+  bath->root = sqrt(tau);
   for (int b = 0, first = 0, n; b < BLOCKS; b++, w += n * n, v += n * n, first += n) {
     double s[LARGEST_BLOCK * LARGEST_BLOCK] = {0}, largest = 0;
     n = BLOCK_SIZE[b];
@@ -137,33 +148,50 @@ static int prepare_bath(bath_factors *bath, double t, double h, const double *q,
       largest = fmax(largest, fabs(s[i * n + i]));
     for (int i = 0; i < n; i++) {
       const double rate = fabs(s[i * n + i]) > NO_FRICTION * largest ? s[i * n + i] : 0;
-      bath->decay[first + i] = expm1(-rate * bath->tau);
-      bath->strength[first + i] = sqrt(-temperature * expm1(-2 * rate * bath->tau));
+      bath->decay[first + i] = expm1(-rate * tau);
+      bath->strength[first + i] = sqrt(-temperature * expm1(-2 * rate * tau));
     }
   }
   return temperature >= 0 && all_finite(bath->terms, BATH_TERMS) && all_finite(bath->strength, M);
 }
 
-/* Adds half a step to p + carry, by M + STRENGTHS normals; returns the change of the kinetic energy. */
-static inline double exchange_heat(const bath_factors *bath, const double *normals, double *p, double *carry)
+static inline bath_number product(int n, const bath_number *x, const bath_number *y)
 {
-  const double *w = bath->w, *v = bath->v, *at_rest = bath->terms + 1, *sigma = bath->terms + BATH_TERMS - STRENGTHS;
-  double heat = 0;
+  bath_number sum = x[0] * y[0];
+  for (int i = 1; i < n; i++)
+    sum += x[i] * y[i];
+  return sum;
+}
+
+/* Adds half a step to p + carry, by M + STRENGTHS normals; returns the change of the kinetic energy. */
+static inline bath_number exchange_heat(const present_factors *bath, const bath_number *normals, bath_number *p,
+    bath_number *carry)
+{
+  const bath_number *w = bath->w, *v = bath->v, *at_rest = bath->terms + 1, *sigma = bath->terms + BATH_TERMS - STRENGTHS;
+  bath_number heat = {0};
   for (int b = 0, first = 0, n; b < BLOCKS; b++, w += n * n, v += n * n, first += n) {
     const int *at = BLOCK_COORDINATE + first;
-    double x[LARGEST_BLOCK], noise[LARGEST_BLOCK], change[LARGEST_BLOCK];
+    bath_number x[LARGEST_BLOCK], noise[LARGEST_BLOCK], change[LARGEST_BLOCK];
     n = BLOCK_SIZE[b];
     for (int i = 0; i < n; i++) {
       x[i] = (p[at[i]] - at_rest[at[i]]) + carry[at[i]];
-      noise[i] = STRENGTHS ? sqrt(bath->tau) * sigma[at[i]] * normals[M + at[i]] : 0;
+      if (STRENGTHS)
+        noise[i] = bath->root * sigma[at[i]] * normals[M + at[i]];
     }
     for (int i = 0; i < n; i++) {
-      const double y = dot(n, v + i * n, x), further = STRENGTHS ? dot(n, v + i * n, noise) : 0;
-      change[i] = bath->decay[first + i] * y + bath->strength[first + i] * normals[at[i]] + further;
+      const bath_number y = product(n, v + i * n, x);
+      change[i] = bath->decay[first + i] * y + bath->strength[first + i] * normals[at[i]];
+      if (STRENGTHS)
+        change[i] += product(n, v + i * n, noise);
       heat += change[i] * (y + change[i] / 2);
     }
-    for (int i = 0; i < n; i++)
-      add_compensated(&p[at[i]], &carry[at[i]], dot(n, w + i * n, change), 0);
+    for (int i = 0; i < n; i++) { /* as add_compensated */
+      const bath_number increment = product(n, w + i * n, change), old = p[at[i]];
+      const bath_number sum = old + increment, part = sum - old;
+      const bath_number rest = ((old - (sum - part)) + (increment - part)) + carry[at[i]];
+      p[at[i]] = sum + rest;
+      carry[at[i]] = rest - (p[at[i]] - sum);
+    }
   }
   return heat;
 }

@@ -128,6 +128,7 @@ int NAME(advance)(run_memory *run, long long steps, long long every, const real 
   int status = steps == 0 || prepare_bath(&bath, run->t, run->h, run->q, parameters) ? OK : NOT_FINITE;
   for (int k = 0; total.steps < steps && status == OK; k = (k + 1) % STEPS_DRAWN) {
     const double heat = run->heat, heat_low = run->heat_low;
+    const long long step = run->step;
     state now;
     memcpy(&now, run, sizeof now);
     total.t = now.t, total.duration = run->h;
@@ -144,7 +145,7 @@ int NAME(advance)(run_memory *run, long long steps, long long every, const real 
 #endif
     if (status != OK) { /* the state before the step */
       memcpy(run, &now, sizeof now);
-      run->heat = heat, run->heat_low = heat_low;
+      run->heat = heat, run->heat_low = heat_low, run->step = step;
       break;
     }
     half_of_bath(run, &bath, second[k]);

@@ -72,6 +72,9 @@ static void drop_infinite(const state *now, const lanes *dq, const lanes *dp, do
     active[j] = sum.lane[j] == 0.0 ? active[j] : 0.0;
 }
 
+#ifdef HEAT_BATH
+#include "bath_lanes.h"
+#endif
 #ifdef OBSERVED
 #include "observation.h"
 #endif
@@ -222,6 +225,10 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
   memcpy(parameters, block->parameters, sizeof(lanes) * P);
   memcpy(memory, block->memory, sizeof memory);
   prepare_iteration(&step, &data);
+#ifdef HEAT_BATH
+  block_bath bath;
+  prepare_lanes(&bath, block, &now);
+#endif
 #ifdef OBSERVED
   observation seen;
   memcpy(&seen, block->observed, sizeof seen);
@@ -244,6 +251,9 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
     const history past = {memory[1 - parity], memory[parity]};
 #endif
     step.t = block->t;
+#ifdef HEAT_BATH
+    enter_step(&bath, block, k, &now);
+#endif
 #ifdef DOUBLE_DOUBLE
     step.t_low = block->t_low, step.h_low = block->h_low;
 #endif
@@ -268,6 +278,9 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
     add_increments(now.p, now.carry_p, dp, block->active);
     block->step++;
     add_compensated(&block->t, &block->t_low, block->h, LOW_WORD(block, h));
+#ifdef HEAT_BATH
+    leave_step(&bath, block, k, &now);
+#endif
     for (int j = 0; j < count; j++)
       if (block->active[j] > 0.0)
         block->last_step[j] = block->step;
@@ -327,6 +340,9 @@ static void begin_block(NAME(each) * c, int count)
 {
   block_memory *block = c->block;
   NAME(start)(block, c->t, c->segment_h[0]);
+#ifdef HEAT_BATH
+  block->seed = c->seed, block->trajectory = c->trajectory + c->next;
+#endif
 #ifdef DOUBLE_DOUBLE
   block->t_low = c->t_low;
   set_step_to(c->segment_end[0], block->t, block->t_low, &block->h, &block->h_low);

@@ -10,21 +10,42 @@ enum { HEAT = 0,
   COLOURED_INPUT = 2 }; /* purposes; an index is below 2^30 */
 enum { NORMALS_AT_ONCE = 64 };
 
-typedef uint32_t noise_words[4][NORMALS_AT_ONCE]; /* counters, then random words */
+#if defined(__AVX2__) && defined(__GNUC__) /* one instruction, which gcc does not choose for products of 64 bits */
+typedef uint64_t word_lanes __attribute__((vector_size(32)));
+typedef int half_words __attribute__((vector_size(32)));
+#define PRODUCT_OF_HALVES(x, y) ((word_lanes)__builtin_ia32_pmuludq256((half_words)(x), (half_words)(y)))
+#else
+typedef uint64_t word_lanes;
+#define PRODUCT_OF_HALVES(x, y) ((uint64_t)(uint32_t)(x) * (uint32_t)(y))
+#endif
+enum { WORDS_AT_ONCE = sizeof(word_lanes) / sizeof(uint64_t) };
 
-/* Philox4x32-10 of counters (x[0][i], .., x[3][i]), round by round, so that no counter waits for its own product. */
-static inline void philox(uint64_t seed, int count, noise_words x)
+/* Counters, then random words: the lower halves. */
+typedef union {
+  uint64_t of[4][NORMALS_AT_ONCE];
+  word_lanes lanes[4][NORMALS_AT_ONCE / WORDS_AT_ONCE];
+} noise_words;
+
+/* Philox4x32-10 of counters, two vectors at a time, so that no product waits for the last one. */
+static inline void philox(uint64_t seed, int count, noise_words *words)
 {
-  uint32_t low_key = (uint32_t)seed, high_key = (uint32_t)(seed >> 32);
-  for (int round = 0; round < 10; round++) {
-    for (int i = 0; i < count; i++) {
-      const uint32_t a = x[0][i], b = x[1][i], c = x[2][i], d = x[3][i];
-      x[0][i] = (uint32_t)(((uint64_t)0xCD9E8D57u * c) >> 32) ^ b ^ low_key;
-      x[1][i] = 0xCD9E8D57u * c;
-      x[2][i] = (uint32_t)(((uint64_t)0xD2511F53u * a) >> 32) ^ d ^ high_key;
-      x[3][i] = 0xD2511F53u * a;
+  const word_lanes none = {0}, of_a = none + 0xD2511F53u, of_c = none + 0xCD9E8D57u;
+  for (int from = 0; from * WORDS_AT_ONCE < count; from += 2) {
+    uint32_t low_key = (uint32_t)seed, high_key = (uint32_t)(seed >> 32);
+    word_lanes x[2][4];
+    for (int i = 0; i < 8; i++)
+      x[i / 4][i % 4] = words->lanes[i % 4][from + i / 4];
+#pragma GCC unroll 10
+    for (int round = 0; round < 10; round++) {
+      for (int i = 0; i < 2; i++) {
+        const word_lanes first = PRODUCT_OF_HALVES(x[i][0], of_a), second = PRODUCT_OF_HALVES(x[i][2], of_c);
+        x[i][0] = (second >> 32) ^ x[i][1] ^ low_key, x[i][1] = second;
+        x[i][2] = (first >> 32) ^ x[i][3] ^ high_key, x[i][3] = first;
+      }
+      low_key += 0x9E3779B9u, high_key += 0xBB67AE85u; /* golden ratio and sqrt 3 - 1, as fractions of 2^32 */
     }
-    low_key += 0x9E3779B9u, high_key += 0xBB67AE85u; /* golden ratio and sqrt 3 - 1, as fractions of 2^32 */
+    for (int i = 0; i < 8; i++)
+      words->lanes[i % 4][from + i / 4] = x[i / 4][i % 4];
   }
 }
 
@@ -88,21 +109,21 @@ static inline void normals(uint64_t seed, uint64_t step, int steps, uint32_t pur
   for (int from = 0, index = 0, lane = 0, size; from < total; from += size, first += size, second += size) {
     size = total - from < NORMALS_AT_ONCE ? total - from : NORMALS_AT_ONCE;
     for (int i = 0; i < size; i++) {
-      x[0][i] = (uint32_t)step, x[1][i] = (uint32_t)(step >> 32), x[2][i] = trajectory + (uint32_t)lane;
-      x[3][i] = purpose << 30 | (uint32_t)(begin + index);
+      x.of[0][i] = (uint32_t)step, x.of[1][i] = (uint32_t)(step >> 32), x.of[2][i] = trajectory + (uint32_t)lane;
+      x.of[3][i] = purpose << 30 | (uint32_t)(begin + index);
       lane = lane + 1 < width ? lane + 1 : 0;
       index += lane == 0;
       step += index == count;
       index = index < count ? index : 0;
     }
-    philox(seed, size, x);
+    philox(seed, size, &x);
     for (int i = 0; i < size; i++)
-      length[i] = -2.0 * log_of_uniform(uniform_of_words(x[0][i], x[1][i]));
+      length[i] = -2.0 * log_of_uniform(uniform_of_words((uint32_t)x.of[0][i], (uint32_t)x.of[1][i]));
     for (int i = 0; i < size; i++)
       length[i] = sqrt(length[i]);
     for (int i = 0; i < size; i++) {
       double cosine, sine;
-      cos_and_sin_of_words(x[2][i], x[3][i], &cosine, &sine);
+      cos_and_sin_of_words((uint32_t)x.of[2][i], (uint32_t)x.of[3][i], &cosine, &sine);
       first[i] = fma(length[i], cosine, 0.0), second[i] = fma(length[i], sine, 0.0);
     }
   }
@@ -112,7 +133,7 @@ static inline void normals(uint64_t seed, uint64_t step, int steps, uint32_t pur
 static inline double uniform_number(uint64_t seed, uint64_t step, uint32_t purpose, uint32_t trajectory)
 {
   noise_words x;
-  x[0][0] = (uint32_t)step, x[1][0] = (uint32_t)(step >> 32), x[2][0] = trajectory, x[3][0] = purpose << 30;
-  philox(seed, 1, x);
-  return uniform_of_words(x[0][0], x[1][0]);
+  x.of[0][0] = (uint32_t)step, x.of[1][0] = (uint32_t)(step >> 32), x.of[2][0] = trajectory, x.of[3][0] = purpose << 30;
+  philox(seed, 1, &x);
+  return uniform_of_words((uint32_t)x.of[0][0], (uint32_t)x.of[1][0]);
 }
