@@ -37,6 +37,7 @@ from scvi_codegen.analysis.orbits.solver import (
     DIFFERENCE_INCREMENT,
     EASY,
     NULL_SINGULAR_VALUE,
+    REVERSED,
     SAME,
     SYMPLECTIC,
     TOLERANCES,
@@ -384,6 +385,10 @@ class Continuation:
             equal = StepSequence.equal(periods * len(self.search.sequence))
             doubled = replace(doubled, search=replace(doubled.search, sequence=equal))
         both = doubled.corrected(y, None, point)
+        flat = np.count_nonzero(np.linalg.svd(both.jacobian, compute_uv=False) <= BRANCHES)
+        if doubled.search.reversor is not None and flat < both.same.shape[1] + 2:  # the branch is not symmetric
+            doubled = replace(doubled, search=doubled.search.of_reversor(None))
+            both = doubled.corrected(y, None, point)
         kept = _smallest(both.jacobian, both.same.shape[1] + 2)
         others = _without(_without(kept, both.same), both.tangent[:, np.newaxis])
         inward = self.search.reduction.inward(*np.split(y[:size], 2)) * both.units[: self.search.reduction.size]
@@ -413,9 +418,11 @@ class Continuation:
             orbit = self._found(search, y).described(y[:end], linear.closing, corrections, guess=y[:end])
             if orbit.error <= self.bound or self.search.sequence is not None:
                 break
+        if self.parameter is not None and search.reversor and search.irreversibility(y[:end]) > REVERSED:
+            raise OrbitError("the reversor= is no symmetry at another value of parameter=: omit it")
         inward = search.reduction.inward(*np.split(y[: end - 1], 2))
         gradient = search.integral_gradients(y[: end - 1], search.t, linear.closing.sizes)[0] @ inward
-        same, conserved = self._same_orbit(search, linear)
+        same, conserved = self._same_orbit(search, linear, y[: end - 1])
         tangents = _without(_smallest(linear.jacobian, same.shape[1] + 1, BRANCHES), same)
         tangent = tangents[:, 0]
         along = None if normal is None else self._reduced(search, y, normal)
@@ -438,6 +445,11 @@ class Continuation:
             step=self.step * FIRST if former is None else former.step,
             largest=max(linear.units[0], 0.0 if former is None else former.largest),
         )
+
+    def with_steps(self, steps: StepSequence | None) -> Continuation:
+        """Return the continuation of orbits with the steps of a whole one."""
+        whole = replace(self.search.of_reversor(None), sequence=steps)
+        return replace(self, search=whole.of_reversor(self.search.reversor))
 
     def _search_at(self, y: Array, tolerance: float) -> OrbitSearch:
         """Return the closing equations next to some unknowns, with the steps of a run there."""
@@ -524,7 +536,7 @@ class Continuation:
             units = np.append(units, self.parameter_unit)
             columns.append(self._by_parameter(search, closing, starts, period)[:, np.newaxis])
         jacobian = np.hstack(columns) * units / rows[:, np.newaxis]
-        fixed = into[[k if k >= 0 else len(states) for k in search.fixed_indices]] * units
+        fixed = search.fixed_rows(len(states) + 1) @ into[: len(states) + 1] * units
         jacobian = np.vstack([jacobian, fixed / np.abs(fixed).max(axis=1, keepdims=True)]) if len(fixed) else jacobian
         defects = np.append(defects / rows, np.zeros(len(fixed)))
         if self.period_of is not None:
@@ -556,7 +568,7 @@ class Continuation:
             at = times, sizes, tangent, search.parameters, search.options, np.zeros((len(sizes), 1))
             column.append(search.leaving(segment) @ tangents_along(search.stepper, starts[k].ravel(), *at)[1][-1][0])
         column[-1][np.flatnonzero(search.drifts)] = 0.0
-        column[-1] = closing.independent @ column[-1]
+        column[-1] = closing.returning @ column[-1]
         if search.energy is not None:
             column.append(np.array([self._energy_by_parameter(search, starts[0], self.parameter)]))
         return np.concatenate(column)
@@ -585,14 +597,17 @@ class Continuation:
             effect = 1.0 / (parameter or 1.0)
         return replace(self, parameter_unit=1.0 / effect)
 
-    def _same_orbit(self, search: OrbitSearch, linear: _Linearised) -> tuple[Array, int]:
+    def _same_orbit(self, search: OrbitSearch, linear: _Linearised, start: Array) -> tuple[Array, int]:
         """Return the orthonormal directions to the same orbit, and the number of conserved quantities.
 
-        They are the flow and the fields Omega grad J of the conserved quantities, whose gradients are the equations
-        that the projection ``independent`` removes, and shifts of drifting positions, if they keep fixed entries.
+        They are the flow, the fields Omega grad J of the conserved quantities, whose gradients are the equations that
+        are not among the independent ones, and shifts of drifting positions, if they keep fixed entries.
         """
         closing, size, units = linear.closing, search.reduction.size, linear.units
-        kept, strengths, _ = np.linalg.svd(closing.independent * units[:size] / units[:size, np.newaxis])
+        independent = closing.returning
+        if search.reversor is not None:
+            independent = search.independent_equations(start[np.newaxis], closing.segments, closing.sizes)
+        kept, strengths, _ = np.linalg.svd(independent * units[:size] / units[:size, np.newaxis])
         gradients = kept[:, strengths < 0.5]
         fields = np.vstack([gradients[size // 2 :], -gradients[: size // 2]])
         if not closing.motion.by_time.any():

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.analysis.estimation.measurements import state_names
 from scvi_codegen.analysis.orbits.continuation import Continuation, FamilyPoint, Formula
 from scvi_codegen.analysis.orbits.equilibrium import Equilibrium
+from scvi_codegen.analysis.orbits.reversor import Reversor
 from scvi_codegen.analysis.orbits.solver import OrbitSearch, PeriodicOrbit, bound_of, checked_part, gains_of, indices_of
 from scvi_codegen.analysis.orbits.step_sequence import StepSequence
 from scvi_codegen.codegen.native.arguments import checked_number
@@ -40,7 +41,8 @@ SAME_ORBIT = 1e-6
 """Relative distance, far above errors of orbits, from which an orbit of a file is another one than the recomputed."""
 OF_ORBITS = tuple(name for name in PeriodicOrbit.__dataclass_fields__ if name not in ("stepper", "sequence", "options"))
 """Fields of orbits that are saved as they are."""
-OF_SEARCHES = ("fixed_indices", "energy", "gain", "drifts")
+OF_SEARCHES = ("fixed_indices", "energy", "gain", "drifts", "at_rest")
+OF_POINTS = ("step", "largest", "of_both", "accuracy")
 OF_CONTINUATIONS = ("parameter", "step", "bound", "parameter_unit")
 
 
@@ -201,11 +203,12 @@ class Family:
         arrays["kinds"] = np.array([bifurcation.kind for bifurcation in self.bifurcations], dtype=np.str_)
         points = [self._first, self._last, *(bifurcation._at for bifurcation in self.bifurcations)]
         arrays["points"] = np.array([[point.y, continuation.change_along(point)] for point in points])
-        options, period = continuation.search.options, continuation.period_of
+        options, period, reversor = continuation.search.options, continuation.period_of, continuation.search.reversor
         settings = {name: getattr(continuation, name) for name in OF_CONTINUATIONS}
         settings |= {name: np.asarray(getattr(continuation.search, name)).tolist() for name in OF_SEARCHES}
-        settings |= {"system": self[0].stepper.title, "ended": self.ended, "largest": self._last.largest}
-        settings |= {"next step": self._last.step, "period": period and period.text}
+        settings["reversor"] = reversor and [reversor.matrix.tolist(), reversor.shift.tolist()]
+        settings |= {"system": self[0].stepper.title, "ended": self.ended}
+        settings |= {"last": {name: getattr(self._last, name) for name in OF_POINTS}, "period": period and period.text}
         settings["options"] = options and asdict(options)
         arrays["settings"] = np.array(json.dumps(settings))
         write_atomically(path, lambda file: np.savez(file, **arrays))
@@ -229,9 +232,10 @@ class Family:
             raise StateError(f"'{os.fspath(path)}' is a family of '{settings['system']}', not of '{stepper.title}'")
         options = settings["options"] and SolverOptions(**settings["options"])
         orbits = list(_orbits_of(arrays, stepper, options))
-        own: dict[str, Any] = {name: np.array(settings[name]) for name in ("gain", "drifts")}
+        own: dict[str, Any] = {name: np.array(settings[name]) for name in ("gain", "drifts", "at_rest")}
         own |= {"fixed_indices": tuple(settings["fixed_indices"]), "energy": settings["energy"]}
         search = _search_at(orbits[-1], orbits[-1].period, **own)
+        search = search.of_reversor(settings["reversor"] and Reversor(*map(np.array, settings["reversor"])))
         continuation = Continuation(
             search=search,
             period_of=settings["period"] and Formula.of(settings["period"], stepper.parameters),
@@ -239,7 +243,10 @@ class Family:
         )
         points = arrays["points"]
         try:
-            first, last, *others = (continuation.corrected(*point) for point in points)
+            steps = [orbits[0].sequence, orbits[-1].sequence, *[search.of_reversor(None).sequence] * (len(points) - 2)]
+            first, last, *others = (
+                continuation.with_steps(own).corrected(*point) for own, point in zip(steps, points, strict=True)
+            )
             same = np.abs(first.y - points[0, 0]).max() <= SAME_ORBIT * np.abs(first.y).max()
         except OrbitError:
             same = False
@@ -253,7 +260,7 @@ class Family:
             bifurcations=tuple(Bifurcation(str(kind), int(k), at, continuation) for kind, k, at in saved),
             ended=settings["ended"],
             _first=first,
-            _last=replace(last, step=settings["next step"], largest=settings["largest"]),
+            _last=replace(last, **settings["last"]),
             _continuation=continuation,
         )
 
@@ -293,6 +300,7 @@ def family(
     mode: int = 0,
     amplitude: float | None = None,
     gain: ArrayLike | Sequence[float | None] | None = None,
+    reversor: str | Sequence[str] | None = None,
     error: float | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Family:
@@ -315,7 +323,7 @@ def family(
         energy: prescribed energy, of a family along a parameter.
         mode: number of the oscillation of the equilibrium, in descending order of frequencies.
         amplitude: largest deviation of a coordinate from the equilibrium on the first orbit.
-        gain, error: as of :func:`periodic_orbit`.
+        gain, reversor, error: as of :func:`periodic_orbit`; branches that break the symmetry have whole orbits.
         progress: called with the number of orbits.
 
     Returns:
@@ -331,14 +339,17 @@ def family(
         raise StateError(f"the start is one of '{start.stepper.title}', not of '{stepper.title}'")
     if parameter is not None and parameter not in stepper.parameters:
         raise StateError(f"'{parameter}' is no parameter of '{stepper.title}'{closest(parameter, stepper.parameters)}")
-    first = _state_at(start, mode, amplitude)
     if isinstance(start, Equilibrium) and backward:
         raise StateError("backward= is for a start at an orbit: a family that begins at an equilibrium leaves it")
     if period is not None and parameter is None:
         raise StateError("period= is a formula of parameter=, which is missing: name it, or give fixed_period=True")
     prescribed = None if energy is None else checked_number(energy, "the energy")
     indices = indices_of(stepper, fixed, fixed_period=fixed_period)
+    first = _state_at(start, mode, amplitude)
     search = _search_at(start, float(first[-1]), fixed_indices=indices, energy=prescribed, **gains_of(stepper, gain))
+    if reversor is not None:
+        state = np.concatenate([start.q, start.p])
+        search, first = search.symmetric(reversor, state, lambda own: _state_at(start, mode, amplitude, own))
     continuation = Continuation(
         search=search,
         parameter=None if parameter is None else stepper.parameters.index(parameter),
@@ -382,8 +393,10 @@ def _equal_steps_of(start: PeriodicOrbit | Equilibrium) -> StepSequence | None:
     return start.sequence
 
 
-def _state_at(start: PeriodicOrbit | Equilibrium, mode: int, amplitude: float | None) -> Array:
-    """Return (q, p, period) of the first orbit, or of its guess next to an equilibrium."""
+def _state_at(
+    start: PeriodicOrbit | Equilibrium, mode: int, amplitude: float | None, reversor: Reversor | None = None
+) -> Array:
+    """Return (q, p, period) of the first orbit, or of its guess next to an equilibrium, nearest to a fixed set."""
     if isinstance(start, PeriodicOrbit):
         if amplitude is not None:
             raise StateError("amplitude= is for a start at an equilibrium: omit it")
@@ -395,6 +408,10 @@ def _state_at(start: PeriodicOrbit | Equilibrium, mode: int, amplitude: float | 
         raise StateError("a family that begins at an equilibrium needs the amplitude= of its first orbit, positive")
     vector = start.modes[:, mode]
     vector = vector / vector[np.abs(vector[:count]).argmax()]  # that coordinate is at its largest deviation
+    if reversor is not None:  # the phase of the least change across the fixed set
+        odd = reversor.odd @ vector
+        cosine, sine = np.linalg.svd(np.column_stack([odd.real, -odd.imag]))[2][-1]
+        vector = vector * (cosine + 1j * sine)
     state = np.concatenate([start.q, start.p]) + amplitude * vector.real
     return np.append(state, 2.0 * math.pi / frequencies[mode])
 

@@ -11,12 +11,15 @@ Periodic orbits are not isolated: the initial point is arbitrary, and orbits for
 another conserved quantity). Each Newton step is the minimum-norm solution of the linearised equations (Moore-Penrose
 inverse), so the iteration converges to a nearby orbit without phase conditions. Equations implied by conserved
 quantities are projected out (Munoz-Almaraz et al., Physica D 181 (2003) 1).
+
+Symmetric orbits start in the fixed set of a reversor R and return to it after half a period, which is computed alone:
+the end x has the defect (x - R x)/2; see :mod:`~scvi_codegen.analysis.orbits.reversor`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -27,6 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.analysis.estimation.fixed_steps import tangents_along
 from scvi_codegen.analysis.estimation.measurements import state_names
+from scvi_codegen.analysis.orbits.reversor import Reversor
 from scvi_codegen.analysis.orbits.step_sequence import StepSequence
 from scvi_codegen.codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.codegen.native.options import SolverOptions
@@ -77,7 +81,8 @@ class PeriodicOrbit:
         sequence: ends of the steps relative to the period.
         monodromy: (2m, 2m) derivative of the end with respect to the start; of systems with rotations in canonical
             coordinates of the reduced space, with 6 rows for a rotation, 4 for a direction and 2 for a spin.
-        residual: largest entry of the end minus the start, of the computed map.
+        residual: largest entry of the end minus the start, of the computed map; of symmetric orbits of the end of half
+            a period minus its mirror image, halved.
         error: discretisation error of the orbit: the distance to the orbit of a run with 2.6 times as many steps, which
             end at other times. It is the largest of three relative errors: of the positions and of the momenta at the
             start, with their rounding errors, relative to the largest range of a position and the largest momentum of a
@@ -208,6 +213,8 @@ FREEDOM = 3.0
 FAR = 1.5
 """Factor between the periods, and part of the distance of the guess from the middle of the orbit, beyond which an
 orbit is not the guessed one."""
+REVERSED = 1e-9
+"""Largest distance of a step from one that a reversor reverses, relative to the motion."""
 OTHER = 1.0 / 3.0
 """Part of the amplitude of an orbit from which its distance to the guess is reported."""
 EQUILIBRIUM_MOTION = 1e-6
@@ -230,6 +237,7 @@ def periodic_orbit(
     energy: float | None = None,
     fixed: Sequence[str] = (),
     gain: ArrayLike | Sequence[float | None] | None = None,
+    reversor: str | Sequence[str] | None = None,
     t: float = 0.0,
     parameters: Parameters = None,
     options: SolverOptions | None = None,
@@ -261,6 +269,9 @@ def periodic_orbit(
             ``["y"]``.
         gain: (m,) increase of the positions over a period: 2 pi for a rotating angle, by default 0, and ``None`` where
             it is unknown, of a coordinate on which the motion does not depend: the way of a walker.
+        reversor: of a symmetric orbit, of which half a period is computed: formulas of positions R(q), such as
+            ``["x", "-y", "z"]``, if a motion q(t), reversed as R(q(-t)), is one, too, or ``"detect"`` for changes of
+            signs. The guess is moved to a state with q = R(q) and v = -R'v.
         t, parameters, options: as of :meth:`Stepper.integrate`.
 
     Returns:
@@ -271,7 +282,8 @@ def periodic_orbit(
             system is not periodic in time with this period.
         MethodError: if time is transformed, the stepper has constraints, an energy is prescribed with
             forces, or the period of a time-dependent system is free.
-        StateError: if a shape, name or number is invalid, or an input is not set.
+        StateError: if a shape, name or number is invalid, an input is not set, or steps are not reversed by
+            ``reversor``.
         StepFailedError: if a step from the initial guess fails.
     """
     stepper = stepper.bind(q, parameters)[0]._known_with_events
@@ -303,7 +315,10 @@ def periodic_orbit(
         parameters=values,
         options=options,
     )
-    return search.orbit(np.append(start, search.period), bound_of(sequence, error))
+    guess = np.append(start, search.period)
+    if reversor is not None:
+        search, guess = search.symmetric(reversor, start, lambda _: guess)
+    return search.orbit(guess, bound_of(sequence, error))
 
 
 def bound_of(sequence: StepSequence | None, error: float | None) -> float:
@@ -362,6 +377,7 @@ class OrbitSearch:
         at_rest: (m,) momenta without velocity at the guess, which are no size of the motion.
         gain: (m,) increase of the positions over a period.
         drifts: (m,) mask of positions with another increase, which is unknown.
+        reversor: of symmetric orbits, whose steps and segments are those of half a period.
     """
 
     stepper: Stepper
@@ -377,6 +393,7 @@ class OrbitSearch:
     t: float
     parameters: Array
     options: SolverOptions | None
+    reversor: Reversor | None = None
 
     @classmethod
     def at(
@@ -388,7 +405,7 @@ class OrbitSearch:
             at_rest = stepper.momentum(q, at_rest, t, parameters)
         reduction = Reduction(stepper.interface)
         own: dict[str, Any] = {"at_rest": at_rest, "reduction": reduction, "max_step": max_step}
-        return cls(stepper=stepper, t=t, parameters=parameters, **own, **rest)
+        return cls(stepper=stepper, t=t, parameters=parameters, **own | rest)
 
     def orbit(self, guess: Array, bound: float) -> PeriodicOrbit:
         """Return the orbit near a guess, with a discretisation error below a bound if steps are adaptive.
@@ -412,7 +429,51 @@ class OrbitSearch:
     def adapted(self, z: Array, tolerance: float) -> OrbitSearch:
         """Return the search with the steps of an adaptive run along z."""
         at = self.max_step, self.t, self.parameters, self.options
-        return replace(self, sequence=StepSequence.adaptive(self.stepper, z[:-1], float(z[-1]), tolerance, *at))
+        end = 1.0 if self.reversor is None else 0.5
+        return replace(self, sequence=StepSequence.adaptive(self.stepper, z[:-1], float(z[-1]), tolerance, *at, end))
+
+    def symmetric(
+        self, reversor: str | Sequence[str], state: Array, guess_of: Callable[[Reversor], Array]
+    ) -> tuple[OrbitSearch, Array]:
+        """Return the search of symmetric orbits, and the guess z by the reversor, in its fixed set, near a state."""
+        stepper = self.stepper
+        if stepper.divides_steps or stepper.interface.rotations or self.drifts.any():
+            raise StateError("reversor= requires a system without events, kinks, rotations and unknown gains: omit it")
+        if self.sequence is not None and len(self.sequence) % 2:
+            raise StateError(f"reversor= requires an even number of steps, not {len(self.sequence)}")
+        texts = reversor.split(",") if isinstance(reversor, str) else reversor
+        detects = reversor == "detect"
+        for own in Reversor.fitting(state) if detects else [Reversor.of(stepper.coordinates, texts)]:
+            guess = guess_of(own)
+            z = np.append(own.projected(guess[:-1]), guess[-1])
+            if (error := self.of_reversor(own).irreversibility(z)) <= REVERSED:
+                return self.of_reversor(own), z
+        if detects:
+            raise StateError("reversor='detect': no change of signs of coordinates reverses motions and fits the guess")
+        raise StateError(
+            f"reversor={list(texts)} does not reverse the steps of '{stepper.title}', which differ by {error:.1e} of "
+            "the motion: give a symmetry of the system, or omit it"
+        )
+
+    def of_reversor(self, reversor: Reversor | None) -> OrbitSearch:
+        """Return the search of orbits that are symmetric by another reversor, or of whole ones."""
+        sequence = self.sequence
+        if sequence is not None and (reversor is None) != (self.reversor is None):
+            sequence = sequence.mirrored if reversor is None else sequence.half
+        return replace(self, reversor=reversor, sequence=sequence)
+
+    def irreversibility(self, z: Array) -> float:
+        """Return the distance of mirror images of states from steps back to them, relative to the motion."""
+        assert self.reversor is not None
+        search = self if self.sequence is not None else self.adapted(z, TOLERANCES[0] * ERROR)
+        at: Any = np.zeros((0, self.stepper._input_size)), self.parameters, self.options
+        times = z[-1] * search.steps.ends
+        states = tangents_along(self.stepper, z[:-1], self.t + times[:-1], np.diff(times), *at)[0]
+        images, away = self.reversor(states), []
+        for k in range(len(states) - 1):
+            step = self.t - times[k + 1 : k + 2], np.diff(times)[k : k + 1]
+            away.append(tangents_along(self.stepper, images[k + 1], *step, *at)[0][-1] - images[k])
+        return float((np.abs(away) / self.sizes_of(states)).max())
 
     def _refreshed(self, z: Array) -> PeriodicOrbit:
         """Return the orbit of the steps of this search next to one of other steps."""
@@ -431,14 +492,14 @@ class OrbitSearch:
         failures: list[Exception] = []
         far: list[PeriodicOrbit] = []
         attempts = [(self, False), (self, True)]
-        if self.energy is None and not set(self.fixed_indices) - {-1}:
+        if self.energy is None and self.reversor is None and not set(self.fixed_indices) - {-1}:
             at_positions = replace(self, fixed_indices=(*self.fixed_indices, *range(self.stepper.dimension)))
             attempts += [(at_positions, False), (at_positions, True)]
         for search, smoothed in attempts:
             try:
                 iterated = search._iterated(*search._by_segments(guess, smoothed=smoothed))
                 orbit = search.described(*iterated, guess=guess)
-                if _is_near(orbit, guess, iterated[1].motion.states):
+                if _is_near(orbit, guess, search._whole(iterated[1].motion.states)):
                     return orbit
                 far.append(orbit)
             except (OrbitError, StepFailedError, np.linalg.LinAlgError) as failure:
@@ -455,7 +516,7 @@ class OrbitSearch:
 
     def described(self, z: Array, equations: ClosingEquations, iterations: int, *, guess: Array) -> PeriodicOrbit:
         """Return the orbit at the end of the iteration, after all checks; raise OrbitError if there is none."""
-        m, motion = self.stepper.dimension, equations.motion
+        m, motion, steps = self.stepper.dimension, equations.motion, self.of_reversor(None).steps
         sizes, reduced = equations.sizes, self.reduced_sizes(equations.sizes)
         rounding = RESOLVED * roundoff(1) * float((np.abs(z[:-1]) / sizes).max())
         scaled_norm = float(np.linalg.norm(equations.monodromy / reduced[:, np.newaxis] * reduced, 2))
@@ -478,8 +539,8 @@ class OrbitSearch:
             p=z[m:-1],
             t=self.t,
             period=float(z[-1]),
-            steps=len(self.steps),
-            sequence=self.steps,
+            steps=len(steps),
+            sequence=steps,
             monodromy=equations.monodromy,
             residual=equations.error,
             error=self._discretisation_error(z, equations),
@@ -544,7 +605,8 @@ class OrbitSearch:
         if growth <= EASY:
             return None
         pairs = int(np.ceil(np.log(growth) / np.log(GROWTH) / 2.0))
-        segments = min((4 if smoothed else 2) * pairs, count)
+        parts = 2 if self.reversor is None else 1
+        segments = min((2 if smoothed else 1) * parts * pairs, count)
         middle = count - len(later)
         path = np.vstack([start, earlier[:middle], later[-2::-1]])
         if smoothed and len(later) > 1:  # distributes the jump in the middle, quadratically in time
@@ -557,6 +619,9 @@ class OrbitSearch:
         """Return the states forward and backward from a start, the latter a period later, and the monodromy matrix."""
         steps = self.steps
         half, count = steps.middle, len(steps)
+        if self.reversor is not None:
+            forward = self._segment(start, steps, 0, count, period)
+            return forward.states, forward.states[-1:], self.reversor.monodromy(forward.monodromy)
         inward = self.reduction.inward(*np.split(start, 2))
         if self.stepper.divides_steps:  # derivatives through events require runs forward in time
             forward = self._segment(start, steps, 0, count, period)
@@ -646,11 +711,19 @@ class OrbitSearch:
     def _inverse(self, equations: ClosingEquations) -> Array:
         """Return the pseudoinverse of the Jacobian in units of the motion; fixed unknowns do not change."""
         units, rows = self._units(equations), self.row_units(equations)
-        free = np.delete(np.arange(len(units)), self.fixed_indices)
-        inverse = np.zeros((len(units), len(rows)))
-        scaled = equations.partials[:, free] * units[free] / rows[:, np.newaxis]
-        inverse[free] = units[free, np.newaxis] * np.linalg.pinv(scaled, NULL_SINGULAR_VALUE) / rows
-        return inverse
+        fixed = self.fixed_rows(len(units))
+        free = np.linalg.svd(fixed)[2][np.linalg.matrix_rank(fixed) :].T
+        scaled = equations.partials * units / rows[:, np.newaxis] @ free
+        inverse: Array = free @ np.linalg.pinv(scaled, NULL_SINGULAR_VALUE)
+        return units[:, np.newaxis] * inverse / rows
+
+    def fixed_rows(self, count: int) -> Array:
+        """Return (n, count) rows of fixed entries of z, and of changes across the fixed set of the reversor."""
+        rows = np.eye(count)[list(self.fixed_indices)]
+        if self.reversor is None:
+            return rows
+        across = self.reversor.across
+        return np.vstack([rows, np.hstack([across, np.zeros((len(across), count - across.shape[1]))])])
 
     def reduced_sizes(self, sizes: Array) -> Array:
         """Return sizes (2m,) of positions and momenta as those of the coordinates of the reduced tangent space."""
@@ -676,35 +749,47 @@ class OrbitSearch:
             self._segment(start, self.steps, first, last, z[-1])
             for start, first, last in zip(starts, bounds[:-1], bounds[1:], strict=True)
         ]
-        sizes = self.sizes_of(np.vstack([starts, *(segment.states for segment in segments)]))
-        gradients = [
-            self.integral_gradients(start, segment.start_time, sizes)
-            for start, segment in zip(starts, segments, strict=True)
-        ]
-        left = self._independent_equations(starts, segments, gradients, sizes)
+        sizes = self.sizes_of(self._whole(np.vstack([starts, *(segment.states for segment in segments)])))
         rows = np.zeros((count, self.reduction.size, count * size + 1))
         defects = np.zeros(rows.shape[:2])
         for k, segment in enumerate(segments):
             after = (k + 1) % count
             leaving, outward = self.leaving(segment), self.reduction.outward(*np.split(starts[after], 2))
-            end = segment.states[-1] if after else self._returned(segment.states[-1], starts[0])
-            defects[k] = outward @ (self.reduction.aligned(end, starts[after]) - starts[after])
+            closes = after == 0
+            defects[k] = self._defect(segment.states[-1], starts[after], closes=closes)
             rows[k, :, k * size : (k + 1) * size] = leaving @ segment.monodromy
-            rows[k, :, after * size : (after + 1) * size] -= outward
+            if not closes or self.reversor is None:
+                rows[k, :, after * size : (after + 1) * size] -= outward
             rows[k, :, -1] = leaving @ segment.by_period
         rows[-1, np.flatnonzero(self.drifts)] = 0.0
         error, relative_error = float(np.abs(defects).max()), float(np.abs(defects / self.reduced_sizes(sizes)).max())
         monodromy = leaving @ segments[-1].monodromy @ self.reduction.inward(*np.split(starts[-1], 2))
-        rows[-1], defects[-1] = left @ rows[-1], left @ defects[-1]
+        if self.reversor is None:
+            returning = self.independent_equations(starts, segments, sizes)
+        else:
+            monodromy, returning = self.reversor.monodromy(monodromy), self.reversor.odd
+        rows[-1], defects[-1] = returning @ rows[-1], returning @ defects[-1]
         partials, residuals = rows.reshape(defects.size, -1), defects.ravel()
         if self.energy is not None:
             first = starts[0]
             energy = self.stepper.energy(first[: size // 2], first[size // 2 :], self.t, self.parameters)
             residuals = np.append(residuals, energy - self.energy)
             row = np.zeros(len(z))
-            row[:size] = gradients[0][0]
+            row[:size] = self.integral_gradients(first, self.t, sizes)[0]
             partials = np.vstack([partials, row])
-        return ClosingEquations(segments, monodromy, error, relative_error, sizes, residuals, partials, left)
+        return ClosingEquations(segments, monodromy, error, relative_error, sizes, residuals, partials, returning)
+
+    def _whole(self, states: Array) -> Array:
+        """Return states along a period by those that were computed."""
+        return states if self.reversor is None else np.concatenate([states, self.reversor(states)])
+
+    def _defect(self, end: Array, start: Array, *, closes: bool) -> Array:
+        """Return the end of a segment minus the start that follows, of the last one after the period."""
+        returned = self._returned(end, start) if closes else end
+        if closes and self.reversor is not None:
+            return np.asarray((end - self.reversor(returned)) / 2.0)
+        outward = self.reduction.outward(*np.split(start, 2))
+        return np.asarray(outward @ (self.reduction.aligned(returned, start) - start))
 
     def _returned(self, end: Array, start: Array) -> Array:
         """Return the state after a period without the increase of its positions."""
@@ -745,15 +830,12 @@ class OrbitSearch:
             states = tangents_along(self.stepper, start, *at)[0]
         except (EventError, StepFailedError):
             return math.inf
-        end, outward = self._returned(states[-1], start), self.reduction.outward(*np.split(start, 2))
-        defects = equations.independent @ outward @ (self.reduction.aligned(end, start) - start)
+        defects = equations.returning @ self._defect(states[-1], start, closes=True)
         change = self._inverse(equations) @ np.append(defects, np.zeros(len(equations.defects) - len(defects)))
         q, p = (float(np.abs(part).max()) for part in np.split(change[:-1], 2))
-        return max(float(abs(change[-1])) / period, self._size_of(states).error(q, p))
+        return max(float(abs(change[-1])) / period, self._size_of(self._whole(states)).error(q, p))
 
-    def _independent_equations(
-        self, starts: Array, segments: Sequence[_Segment], gradients: Sequence[Array], sizes: Array
-    ) -> Array:
+    def independent_equations(self, starts: Array, segments: Sequence[_Segment], sizes: Array) -> Array:
         """Return the (size, size) projection onto the equations of return not implied by conserved quantities.
 
         Energy and momentum maps count as conserved if the Jacobian of every segment maps their gradients accordingly,
@@ -762,6 +844,8 @@ class OrbitSearch:
         conserved_masks, units = [], self.reduced_sizes(sizes)
         accepted = CONSERVED if self.stepper.interface.conserves_energy else SAME  # weak damping is no conservation
         inward = [self.reduction.inward(*np.split(start, 2)) for start in starts]
+        times = [segment.start_time for segment in segments]
+        gradients = [self.integral_gradients(*at, sizes) for at in zip(starts, times, strict=True)]
         begins = [gradient @ own * units for gradient, own in zip(gradients, inward, strict=True)]
         for start, segment, begin, own in zip(starts, segments, begins, inward, strict=True):
             last = segment.states[-1]
@@ -886,7 +970,8 @@ class ClosingEquations:
         sizes: (2m,) sizes of the motion.
         defects: (r,) residuals.
         partials: (r, 2m segments + 1) Jacobian of the residuals with respect to the starts of segments and the period.
-        independent: (size, size) projection of the closing equations onto those that conserved quantities do not imply.
+        returning: (size, size) projection of the closing equations onto those that conserved quantities do not imply;
+            of symmetric orbits onto changes that the reversor reverses.
     """
 
     segments: Sequence[_Segment]
@@ -896,7 +981,7 @@ class ClosingEquations:
     sizes: Array
     defects: Array
     partials: Array
-    independent: Array
+    returning: Array
 
     @property
     def motion(self) -> _Segment:

@@ -28,7 +28,7 @@ class StepSequence:
     """Ends of consecutive steps as fractions of the period.
 
     Attributes:
-        ends: (n + 1,) ascending, from 0 to 1.
+        ends: (n + 1,) ascending, from 0 to 1, or to 1/2 of the computed half of a symmetric orbit.
         tolerance: that of the adaptive run from which they are; ``None`` of equal steps.
     """
 
@@ -36,9 +36,9 @@ class StepSequence:
     tolerance: float | None = None
 
     @classmethod
-    def equal(cls, count: int) -> StepSequence:
-        """Return the sequence of equal steps."""
-        return cls(np.arange(count + 1) / count)
+    def equal(cls, count: int, end: float = 1.0) -> StepSequence:
+        """Return the sequence of equal steps, of a part of the period if ``end`` is smaller."""
+        return cls(end * np.arange(count + 1) / count)
 
     @classmethod
     def adaptive(
@@ -51,6 +51,7 @@ class StepSequence:
         t: float,
         parameters: Array,
         options: SolverOptions | None,
+        end: float,
     ) -> StepSequence:
         """Return the sequence of adaptive steps along a guess, half a period forward and half a period backward.
 
@@ -63,6 +64,7 @@ class StepSequence:
             start, period: (2m,) state and period of the guess.
             tolerance: that of the local error; 0 for round-off.
             max_step, t, parameters, options: as of :class:`OrbitSearch`.
+            end: 1/2 for half a period, forward only.
         """
 
         def ends_of(duration: float) -> Array:
@@ -82,11 +84,11 @@ class StepSequence:
             return np.sort(ends)
 
         with without_accuracy_warnings():
-            if stepper.divides_steps:
-                ends = ends_of(period)
+            if stepper.divides_steps or end < 1.0:
+                ends = ends_of(end * period)
             else:
                 ends = np.concatenate([ends_of(0.5 * period), 1.0 - ends_of(-0.5 * period)[-2::-1]])
-        ends[0], ends[-1] = 0.0, 1.0
+        ends[0], ends[-1] = 0.0, end
         return cls(ends, tolerance)
 
     def __len__(self) -> int:
@@ -95,7 +97,7 @@ class StepSequence:
     @cached_property
     def widths(self) -> Array:
         """(n,) step sizes relative to the period."""
-        return np.full(len(self), 1.0 / len(self)) if self.tolerance is None else np.diff(self.ends)
+        return np.full(len(self), self.ends[-1] / len(self)) if self.tolerance is None else np.diff(self.ends)
 
     @property
     def middle(self) -> int:
@@ -108,10 +110,22 @@ class StepSequence:
         return StepSequence(1.0 - self.ends[::-1], self.tolerance)
 
     @property
+    def half(self) -> StepSequence:
+        """The first half of an even number of steps."""
+        return StepSequence(self.ends[: len(self) // 2 + 1], self.tolerance)
+
+    @property
+    def mirrored(self) -> StepSequence:
+        """Sequence of half a period, followed by its mirror image."""
+        if self.tolerance is None:
+            return StepSequence.equal(2 * len(self))
+        return StepSequence(np.append(self.ends, 1.0 - self.ends[-2::-1]), self.tolerance)
+
+    @property
     def finer(self) -> StepSequence:
         """Sequence of ``FINER`` times as many steps with the same relative density, and with other ends."""
         count = int(np.ceil(FINER * len(self))) | 1
         if self.tolerance is None:
-            return StepSequence.equal(count)
+            return StepSequence.equal(count, float(self.ends[-1]))
         numbers = np.linspace(0.0, len(self), count + 1)
         return StepSequence(np.interp(numbers, np.arange(len(self) + 1), self.ends), self.tolerance)

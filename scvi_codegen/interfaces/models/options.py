@@ -321,6 +321,7 @@ _OF_FAMILIES = {
     "period": (TEXT, "T", "Period of an orbit near --q, or its formula (2*pi/w)."),
     "vary": (TEXT, "NAME", "Parameter of the system along which the family is continued."),
     "fixed": (TEXT, "NAMES", "Coordinates and momenta that keep their values, y,p_x."),
+    "reversor": (TEXT, "FORMULAS", "Symmetry of the orbits, x,-y,z or detect: half a period is computed."),
     "until": (TEXT, "CONDITION", "Condition that ends the family, 'energy > -1.57'."),
     "backward": (SWITCH, "", "Towards smaller values of the parameter, or of the energy."),
     "stride": (NUMBER, "S", "Largest step, relative to the motion [0.1]."),

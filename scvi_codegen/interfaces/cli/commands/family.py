@@ -72,12 +72,13 @@ def _members(model: Model, resume: str | None, progress: Callable[[int], None]) 
     period = None if text is None else Formula.of(text, stepper.parameters)
     varies = period is not None and settings.get("parameter") in {str(name) for name in period.expression.free_symbols}
     settings["fixed"] = [name.strip() for name in settings.get("fixed", "").split(",") if name.strip()]
-    start = _start(model, stepper, settings.get("amplitude"), period, fixed_period=varies)
+    own = {"fixed_period": varies, "reversor": settings.get("reversor")}
+    start = _start(model, stepper, settings.get("amplitude"), period, **own)
     return families.family(stepper, start, period=text if varies else None, progress=progress, **settings)
 
 
 def _start(
-    model: Model, stepper: Stepper, amplitude: float | None, period: Formula | None, *, fixed_period: bool
+    model: Model, stepper: Stepper, amplitude: float | None, period: Formula | None, **own: Any
 ) -> PeriodicOrbit | Equilibrium:
     """Return the orbit or the equilibrium near the initial state of a model."""
     at: dict[str, Any] = {"t": model.t, "parameters": model.parameters}
@@ -87,9 +88,7 @@ def _start(
         ways = "the period of an orbit (--period) or the amplitude next to an equilibrium (--amplitude)"
         raise ModelFileError(f"give {ways}")
     value = period(dict(zip(stepper.parameters, stepper._parameters(model.parameters), strict=False)))
-    return periodic_orbit(
-        stepper, model.q, model.p, velocity=model.velocity, period=value, fixed_period=fixed_period, **at
-    )
+    return periodic_orbit(stepper, model.q, model.p, velocity=model.velocity, period=value, **own, **at)
 
 
 def _described(members: families.Family) -> str:

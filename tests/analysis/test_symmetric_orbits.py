@@ -1,0 +1,129 @@
+"""Symmetric periodic orbits, computed over half a period, beside whole ones and elliptic integrals."""
+
+import numpy as np
+import pytest
+from scipy.special import ellipk
+
+import scvi_codegen as sc
+
+PENDULUM = sc.LagrangianSystem.from_text(
+    "pendulum", ["q"], "q_dot**2/2 + g*cos(q) + a*q**3", parameters={"g": 1, "a": 0}
+)
+RESTRICTED = sc.LagrangianSystem.from_text(
+    name="restricted three-body problem",
+    coordinates=["x", "y", "z"],
+    lagrangian="((x_dot - y)**2 + (y_dot + x)**2 + z_dot**2)/2"
+    " + (1 - mu)/sqrt((x + mu)**2 + y**2 + z**2) + mu/sqrt((x - 1 + mu)**2 + y**2 + z**2)",
+    parameters={"mu": 1.215058560962404e-2},
+)
+MIRROR = ["x", "-y", "z"]
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    return sc.compile_stepper(PENDULUM, "svi:8")
+
+
+@pytest.fixture(scope="module")
+def moon():
+    return sc.compile_stepper(RESTRICTED, "svi:8")
+
+
+def closing(orbit, gain=0.0):
+    run = orbit.run()
+    return max(abs(run.q[-1] - run.q[0] - gain).max(), abs(run.p[-1] - run.p[0]).max())
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("steps", [None, 40])
+def test_halo_orbit_of_half_a_period_is_the_whole_one(moon, steps):
+    at = {"velocity": [0, -0.19261628, 0], "period": 3.337915, "fixed": ["z"], "error": 1e-11, "steps": steps}
+    half = sc.periodic_orbit(moon, [1.17, 0.0, 0.09442299937998082], reversor=MIRROR, **at)
+    whole = sc.periodic_orbit(moon, [1.17, 0.0, 0.09442299937998082], **at | {"fixed": ["y", "z"]})
+    for name in ("q", "p", "period"):
+        assert getattr(half, name) == pytest.approx(getattr(whole, name), abs=1e-12)
+    assert half.monodromy == pytest.approx(whole.monodromy, abs=1e-12 * abs(whole.monodromy).max() * 100)
+    assert half.steps == whole.steps or steps is None
+    assert closing(half) < 1e-10
+    assert max(half.residual, half.error) < 1e-11
+    assert half.sequence.ends == pytest.approx(1 - half.sequence.ends[::-1], abs=1e-15)
+
+
+@pytest.mark.second
+def test_detected_reversors_and_rotations(pendulum):
+    """A swing through the lowest point, a swing from rest, and full turns with -q and with 2 pi - q."""
+    swing = sc.periodic_orbit(pendulum, [0.0], [1.0], period=6.7, fixed=["p_q"], reversor="detect")
+    assert swing.period == pytest.approx(4 * ellipk(1 / 4), rel=1e-12)
+    rest = sc.periodic_orbit(pendulum, [np.pi / 3], [0.0], period=6.7, fixed=["q"], reversor="detect")
+    assert rest.period == pytest.approx(4 * ellipk(1 / 4), rel=1e-12)
+    for start, formula in ((0.0, "-q"), (2 * np.pi, "4*pi - q")):
+        at = {"period": 4.0, "fixed": ["p_q"], "gain": [2 * np.pi]}
+        turn = sc.periodic_orbit(pendulum, [start + 1e-3], [2.2], reversor=[formula], **at)
+        assert turn.q == pytest.approx([start], abs=1e-14)
+        assert turn.period == pytest.approx(4 / 2.2 * ellipk(4 / 2.2**2), rel=1e-11)
+        assert closing(turn, 2 * np.pi) < 1e-9
+
+
+@pytest.mark.second
+def test_exchange_of_bodies_as_reversor():
+    """The figure eight of three bodies, from the collinear state: Chenciner & Montgomery (2000)."""
+    names = [f"{axis}{k}" for k in (1, 2, 3) for axis in "xy"]
+    attraction = "".join(f" + 1/sqrt((x{i} - x{j})**2 + (y{i} - y{j})**2)" for i, j in ((1, 2), (1, 3), (2, 3)))
+    kinetic = " + ".join(f"{name}_dot**2/2" for name in names)
+    stepper = sc.compile_stepper(sc.LagrangianSystem.from_text("eight", names, kinetic + attraction), "svi:8")
+    speed = np.array([-0.93240737, -0.86473146])
+    start = [0.97000436, -0.24308753, -0.97000436, 0.24308753, 0.0, 0.0]
+    at = {"velocity": [*(-speed / 2), *(-speed / 2), *speed], "period": 6.32591398}
+    eight = sc.periodic_orbit(stepper, start, reversor=["-x2", "-y2", "-x1", "-y1", "-x3", "-y3"], **at)
+    assert closing(eight) < 1e-9
+    assert eight.q[:2] == pytest.approx(-eight.q[2:4], abs=1e-14)
+
+
+@pytest.mark.second
+def test_what_is_no_symmetry_is_refused(pendulum, moon):
+    start = {"velocity": [0.0, -0.19, 0.0], "period": 3.3}
+    for reversor, message in {
+        ("-x", "y", "z"): r"does not reverse the steps of 'restricted .* differ by",
+        ("x", "y"): "reversor has 2 formulas, not one of each coordinate x, y, z",
+        ("x", "2*y", "z"): "applied twice, change no position",
+        ("x", "sin(y)", "z"): "must be linear formulas",
+        ("x", "w", "z"): "unknown name 'w'",
+    }.items():
+        with pytest.raises(sc.StateError, match=message):
+            sc.periodic_orbit(moon, [1.17, 0.0, 0.09], reversor=reversor, **start)
+    with pytest.raises(sc.StateError, match="no change of signs"):
+        sc.periodic_orbit(moon, [1.17, 0.01, 0.09], reversor="detect", **start)
+    with pytest.raises(sc.StateError, match="even number of steps, not 41"):
+        sc.periodic_orbit(moon, [1.17, 0.0, 0.09], reversor=MIRROR, steps=41, **start)
+    ball = sc.compile_stepper(PENDULUM, "svi:8", events=[sc.impact("q", restitution=1.0)])
+    with pytest.raises(sc.StateError, match="without events"):
+        sc.periodic_orbit(ball, [0.5], [0.0], period=3.1, reversor=["q"])
+    orbit = sc.periodic_orbit(pendulum, [0.0], [1.0], period=6.7, fixed=["p_q"], reversor=["-q"])
+    family = sc.family(pendulum, orbit, parameter="a", fixed=["p_q"], reversor=["-q"], count=3)
+    assert "is no symmetry at another value of parameter=" in family.ended
+
+
+@pytest.mark.rotated
+def test_families_of_symmetric_orbits_are_those_of_whole_ones(moon, tmp_path):
+    """From L1 to the halo orbits; vertical orbits branch off too, with and without the symmetry."""
+    rest = sc.equilibrium(moon, [0.83, 0, 0])
+    at = {"amplitude": 0.01, "step": 0.2, "until": "energy > -1.585"}
+    family = sc.family(moon, rest, reversor="detect", **at)
+    (halo,) = family.bifurcations
+    assert -2 * halo.orbit.energy == pytest.approx(3.174351954, abs=1e-9)
+    assert halo.orbit.period == pytest.approx(2.742994069, abs=1e-8)
+    assert abs(np.array([orbit.q[1] for orbit in family])).max() < 1e-14
+    whole = sc.periodic_orbit(moon, family[-1].q, family[-1].p, period=family[-1].period, fixed=["x", "y"])
+    assert family[-1].period == pytest.approx(whole.period, rel=1e-12)
+    assert family[-1].stability_indices == pytest.approx(whole.stability_indices, rel=1e-9)
+    halos = halo.switch(step=0.1, count=4)
+    assert all(orbit.q[2] > 0 and abs(orbit.q[1]) < 1e-14 for orbit in halos[1:])
+    assert max(closing(orbit) for orbit in halos) < 1e-8
+    halos.save(tmp_path / "halo.npz")
+    longer = sc.Family.load(moon, tmp_path / "halo.npz").more(1)
+    assert longer[-1].period == pytest.approx(halos.more(1)[-1].period, rel=1e-12)
+    # A branch across the symmetry: axial orbits have whole ones.
+    lyapunov = sc.family(moon, family[-1], fixed=["y"], step=0.2, until="energy > -1.5", reversor=MIRROR)
+    axial = lyapunov.bifurcations[0].switch(step=0.1, count=3)
+    assert all(abs(orbit.q[2]) < 1e-6 < abs(orbit.p[2]) for orbit in axial[1:])
+    assert max(closing(orbit) for orbit in axial) < 1e-8
