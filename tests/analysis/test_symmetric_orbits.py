@@ -83,7 +83,7 @@ def test_exchange_of_bodies_as_reversor():
 def test_what_is_no_symmetry_is_refused(pendulum, moon):
     start = {"velocity": [0.0, -0.19, 0.0], "period": 3.3}
     for reversor, message in {
-        ("-x", "y", "z"): r"does not reverse the steps of 'restricted .* differ by",
+        ("-x", "y", "z"): "it does not reverse the steps of 'restricted",
         ("x", "y"): "reversor has 2 formulas, not one of each coordinate x, y, z",
         ("x", "2*y", "z"): "applied twice, change no position",
         ("x", "sin(y)", "z"): "must be linear formulas",

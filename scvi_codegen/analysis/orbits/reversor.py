@@ -24,18 +24,11 @@ from scvi_codegen.systems.formulas.symbols import symbol
 AT_ZERO = 1e-6
 """Positions and momenta, relative to the largest ones, below which they are those of a crossing of the fixed set."""
 MOST_CANDIDATES = 256
-INVOLUTION = 1e-12
-"""Largest rounding error of the square of an involution."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reversor:
-    """Reversor of a system.
-
-    Attributes:
-        matrix: (m, m) A.
-        shift: (m,) b.
-    """
+    """Reversor q -> A q + b with the (m, m) matrix A and the (m,) shift b."""
 
     matrix: Array
     shift: Array
@@ -55,8 +48,8 @@ class Reversor:
         except (ArithmeticError, ScviCodegenError) as error:
             raise StateError(f"reversor={list(texts)}: {error}") from error
         affine = not any(slope.free_symbols for row in slopes for slope in row)
-        square = np.abs(np.append(matrix @ matrix - np.eye(len(matrix)), matrix @ shift + shift)).max()
-        if not affine or square > INVOLUTION * max(1.0, np.abs(shift).max()):
+        twice = np.allclose(matrix @ matrix, np.eye(len(matrix))) and np.allclose(matrix @ shift, -shift)
+        if not affine or not twice:
             raise StateError(f"reversor={list(texts)} must be linear formulas that, applied twice, change no position")
         return cls(matrix, shift)
 
@@ -73,20 +66,10 @@ class Reversor:
         q, p = np.split(states, 2, axis=-1)
         return np.concatenate([q @ self.matrix.T + self.shift, -p @ self.matrix], axis=-1)
 
-    def projected(self, state: Array) -> Array:
-        """Return the nearest state of the fixed set."""
-        return np.asarray((state + self(state)) / 2.0)
-
     @cached_property
     def odd(self) -> Array:
         """(2m, 2m) projection onto the changes that R reverses, (1 - R')/2."""
         return np.asarray((np.eye(2 * len(self.shift)) - self._derivative) / 2.0)
-
-    @cached_property
-    def across(self) -> Array:
-        """(m, 2m) orthonormal rows that are 0 on the changes within the fixed set."""
-        rows: Array = np.linalg.svd(self.odd)[2]
-        return rows[: len(self.shift)]
 
     @cached_property
     def _derivative(self) -> Array:

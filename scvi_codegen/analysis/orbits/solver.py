@@ -81,8 +81,8 @@ class PeriodicOrbit:
         sequence: ends of the steps relative to the period.
         monodromy: (2m, 2m) derivative of the end with respect to the start; of systems with rotations in canonical
             coordinates of the reduced space, with 6 rows for a rotation, 4 for a direction and 2 for a spin.
-        residual: largest entry of the end minus the start, of the computed map; of symmetric orbits of the end of half
-            a period minus its mirror image, halved.
+        residual: largest entry of the end minus the start, of the computed map; of symmetric orbits (x - R x)/2 of the
+            state x after half a period.
         error: discretisation error of the orbit: the distance to the orbit of a run with 2.6 times as many steps, which
             end at other times. It is the largest of three relative errors: of the positions and of the momenta at the
             start, with their rounding errors, relative to the largest range of a position and the largest momentum of a
@@ -282,8 +282,7 @@ def periodic_orbit(
             system is not periodic in time with this period.
         MethodError: if time is transformed, the stepper has constraints, an energy is prescribed with
             forces, or the period of a time-dependent system is free.
-        StateError: if a shape, name or number is invalid, an input is not set, or steps are not reversed by
-            ``reversor``.
+        StateError: if a shape, name or number is invalid, an input is not set, or ``reversor`` is no symmetry.
         StepFailedError: if a step from the initial guess fails.
     """
     stepper = stepper.bind(q, parameters)[0]._known_with_events
@@ -445,15 +444,11 @@ class OrbitSearch:
         detects = reversor == "detect"
         for own in Reversor.fitting(state) if detects else [Reversor.of(stepper.coordinates, texts)]:
             guess = guess_of(own)
-            z = np.append(own.projected(guess[:-1]), guess[-1])
-            if (error := self.of_reversor(own).irreversibility(z)) <= REVERSED:
+            z = np.append((guess[:-1] + own(guess[:-1])) / 2.0, guess[-1])  # in the fixed set
+            if self.of_reversor(own).irreversibility(z) <= REVERSED:
                 return self.of_reversor(own), z
-        if detects:
-            raise StateError("reversor='detect': no change of signs of coordinates reverses motions and fits the guess")
-        raise StateError(
-            f"reversor={list(texts)} does not reverse the steps of '{stepper.title}', which differ by {error:.1e} of "
-            "the motion: give a symmetry of the system, or omit it"
-        )
+        tried = "no change of signs that keeps the guess reverses" if detects else "it does not reverse"
+        raise StateError(f"reversor={reversor!r}: {tried} the steps of '{stepper.title}'; give a symmetry, or omit it")
 
     def of_reversor(self, reversor: Reversor | None) -> OrbitSearch:
         """Return the search of orbits that are symmetric by another reversor, or of whole ones."""
@@ -722,8 +717,8 @@ class OrbitSearch:
         rows = np.eye(count)[list(self.fixed_indices)]
         if self.reversor is None:
             return rows
-        across = self.reversor.across
-        return np.vstack([rows, np.hstack([across, np.zeros((len(across), count - across.shape[1]))])])
+        across = np.linalg.svd(self.reversor.odd)[2][: self.stepper.dimension]
+        return np.vstack([rows, np.pad(across, ((0, 0), (0, count - across.shape[1])))])
 
     def reduced_sizes(self, sizes: Array) -> Array:
         """Return sizes (2m,) of positions and momenta as those of the coordinates of the reduced tangent space."""

@@ -117,8 +117,6 @@ class StepSequence:
     @property
     def mirrored(self) -> StepSequence:
         """Sequence of half a period, followed by its mirror image."""
-        if self.tolerance is None:
-            return StepSequence.equal(2 * len(self))
         return StepSequence(np.append(self.ends, 1.0 - self.ends[-2::-1]), self.tolerance)
 
     @property
