@@ -19,7 +19,27 @@ static int stops_at(const event_step *step, const contact_terms *of, int k)
   return CONTACTS[k].slips == 1 || length_of(of->rate + CONTACTS[k].tangential, 2) <= CONTACT_SLOW * speed;
 }
 
-/* Impacts and new modes at a state, which is projected onto their constraints. */
+/* Whether normal forces push and friction is in its cone, in the present modes at a state. */
+static int are_forces_possible(const event_step *step, const contact_terms *of)
+{
+  const contact_problem in = {.of = of, .right = of->second};
+  contact_mode mode[EVENT_CONTACTS];
+  real force[CONTACT_ROWS], after[CONTACT_ROWS];
+  int possible;
+  modes_at(of, step->watch->mode, mode);
+  possible = solve_contacts(of, mode, of->second, force, after, NULL);
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
+    const int row = normal < 0 ? slip : normal;
+    const real small = rounding_at_row(&in, after, row) / of->W[row * (CONTACT_ROWS + 1)];
+    possible &= normal < 0 || force[normal] >= -small;
+    possible &= !mode[k].sticks || length_of(force + slip, slips) <= friction_limit(of, k, 1, force) + small;
+  }
+  return possible;
+}
+
+/* Impacts and new modes at a state, which is projected onto their constraints. That may turn slow slips, and modes are
+ * chosen again if it makes their forces impossible. */
 static int change_modes(const event_step *step, event_sample *at, contact_change *now)
 {
   contact_terms of;
@@ -38,10 +58,36 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
     forces_at(at->t, at->q, at->p, step->own, present, force, step->workspace);
   if (status == OK && approach)
     status = collide(step, at, &of, closed, now);
-  if (status == OK)
+  for (int pass = 0, possible = 0; status == OK && !possible && pass <= EVENT_CONTACTS; pass++) {
     status = choose_modes(step, &of, now, force);
-  return status == OK ? satisfy_constraints(step, at->t, at->q, at->p, 1) : status;
+    if (status == OK)
+      status = satisfy_constraints(step, at->t, at->q, at->p, 1);
+    if (status == OK)
+      status = terms_at(step, at, &of);
+    possible = status == OK && are_forces_possible(step, &of);
+  }
+  return status;
 }
+
+#ifdef CONTACTS_IN_SPACE
+/* Follows slips in space from a state; new modes where their new directions make forces impossible. */
+static int renew_slips(const event_step *step, event_sample *at, real *longest)
+{
+  const long long before = *step->filled;
+  const real most = *longest;
+  contact_change now;
+  contact_terms of;
+  int status = follow_slips(step, at, longest);
+  if (status == OK && *step->filled > before)
+    status = terms_at(step, at, &of);
+  if (status != OK || *step->filled == before || are_forces_possible(step, &of))
+    return status;
+  memset(&now, 0, sizeof now);
+  status = change_modes(step, at, &now);
+  *longest = most;
+  return status == OK ? follow_slips(step, at, longest) : status;
+}
+#endif
 
 /* Whether a condition of a contact has failed now: its gap may vanish again where that is 0 within rounding. */
 static int has_just_left(const event_step *step, int k)

@@ -333,7 +333,7 @@ static int renew_sides(const event_step *step, long long first, const event_samp
 #ifdef CONTACTS_IN_SPACE
 /* Cuts a part of a fixed step to one that resolves slips in space, and to the longest whose iterations converge; the
  * first part was taken by the run unless it is replaced, in other modes. */
-static int shorten_part(const event_step *step, const event_sample *left, event_sample *right, real end, int changes,
+static int shorten_part(const event_step *step, event_sample *left, event_sample *right, real end, int changes,
     real longest, real *part)
 {
   const real whole = *part;
@@ -343,7 +343,7 @@ static int shorten_part(const event_step *step, const event_sample *left, event_
     is_taken &= step->own[MODE_PLACE[k]] == step->watch->mode[k];
   put_modes(step->watch->mode, step->own);
   real by_slips = longest;
-  status = follow_slips(step, left, &by_slips);
+  status = renew_slips(step, left, &by_slips);
   longest = fmin(longest, by_slips);
   if (longest < fabs(whole))
     *part = copysign(longest, whole);
@@ -659,13 +659,13 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
     put_modes(watch->mode, own);
 #endif
 #ifdef CONTACTS_IN_SPACE
-    const event_sample now = {.t = run->t, .q = run->q, .p = run->p};
+    event_sample now = {.t = run->t, .q = run->q, .p = run->p};
     real longest = fabs(run->h);
 #if EVENTS_CONTROLLED
     longest = control ? exp2((real)run->grid_level / 4.0) : longest; /* the size that the controller has found */
 #endif
     if (status == OK)
-      status = follow_slips(&step, &now, &longest);
+      status = renew_slips(&step, &now, &longest);
 #endif
     keep_run(&before, run, step.values + (long long)EVENT_VALUES * EVENTS);
 #ifdef EVENT_KINKS

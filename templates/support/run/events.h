@@ -301,8 +301,8 @@ static int search_part(const event_step *step, int e, const event_sample *left, 
   return status == OK ? search_part(step, e, &sample, right, NULL, splits - 1) : status;
 }
 
-/* Changes of the functions if each coordinate changes by one ulp: the effect of rounding of the state. Of many
- * coordinates the largest change if all of them change at once, with alternating signs of three patterns. */
+/* Changes of the functions if each coordinate and its momentum change by one ulp: the effect of rounding of the state.
+ * Of many the largest change if all of them change at once, with alternating signs of three patterns. */
 static int rounding_of(const event_step *step, const event_sample *at)
 {
   real *const noise = values_at(step, EVENT_DEGREE + 2), *const now = values_at(step, EVENT_DEGREE + 1);
@@ -311,11 +311,13 @@ static int rounding_of(const event_step *step, const event_sample *at)
   event_sample next = *at;
   int status = OK;
   next.q = step->memory + 2 * M;
+  next.p = next.q + M;
   memset(noise, 0, BYTES(EVENTS));
   for (int k = 0; status == OK && k < (each ? M : 3); k++) {
     for (int i = 0; i < M; i++) {
       const int sign = (i * k / 2) % 2 ? -1 : 1, ulps = each ? i == k : sign;
       next.q[i] = at->q[i] * (1.0 + ulps * DBL_EPSILON);
+      next.p[i] = at->p[i] * (1.0 + ulps * DBL_EPSILON);
     }
     status = evaluate_functions(step, &next, now);
     for (int e = 0; status == OK && e < EVENTS; e++)
