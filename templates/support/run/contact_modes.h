@@ -25,12 +25,12 @@ typedef struct {
   contact_mode role[EVENT_CONTACTS]; /* whether it may be closed, and its friction any (sticks) or in its direction */
 } contact_problem;
 
-/* Sets the modes of a contact that its gap and its slip at a state allow. */
-static void allow_modes(contact_problem *in, int k, const contact_change *now)
+/* Sets the modes of a contact that its gap and its slip at a state allow; fastest: its slip so far. */
+static void allow_modes(contact_problem *in, int k, const contact_change *now, real fastest)
 {
   const contact_terms *const of = in->of;
   const contact_places *at = CONTACTS + k;
-  const real *const w = of->rate + at->tangential, speed = at->slips > 0 ? of->speed[at->tangential] : 0.0;
+  const real *const w = of->rate + at->tangential;
   in->is_free[k] = of->absent[k] || now->leaves[k] ||
       (at->normal >= 0 && !now->touches[k] &&
           (of->value[at->normal] > CONTACT_ROUNDING * of->size[at->normal] ||
@@ -39,7 +39,7 @@ static void allow_modes(contact_problem *in, int k, const contact_change *now)
   if (in->is_free[k] || at->slips == 0)
     return;
   in->begins[k] = now->begins[k];
-  in->rests[k] = !now->begins[k] && (now->rests[k] || length_of(w, at->slips) <= CONTACT_ROUNDING * speed);
+  in->rests[k] = !now->begins[k] && (now->rests[k] || length_of(w, at->slips) <= CONTACT_ROUNDING * fastest);
   in->limit[k] = in->rests[k] || in->begins[k];
   if (in->limit[k])
     in->role[k] = CONTACT_STICKS;
@@ -359,7 +359,7 @@ static int choose_modes(const event_step *step, const contact_terms *of, const c
   real second[CONTACT_ROWS], entry = 0.0;
   int imposed[CONTACT_ROWS] = {0};
   for (int k = 0; k < EVENT_CONTACTS; k++)
-    allow_modes(&in, k, now);
+    allow_modes(&in, k, now, step->watch->fastest[k]);
   if (!relax_modes(&in, force, best)) {
     const int paradox = painleve(&in, &entry);
     return refuse(step, CONTACT_WITHOUT_MODE, paradox, paradox < 0 ? 0.0 : entry);

@@ -48,6 +48,8 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
   int closed[EVENT_CONTACTS], approach = 0, status = terms_at(step, at, &of);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const contact_mode mode = mode_of(step->watch->mode, k);
+    if (status == OK && CONTACTS[k].slips > 0)
+      step->watch->fastest[k] = fmax(step->watch->fastest[k], of.speed[CONTACTS[k].tangential]);
     closed[k] = CONTACTS[k].normal >= 0 && mode.closed && !now->leaves[k];
     now->touches[k] |= closed[k];
     now->rests[k] = mode.sticks || (mode.closed && mode.held) || (now->stops[k] && stops_at(step, &of, k));
