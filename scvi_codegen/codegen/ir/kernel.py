@@ -20,7 +20,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, TypeAlias
 
 import sympy
@@ -267,7 +267,7 @@ Statement: TypeAlias = tuple[str, int, Expression]
 """(kind, index, expression): ``w`` is a temporary of the part, ``kept``, ``value`` and ``derivative`` are arrays."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Part:
     """Consecutive statements of a kernel; loads from ``kept`` are temporaries of earlier parts.
 
@@ -281,10 +281,12 @@ class Part:
 
     def uses(self, array: str) -> bool:
         """Return whether it reads or writes ``u``, ``t``, ``parameters``, ``kept``, ``value`` or ``derivative``."""
-        return any(
-            kind == array or any(load.source == array for load in loads(expression))
-            for kind, _, expression in self.statements
-        )
+        return array in self._arrays
+
+    @cached_property
+    def _arrays(self) -> set[str]:
+        written = {kind for kind, _, _ in self.statements}
+        return written | {load.source for _, _, expression in self.statements for load in loads(expression)}
 
 
 def kept_length(cut: Sequence[Part]) -> int:

@@ -42,7 +42,7 @@ from sympy import Add, Expr, Matrix, S, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError, closest
 from scvi_codegen.systems.formulas.arrays import ROTATING, parse_coordinate
-from scvi_codegen.systems.formulas.expressions import dot, gradient, hessian
+from scvi_codegen.systems.formulas.expressions import dot, gradient
 from scvi_codegen.systems.formulas.grammar import Parser, parsed
 from scvi_codegen.systems.formulas.indices import Array, Size
 from scvi_codegen.systems.formulas.symbols import DOT, check_name, name_of_key, symbol
@@ -348,9 +348,12 @@ class RotationNames:
 
     def inertia(self, member: Homogeneous, reduced: Expr, parameters: Sequence[Symbol]) -> Expr:
         """Return I0 of a member: the mean of the diagonal of l's Hessian in its rates if that is constant, else 1."""
-        entries = hessian(reduced, member.rates)
-        mean = Add(*(entries.get((i, i), S.Zero) for i in range(len(AXES)))) / len(AXES)
-        return mean if mean != 0 and mean.free_symbols <= set(parameters) else S.One
+        entries = [S.Zero] * len(AXES)
+        for i, row in gradient(reduced, member.rates).items():
+            entries[i] = gradient(row, member.rates).get(i, S.Zero)
+            if not entries[i].free_symbols <= set(parameters):
+                return S.One
+        return Add(*entries) / len(AXES) if any(entries) else S.One
 
     def lagrangian(self, reduced: Expr, parameters: Sequence[Symbol]) -> Expr:
         """Return l plus the scaling terms, as a function of the homogeneous coordinates and their velocities."""

@@ -10,13 +10,14 @@ H has no term in q . p and is singular in p. Its velocities satisfy q . q_dot = 
 symmetry with the same reduced space T*SO(3).
 """
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import sympy
 from sympy import Add, Expr, Matrix, S, Symbol
 
 from scvi_codegen.systems.derived_expressions import coupled_blocks, inverse_by_minors
-from scvi_codegen.systems.formulas.expressions import gradient_tuple, hessian
+from scvi_codegen.systems.formulas.expressions import gradient, gradient_tuple, hessian
 from scvi_codegen.systems.formulas.rotations import RotationNames
 from scvi_codegen.systems.formulas.symbols import symbol
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
@@ -35,7 +36,7 @@ def hamiltonian_of_rotations(system: LagrangianSystem) -> HamiltonianSystem | No
     ordinary = [q for q in system.coordinates if q.name not in names.coordinates]
     rates = (rate for rotation in names.rotations for rate in rotation.rates)
     u = (*(symbol(f"{q.name}_dot") for q in ordinary), *rates)
-    inverse = _inverse_of_constant(hessian(reduced.lagrangian, u), len(u), set(system.parameters))
+    inverse = _inverse_of_constant(reduced.lagrangian, u, set(system.parameters))
     if inverse is None:
         return None
     momenta = {q: symbol(f"p_{q.name}") for q in system.coordinates}
@@ -62,10 +63,12 @@ def hamiltonian_of_rotations(system: LagrangianSystem) -> HamiltonianSystem | No
     )
 
 
-def _inverse_of_constant(entries: dict[tuple[int, int], Expr], size: int, parameters: set[Symbol]) -> Matrix | None:
-    """Return the inverse of a block-diagonal matrix of parameters; ``None`` if it varies or a block is too large."""
-    if any(not entry.free_symbols <= parameters for entry in entries.values()):
+def _inverse_of_constant(energy: Expr, u: Sequence[Symbol], parameters: set[Symbol]) -> Matrix | None:
+    """Return the inverse of a block-diagonal Hessian of parameters; ``None`` if it varies or a block is too large."""
+    rows = (gradient(row, u) for row in gradient(energy, u).values())  # until one varies: O(n), the Hessian O(n^2)
+    if any(not entry.free_symbols <= parameters for row in rows for entry in row.values()):
         return None
+    entries, size = hessian(energy, u), len(u)
     inverse = sympy.zeros(size, size)
     for block in coupled_blocks(entries, size):
         if len(block) > LARGEST_BLOCK:

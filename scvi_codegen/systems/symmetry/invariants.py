@@ -90,7 +90,7 @@ def conserved(
     if rows is None or not len(rows):
         return []
     support = [int(c) for c in np.flatnonzero(rows.any(axis=0))]
-    factors = _factors(system, motion)
+    factors = _factors(system, search.acting(support))
     computed = search.null_spaces(support, len(factors) + MORE_PARAMETERS if factors else 1)
     spaces = [space for space in computed if space is not None and space.shape == (len(rows), len(support))]
     if len(spaces) < len(computed):
@@ -117,14 +117,33 @@ class _Search:
         self.partials: dict[int, dict[int, Expr]] = {}
         self.parameters_at: dict[Symbol, Array] = {}
 
-    def null_spaces(self, selected: Sequence[int], count: int) -> list[Array | None]:
+    def acting(self, selected: Sequence[int]) -> list[Symbol]:
+        """Return the parameters on which null spaces depend, by bisection: those of a part are changed together."""
+        parts = [[*self.motion.constants]] if self.motion.constants else []
+        while parts:
+            first, *spaces = self.null_spaces(selected, 1 + len(parts), parts)
+            parts = [part for part, space in zip(parts, spaces, strict=True) if not _equal(first, space)]
+            if all(len(part) == 1 for part in parts):
+                break
+            halves = ((part[: len(part) // 2], part[len(part) // 2 :]) for part in parts)
+            parts = [half for pair in halves for half in pair if half]
+        return [parameter for (parameter,) in parts]
+
+    def null_spaces(
+        self, selected: Sequence[int], count: int, parts: Sequence[Sequence[Symbol]] | None = None
+    ) -> list[Array | None]:
         """Return null spaces of the chosen columns for ``count`` values of the parameters, of shape (d, columns) each.
 
         ``None`` where the system is undefined at too many points. Parameters have the signs of their default values and
-        are of size 1, or are near the default values where the system is undefined there.
+        are of size 1, or are near the default values where the system is undefined there. Each set of values after the
+        first differs from it in the parameters of one of the ``parts``.
         """
         for near in (False, True):
             self.parameters_at = drawn_parameters(self.motion.constants, count, near=near)
+            for k, part in enumerate(parts or (), 1):
+                for parameter in part:
+                    values = self.parameters_at[parameter]
+                    values[[*range(k), *range(k + 1, count)]] = values[0]
             together = max(1, AT_ONCE // (2 * (len(selected) + MORE_POINTS)))
             spaces = [
                 space
@@ -183,6 +202,11 @@ class _Search:
         return bool(self.motion.verifying)
 
 
+def _equal(one: Array | None, other: Array | None) -> bool:
+    """Return whether null spaces are equal up to rounding; those that are unknown are not."""
+    return one is not None and other is not None and one.shape == other.shape and np.allclose(one, other, 1e-6, ZERO)
+
+
 def _null_space(matrix: Array, sizes: Array) -> Array:
     """Return the null space in reduced row echelon form; rows and columns are scaled by ``sizes`` of terms."""
     # Rows to size 1, then columns to root mean square 1: the null space of M D is D^-1 that of M.
@@ -226,11 +250,11 @@ def _reduced(rows: Array) -> tuple[Array, list[int]]:
     return np.where(np.abs(rows) > ZERO, rows, 0.0), pivots
 
 
-def _factors(system: MechanicalSystem, motion: Rates) -> list[Expr]:
-    """Return candidate factors of coefficients: parameters, and sums of parameters that occur in the system."""
-    constants = set(motion.constants)
-    result: list[Expr] = list(motion.constants)
-    masses = forms_of(system).mass
+def _factors(system: MechanicalSystem, acting: Sequence[Symbol]) -> list[Expr]:
+    """Return candidate factors of coefficients: parameters that act on them, and sums of these in the system."""
+    constants = set(acting)
+    result: list[Expr] = list(acting)
+    masses = {} if forms_of(system).inverse_mass else forms_of(system).mass  # of trees of bodies never formed
     sums = [*(part for part in parts(system.formula) if part.is_Add), *masses.values()]
     sums.append(sympy.Add(*(entry for (i, j), entry in masses.items() if i == j)))
     for total in sums:
