@@ -83,9 +83,26 @@ static const int POSITION_IN_MATRIX[SITES] = {0, 1};
 #define MASS_POSITION POSITION_IN_MATRIX
 static const int MASS_ENTRY[2][2] = {{0, 0}, {1, 1}};
 
-INVERSE_ROOT(1, (inverse));
-INVERSE_ROOT(3, (inverse * inverse));
-INVERSE_ROOT(5, (inverse * inverse * inverse));
+/* x^(-1/2). */
+static inline real inverse_root_1(real x)
+{
+  const real inverse = 1 / x;
+  return inverse * MATH(sqrt)(x);
+}
+
+/* x^(-3/2). */
+static inline real inverse_root_3(real x)
+{
+  const real inverse = 1 / x;
+  return inverse * inverse * MATH(sqrt)(x);
+}
+
+/* x^(-5/2). */
+static inline real inverse_root_5(real x)
+{
+  const real inverse = 1 / x;
+  return inverse * inverse * inverse * MATH(sqrt)(x);
+}
 
 /* L_q and L_v at u = (q, v). Operations: 5 *, 1 +, 1 inverse_root_3, 2 neg. */
 static void quadrature_value(const double *u, double t, const double *parameters, double *value)

@@ -289,7 +289,7 @@ class _Graph:
 
 
 def _primitive(total: sympy.Add) -> tuple[sympy.Rational, Sequence[sympy.Expr]]:
-    """Return content and terms of SymPy's ``primitive()``, which takes ten times as long for multiples of quantities."""
+    """Return content and terms of SymPy's ``primitive()``, which takes ten times as long for products."""
     pairs = [term.as_coeff_Mul() for term in total.args]
     content = sympy.Rational(math.gcd(*(c.p for c, _ in pairs)), math.lcm(*(c.q for c, _ in pairs)))
     if content == 1 or not all(isinstance(rest, sympy.Symbol | sympy.Mul | Intermediate) for _, rest in pairs):

@@ -132,17 +132,9 @@ static inline long long index_of_rate(long long n, long long i)
   return i < n ? i + n : i - n;
 }
 
-static inline double mass_of(const step_points *w, long long i)
-{
-  (void)w, (void)i;
-  return 1.0;
-}
+#define mass_of(w, i) 1.0
 
-static inline double unit_of(const step_points *w, long long i)
-{
-  (void)i;
-  return w->step->h;
-}
+#define unit_of(w, i) (w)->step->h
 
 /* Increment of a value of the state at the points of a group by the rates F. */
 static inline lanes increment_at(const step_points *w, int part, int g, long long i, const lanes *F)

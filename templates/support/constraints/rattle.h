@@ -141,10 +141,7 @@ LANE_FUNCTION void force_of_lane(const step_data *step, const rattle_step *now, 
   constrained_force(u, step->t + RATTLE_ABSCISSA[n + 1] * step->h, step->parameters, force);
 }
 
-static inline void move_points(const step_data *step, rattle_step *now)
-{
-  (void)step, (void)now;
-}
+#define move_points(step, now) (void)0
 #endif
 
 #ifdef MOMENTUM_TERMS
@@ -173,10 +170,7 @@ static inline __attribute__((flatten)) void evaluate_momenta(const step_data *st
   IN_MEMORY(now->w);
 }
 #else
-static inline void evaluate_momenta(const step_data *step, rattle_step *now)
-{
-  (void)step, (void)now;
-}
+#define evaluate_momenta(step, now) (void)0
 #endif
 
 /* Evaluates forces, constraints and their derivatives. */

@@ -60,22 +60,14 @@ static inline int is_stagnant(progress *now, const solver_options *options, int 
 }
 
 /* Where is_stagnant returned 1. */
-static inline double stagnant(const progress *now)
-{
-  (void)now;
-  return 1.0;
-}
+#define stagnant(now) 1.0
 
 static inline int must_amplify(progress *now, const solver_options *options, int k)
 {
   return is_to_amplify(now, options, k);
 }
 
-static inline double amplification(const progress *now)
-{
-  (void)now;
-  return AMPLIFICATION;
-}
+#define amplification(now) AMPLIFICATION
 
 /* Status of the finished iteration. */
 static inline int outcome(const progress *now, solver_report *report)

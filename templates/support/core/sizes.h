@@ -60,17 +60,9 @@ static inline real rounding_of_displacement(real largest_displacement)
 
 #ifndef CONSTRAINED
 /* Sizes of positions that round as constraints do: there are none. */
-static inline real size_by_constraints(const step_data *step)
-{
-  (void)step;
-  return 0;
-}
+#define size_by_constraints(step) 0
 
-static inline real length_of_constraints(const step_data *step)
-{
-  (void)step;
-  return 0;
-}
+#define length_of_constraints(step) 0
 #endif
 
 #ifdef ARRAYS

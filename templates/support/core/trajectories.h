@@ -66,11 +66,7 @@ static inline number bounded_ratio(number a, number b, double bound)
 }
 
 /* No trajectory decides for the others. */
-static inline int is_within(number x, double bound)
-{
-  (void)x, (void)bound;
-  return 0;
-}
+#define is_within(x, bound) 0
 
 static inline number rest_of_numbers(number a, number b, number product)
 {
@@ -147,36 +143,6 @@ static inline lanes points_total(lanes *x)
   return x[0];
 }
 
-/* sum_n weights_n x_n with the low words of the weights. */
-static inline number weigh_apart_twice(const weight *weights, const weight *low, const lanes *x, long long apart)
-{
-  lanes part[S];
-  for (int n = 0; n < S; n++)
-    part[n] = multiply_add(lanes_of(weights[n]), x[n * apart], low[n] * x[n * apart]);
-  return points_total(part);
-}
-
-/* The same with further weights of the changes from values y. */
-static inline number weigh_apart_thrice(const weight *weights, const weight *low, const lanes *x, const lanes *further,
-    const lanes *y, long long apart)
-{
-  lanes part[S];
-  for (int n = 0; n < S; n++) {
-    const lanes rest = multiply_add(further[n], x[n * apart] - y[n * apart], low[n] * x[n * apart]);
-    part[n] = multiply_add(lanes_of(weights[n]), x[n * apart], rest);
-  }
-  return points_total(part);
-}
-
-/* sum_n weights_n x_n of one coordinate. */
-static inline number weigh(const weight *weights, lanes (*x)[M], int i)
-{
-  lanes part[S];
-  for (int n = 0; n < S; n++)
-    part[n] = weights[n] * x[n][i];
-  return points_total(part);
-}
-
 /* Value at the first point. */
 static inline number at_first(const lanes *x)
 {
@@ -189,16 +155,8 @@ static inline number at_last(const lanes *x, long long apart)
   return x[(S - 1) * apart];
 }
 
-/* Values at the first and at the last point. */
-static inline number at_start(lanes (*x)[M], int i)
-{
-  return x[0][i];
-}
-
-static inline number at_end(lanes (*x)[M], int i)
-{
-  return at_last(&x[0][i], M);
-}
+#define LANES_OF_WEIGHT(x) lanes_of(x)
+#include "weighted_points.h"
 
 /* Sums over coordinates, of each point, and the place of those of a point. */
 typedef lanes point_sums[SUMS];

@@ -13,6 +13,11 @@ typedef struct {
   int look; /* first iteration of the linearised equations whose convergence is tested */
 } propagation;
 
+/* Propagation by the arguments of a function. */
+#define PROPAGATION_OF_ARGUMENTS                                                                      \
+  .t = t, .h = h, .q = q, .p = p, .parameters = parameters, .options = options ? options : &standard, \
+  .q1 = q1, .p1 = p1, .workspace = workspace, .report = report
+
 static step_data step_of(const propagation *over, long long k, const real *nothing)
 {
   const step_data step = step_from(over->t[k], over->h[k], over->q + k * M, over->p + k * M, nothing, nothing,
@@ -153,19 +158,7 @@ int NAME(linearise)(long long steps, const real *t, const real *h, const real *q
     solver_report *report, real *workspace)
 {
   const solver_options standard = NAME(default_options)();
-  propagation over = {.t = t,
-      .h = h,
-      .q = q,
-      .p = p,
-      .parameters = parameters,
-      .options = options ? options : &standard,
-      .back = back,
-      .count = count,
-      .vectors = vectors,
-      .q1 = q1,
-      .p1 = p1,
-      .workspace = workspace,
-      .report = report};
+  propagation over = {PROPAGATION_OF_ARGUMENTS, .back = back, .count = count, .vectors = vectors};
   int status = OK;
   memset(report, 0, sizeof *report);
   for (long long done = 0; status == OK && done < steps; done += STEPS_AT_ONCE) {

@@ -24,7 +24,6 @@ typedef ddl weight_pair;
 #define OF_WEIGHTS(name) ddl_##name
 #define NUMBER_PAIR(high, low) dd_of(high, low)
 #define WEIGHT_PAIR(x) ddl_of(x)
-#define LANES_OF_WEIGHT(x) (x)
 #define WEIGHT_OF(x) lanes_of(x)
 #define CHOSEN(wanted, x, y) (x) /* y for trajectories where `wanted` is 0 */
 #define SUM_OF_POINTS(x) points_total(x)
@@ -35,7 +34,6 @@ typedef dd weight_pair;
 #define OF_WEIGHTS(name) dd_##name
 #define NUMBER_PAIR(high, low) ddl_of_words(high, low)
 #define WEIGHT_PAIR(x) (x)
-#define LANES_OF_WEIGHT(x) lanes_of(x)
 #define WEIGHT_OF(x) (x)
 #define CHOSEN(wanted, x, y) lanes_selected(wanted, x, y)
 #define SUM_OF_POINTS(x) sum_of_points(x)
@@ -70,13 +68,6 @@ static inline ddl lanes_of_pair(number_pair x)
 }
 
 #ifdef POINTS
-static inline double lane_of(const lanes *x, int j)
-{
-  double value; /* a cast of the pointer would alias */
-  memcpy(&value, (const char *)x + (size_t)j * sizeof value, sizeof value);
-  return value;
-}
-
 /* Largest absolute value at the points. */
 static inline double largest_at_points(const ddl (*x)[M], int i)
 {

@@ -2,13 +2,6 @@
 
 /* Sums over points of a step in pairs; groups of points are vectors. Requires: vector_pairs.h. */
 
-static inline double lane_of(const lanes *x, int j)
-{
-  double value; /* a cast of the pointer would alias */
-  memcpy(&value, (const char *)x + (size_t)j * sizeof value, sizeof value);
-  return value;
-}
-
 /* sum_j table_gj x_j of a coordinate: Dot2 (Ogita, Rump & Oishi 2005) with the low words of both factors. */
 static inline ddl sum_of_pairs(const lanes *table, const lanes *low, int g, const ddl (*x)[M], int i)
 {

@@ -12,3 +12,11 @@ static inline ddl ddl_of_words(lanes high, lanes low)
 }
 
 #define PARAMETER_OF_LANES(i) ddl_of_words(parameters[i], parameters[PARAMETERS + (i)])
+
+/* Lane j. */
+static inline double lane_of(const lanes *x, int j)
+{
+  double value; /* a cast of the pointer would alias */
+  memcpy(&value, (const char *)x + (size_t)j * sizeof value, sizeof value);
+  return value;
+}

@@ -14,51 +14,20 @@
 
 #define TO_INTEGER 6755399441055744.0 /* 1.5 2^52: adding and subtracting it rounds to a whole number */
 
-static inline double dd_root(double x)
-{
-  return sqrt(x);
-}
-
-static inline double dd_log_of(double x)
-{
-  return log(x);
-}
-
-static inline double dd_asinh_of(double x)
-{
-  return asinh(x);
-}
-
-static inline double dd_atan2_of(double y, double x)
-{
-  return atan2(y, x);
-}
-
-static inline double dd_sign(double x)
-{
-  return copysign(1.0, x);
-}
+#define dd_root(x) sqrt(x)
+#define dd_log_of(x) log(x)
+#define dd_asinh_of(x) asinh(x)
+#define dd_atan2_of(y, x) atan2(y, x)
+#define dd_sign(x) copysign(1.0, x)
+#define dd_is_small(x) (fabs(x) < 0.25 ? 1.0 : 0.0)
+#define dd_are_equal(a, b) ((a) == (b) ? 1.0 : 0.0)
+#define dd_select(chosen, a, b) ((chosen) != 0.0 ? (a) : (b))
 
 /* The whole number nearest to x + rest. */
 static inline double dd_whole(double x, double rest)
 {
   const double whole = rint(x), half = x - whole;
   return fabs(half) == 0.5 && half * rest > 0.0 ? whole + 2.0 * half : whole;
-}
-
-static inline double dd_is_small(double x)
-{
-  return fabs(x) < 0.25 ? 1.0 : 0.0;
-}
-
-static inline double dd_are_equal(double a, double b)
-{
-  return a == b ? 1.0 : 0.0;
-}
-
-static inline double dd_select(double chosen, double a, double b)
-{
-  return chosen != 0.0 ? a : b;
 }
 
 static inline double dd_limited(double x, double most)

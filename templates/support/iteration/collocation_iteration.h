@@ -59,12 +59,7 @@ static void prepare_iteration(const step_data *step, iteration_data *data)
   data->unused = 0;
 }
 
-static inline double correct_start(const step_data *step, const iteration_data *data, const lanes *mass,
-    const double *inverse_size, curve_data *curve)
-{
-  (void)step, (void)data, (void)mass, (void)inverse_size, (void)curve;
-  return 0.0;
-}
+#define correct_start(step, data, mass, inverse_size, curve) 0.0
 
 /* p1 - p0, with p1 the momentum at the end of a curve with the increment dq; NaN if it is undefined. */
 static void momentum_increment(const step_data *step, const iteration_data *data, const curve_data *curve,

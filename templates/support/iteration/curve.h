@@ -23,11 +23,7 @@ static int nearby_velocity(const step_data *step, double *v0)
 }
 #else
 /* Initial velocity of a curve as an unknown; the end of the last curve is the initial guess. */
-static int nearby_velocity(const step_data *step, double *v0)
-{
-  (void)step, (void)v0;
-  return OK;
-}
+#define nearby_velocity(step, v0) OK
 #endif
 
 /* Requires: one_trajectory.h, a mass, the tables COLLOCATION, NODE_END, NODE_MASK, whose column j multiplies node j. */

@@ -9,12 +9,7 @@
 #include "../newton/library_fallback.h"
 #elif defined(NO_FALLBACK)
 /* No fallback: if the fixed-point iteration fails, the step fails. */
-static int fall_back(int status, const step_data *step, double *dq, double *dp, const solver_options *options,
-    solver_report *report, double *workspace, const error_measure *measure)
-{
-  (void)step, (void)dq, (void)dp, (void)options, (void)report, (void)workspace, (void)measure;
-  return status;
-}
+#define fall_back(status, ...) (status)
 #else
 #include "../newton/newton_from_line.h"
 

@@ -13,11 +13,7 @@ static inline history second_curve(history past)
 }
 
 /* Memory for the values to be stored. */
-static inline coordinates *kept(history past, coordinates *own)
-{
-  (void)own;
-  return past.before;
-}
+#define kept(past, own) ((void)(own), (past).before)
 
 /* Number of former steps that the predictor uses: 0 for all trajectories, or 1, to which 2^(j + 1) is added if it is 2
  * for trajectory j. */
@@ -64,11 +60,7 @@ static inline void remember_curve(lanes (*x)[M], history past)
 }
 
 /* Velocities of the straight line; they are stored before the first step. */
-static inline int start_velocities(const step_data *step, lanes (*z)[M])
-{
-  (void)step, (void)z;
-  return OK;
-}
+#define start_velocities(step, z) OK
 
 /* Progress of the iteration of a step in every lane, as trajectory_progress. status: 1 converged, 0 undecided, -1
  * failed in this iteration, -2 before; amplification: factor of the last change to be added, AMPLIFICATION or 0;
@@ -134,11 +126,7 @@ static inline number measures_stiffness(const progress *now, int k)
 }
 
 /* The last iteration does not show the stiffness: the points of trajectories that converged before others are lost. */
-static inline int has_remainder(const progress *now, const solver_options *options)
-{
-  (void)now, (void)options;
-  return 0;
-}
+#define has_remainder(now, options) 0
 
 static inline int any_positive(number x)
 {
@@ -290,11 +278,7 @@ static inline int outcome(const progress *now, const solver_report *report)
   return OK;
 }
 
-static inline int accept(const step_data *step, const lanes *dq, const lanes *dp, const solver_report *report)
-{
-  (void)step, (void)dq, (void)dp, (void)report;
-  return 1;
-}
+#define accept(step, dq, dp, report) 1
 
 static inline long long next_guess(long long steps, const progress *now, const solver_report *report)
 {

@@ -12,6 +12,7 @@ static inline int has_arrived(real t, real t_low, real t_end)
   return t == t_end && t_low == 0;
 }
 
+#ifdef DOUBLE_DOUBLE
 /* What is left to t_end after the last step, whose size is rounded; 0 for other steps. */
 static inline real rest_of_last(const trial *now)
 {
@@ -20,12 +21,13 @@ static inline real rest_of_last(const trial *now)
   return now->last ? (span - now->step.h) + (rest - now->at.t_low) : 0;
 }
 
-#if defined(DOUBLE_DOUBLE) && defined(LEAST_UNRESOLVED)
+#ifdef LEAST_UNRESOLVED
 /* Smallest tolerance that a step of round-off meets and an error estimate in double resolves. */
 double NAME(smallest_tolerance)(void)
 {
   return larger(pow(LEAST_UNRESOLVED, ERROR_POWER), SMALLEST_TOLERANCE);
 }
+#endif
 #endif
 
 int NAME(advance_to)(run_memory *run, real t_end, const step_control *control, long long steps, long long every,
@@ -50,13 +52,15 @@ int NAME(advance_to)(run_memory *run, real t_end, const step_control *control, l
 #endif
   while (report->steps < steps && !has_arrived(now.at.t, now.at.t_low, t_end)) {
     const long long before = report->iterations;
-    real passed[2]; /* which only steps in transformed time need */
     int status = find_step(run, &now, options, report);
     if (status == OK)
       status = confirm_step(run, &now, options, report);
+#ifdef DOUBLE_DOUBLE
+    real passed[2]; /* which only steps in transformed time need */
     if (status == OK)
       status = refine_increments(&now.step, run->memory, now.at.t_low, rest_of_last(&now), now.dq, now.dp, passed,
           now.step.scratch + SCRATCH);
+#endif
     if (status != OK) {
       run->guess = 0;
       memcpy(run, &now.at, sizeof now.at);
