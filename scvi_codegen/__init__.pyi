@@ -135,6 +135,7 @@ from scvi_codegen.runs.stepper import Stepper as Stepper
 from scvi_codegen.runs.stepping.molecular_dynamics import pressure as pressure
 from scvi_codegen.runs.stepping.molecular_dynamics import radial_distribution as radial_distribution
 from scvi_codegen.runs.stepping.molecular_dynamics import temperature as temperature
+from scvi_codegen.runs.stepping.noise import ColouredNoise as ColouredNoise
 from scvi_codegen.runs.stepping.step_derivatives import Sensitivity as Sensitivity
 from scvi_codegen.runs.trajectory import Trajectory as Trajectory
 from scvi_codegen.systems.contact import Contact as Contact

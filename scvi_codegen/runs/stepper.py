@@ -59,7 +59,7 @@ from scvi_codegen.runs.stepping.array_interface import RunSizes, interface_of_si
 from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.runs.stepping.features import check_together, require
 from scvi_codegen.runs.stepping.integrator import Integrator
-from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise
+from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise, with_sequences
 from scvi_codegen.runs.stepping.projection import consistent, constraint_values, multipliers, projected
 from scvi_codegen.runs.stepping.saving import read_checkpoint
 from scvi_codegen.runs.stepping.state_functions import neither_or_both
@@ -139,8 +139,9 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             q, p: (m,) initial positions and momenta.
             inputs: of a system with inputs, by name: ``(t, values)``, interpolated linearly; ``(t, values, kind)`` with
                 ``"constant"`` (zero-order hold), ``"linear"`` or ``"cubic"`` (SciPy's spline); a ``CubicSpline`` or
-                ``PPoly`` of degree 3 at most; or a number. Steps end at the breakpoints, which preserves the order;
-                states there are saved. Without them inputs need values among the parameters.
+                ``PPoly`` of degree 3 at most; a number; or :class:`~scvi_codegen.ColouredNoise`. Steps end at the
+                breakpoints, which preserves the order; states there are saved. Without them inputs need values among
+                the parameters.
             velocity: (m,) initial velocities, instead of p.
             h: fixed step size, negative to integrate backward; step of tau in transformed time
                 (:func:`~scvi_codegen.reparametrise`).
@@ -187,8 +188,8 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             action: sum the action along the run, for :meth:`Trajectory.action`, which otherwise computes the steps
                 again. Runs with events that change the state ignore this; arrays of run-time sizes are compiled with
                 the sizes of the call.
-            seed: of a system with a heat bath, key of the noise, a whole number, by default 0. Noise is a function of
-                the seed, the trajectory, the number of the step and the coordinate.
+            seed: with a heat bath or coloured noise, key of the noise, a whole number, by default 0. Noise is a function
+                of the seed, the trajectory, the number of the step and the coordinate.
             metropolis: accept or reject each step, so that averages have no error of the step size.
 
         Returns:
@@ -209,7 +210,11 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             self._check_not_of_run(tables, threads)
             stride = None if save_every == 1 else save_every
             check_together(inputs=inputs, t_eval=t_eval, observe=observe, save_every=stride, error=error)
-            inputs = None if inputs is None else checked_inputs(interface, inputs)
+            if inputs is not None:
+                noise = Noise.checked(stepper, seed, metropolis, inputs=inputs)
+                end = None if h is None else final_time(t, h, steps, t_end)
+                inputs = with_sequences(interface.inputs, inputs, seed, 0, t=t, h=h, t_end=end)
+                inputs = checked_inputs(interface, inputs)
         if interface.rotations or interface.variables:
             q, p, velocity = self._states.start(q, p, velocity)
         if error is not None:
@@ -242,7 +247,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             times = None if t_eval is None else stepper._output_times(t_eval, t, plan, count)
             output = Output(save_every, times, observe, progress)
         initial = tuple.__new__(InitialData, (q, p, velocity, t, parameters, options))  # without a call of Python
-        noise = Noise.checked(stepper, seed, metropolis)
+        noise = Noise.checked(stepper, seed, metropolis) if inputs is None else noise
         return stepper._integrated(initial, plan, count, output, segments, check_growth, noise)
 
     def _integrated(

@@ -11,6 +11,7 @@ from samples import QUICK_FLAGS
 from scipy.linalg import expm, solve_discrete_lyapunov
 
 import scvi_codegen as sc
+from scvi_codegen.runs.stepping.noise import normal_numbers
 
 MASS = np.array([[1, 0.5, 0], [0.5, 2, 0], [0, 0, 1]])
 STIFFNESS = np.array([[2, -1, 0], [-1, 2, -1], [0, -1, 2.0]])
@@ -342,3 +343,45 @@ def test_acceptance_does_not_depend_on_units():
         )
     assert runs[0].acceptance == runs[1].acceptance < 0.9
     assert np.array_equal(runs[0].q, runs[1].q * 2.0**33)
+
+
+def test_words_of_philox_and_normals_of_c():
+    """Known answers of Random123 (kat_vectors), and the noise of a free particle after a step, sqrt(h/2) (xi + xi')."""
+    words = 0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8
+    chance, turn = ((high << 21 | low >> 11) * 2.0**-53 for high, low in (words[:2], words[2:]))
+    known = np.sqrt(-2 * np.log(chance + 2.0**-53)) * np.exp(2j * np.pi * turn)
+    assert normal_numbers(0, 0, 0, 0, 0) == pytest.approx(known, rel=1e-15)
+    free = compiled("stoermer-verlet", "free", coordinates=["x"], lagrangian="x_dot**2/2", noise={"x": "1"})
+    seed, rest = 2**40 + 3, np.zeros((5, 1))
+    momenta = free.integrate_ensemble(rest, rest, h=0.5, steps=9, seed=seed).p[:, :, 0]
+    pairs = normal_numbers(seed, np.arange(5), np.arange(9)[:, np.newaxis], 0, 1)
+    assert np.abs(np.diff(momenta, axis=0) - (pairs.real + pairs.imag) / 2).max() < 1e-14
+
+
+def test_coloured_noise_is_the_exact_sequence_of_each_trajectory():
+    ramp = compiled(
+        *("svi:1", "ramp"), coordinates=["x"], lagrangian="x_dot**2/2", forces={"x": "u + w"}, inputs=["w", "u"]
+    )
+    h, (sigma, tau), rest = 0.25, (0.7, 1.5), np.zeros((3, 1))
+    inputs = {"u": sc.ColouredNoise(sigma, tau), "w": 0.0}
+    runs = ramp.integrate_ensemble(rest, rest, h=h, steps=20, inputs=inputs, seed=5)
+    u = np.diff(runs.p[:, :, 0], axis=0) / h  # the force in each step
+    xi = normal_numbers(5, np.arange(3), np.arange(20)[:, np.newaxis], 2, 1).real
+    expected = sigma * xi
+    for n in range(1, 20):
+        expected[n] = np.exp(-h / tau) * expected[n - 1] + sigma * np.sqrt(1 - np.exp(-2 * h / tau)) * xi[n]
+    assert np.abs(u - expected).max() < 1e-13
+    single = ramp.integrate(rest[0], rest[0], h=h, t_end=2.6, inputs=inputs, seed=5)
+    assert (single.p[:11] == runs.p[:11, 0]).all()
+    assert single.p[11, 0] - single.p[10, 0] == pytest.approx(0.1 * expected[10, 0])
+    back = ramp.integrate(rest[0], rest[0], h=-h, steps=5, inputs=inputs, seed=5)
+    assert np.diff(back.p[:, 0]) == pytest.approx(-h * expected[:5, 0])
+    many = normal_numbers(1, np.arange(20000), np.arange(3)[:, np.newaxis], 2, 0).real
+    values = sc.ColouredNoise(sigma, tau).values(h, many)
+    for lag in range(3):  # covariance sigma^2 e^(-lag h / tau) within four standard errors
+        exact = sigma**2 * np.exp(-lag * h / tau)
+        assert abs((values[2 - lag] * values[2]).mean() - exact) < 4 * np.sqrt((sigma**4 + exact**2) / 20000)
+    with pytest.raises(sc.StateError, match="requires fixed steps"):
+        ramp.integrate(rest[0], rest[0], t_end=1.0, inputs=inputs)
+    with pytest.raises(sc.StateError, match="tau > 0"):
+        sc.ColouredNoise(1.0, 0.0)

@@ -38,7 +38,7 @@ from scvi_codegen.runs.states.validation import (
 from scvi_codegen.runs.states.words import check_doubles, hashed, stacked
 from scvi_codegen.runs.stepping.features import check_together, require
 from scvi_codegen.runs.stepping.integrator import Integrator
-from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise, check_temperature
+from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise, check_temperature, with_sequences
 from scvi_codegen.runs.stepping.projection import make_consistent
 from scvi_codegen.runs.stepping.state_functions import neither_or_both
 from scvi_codegen.runs.stepping.step_plan import Adaptive, ErrorControl, KindOfSteps, check_max_step, planned_steps
@@ -217,7 +217,11 @@ class Ensemble:
         checked_options(settings.options)
         inputs = dict[str, Input]()
         if settings.inputs is not None:
-            inputs = checked_inputs(stepper.interface, settings.inputs, len(layout.members(q, "q")))
+            count = len(layout.members(q, "q"))
+            streams = settings.trajectory + np.arange(count)[:, np.newaxis]
+            schedule = {"t": t0, "h": settings.h, "t_end": ends}
+            given = with_sequences(stepper.interface.inputs, settings.inputs, settings.seed, streams, **schedule)
+            inputs = checked_inputs(stepper.interface, given, count)
             check_left_to_inputs(stepper.interface, parameters)
             values = layout.parameters_of_each(parameters, len(layout.members(q, "q")))
             first_end = 0.0 if ends is None else float(ends.flat[0])
@@ -229,7 +233,7 @@ class Ensemble:
             plan: dict[str, Any] = {"steps": steps, "t_end": t_end, "inputs": inputs, "save_every": save_every}
             fixed = CommonSteps(t0, settings.h, **plan, words=layout.words)
         positions, momenta, values = start_of_ensemble(stepper, q, momenta, t0, parameters)
-        noise = Noise.checked(stepper, settings.seed, settings.metropolis, settings.trajectory)
+        noise = Noise.checked(stepper, settings.seed, settings.metropolis, settings.trajectory, settings.inputs)
         start: dict[str, Any] = {"t0": t0, "q": positions, "p": momenta, "parameters": values, "noise": noise}
         for member in np.unique(values, axis=0) if stepper.interface.temperature is not None else ():
             check_temperature(stepper, t0, member)
@@ -278,5 +282,7 @@ class Ensemble:
         settings = replace(
             self.settings, parameters=self.parameters[part], inputs=inputs_of_slice(self.inputs, part) or None
         )
-        settings = replace(settings, trajectory=self.noise.trajectory + part.start)
+        in_bath = self.stepper.interface.temperature is not None
+        seed = settings.seed if in_bath else None  # the inputs are values
+        settings = replace(settings, seed=seed, trajectory=self.noise.trajectory + part.start)
         return settings if self.fixed is not None else replace(settings, t_end=self.ends[part])

@@ -2,15 +2,102 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.common.validation import checked_count
+from scvi_codegen.runs.states.times import steps_within, times_after
 from scvi_codegen.runs.states.validation import Array, evaluation
 from scvi_codegen.systems.system import BATH_ENERGY
 
 NO_BATH = "requires a heat bath: give temperature= or noise= to the system"
+
+
+COLOURED_INPUT = 2
+"""Purpose of the numbers of coloured noise, as in ``templates/support/run/normals.h``."""
+WORD = 2**32 - 1
+
+
+@dataclass(frozen=True, slots=True)
+class ColouredNoise:
+    """Input of runs with fixed steps: stationary noise u with <u(t) u(s)> = sigma^2 e^(-|t - s|/tau).
+
+    It is the process of Ornstein and Uhlenbeck, exact at the steps (D. T. Gillespie, Phys. Rev. E 54 (1996) 2084),
+
+        u_0 = sigma xi_0,   u_(n+1) = E u_n + sigma (1 - E^2)^(1/2) xi_(n+1),   E = e^(-|h|/tau),
+
+    and constant in step n + 1. The normal xi_n is a function of the seed, the trajectory, n and the input.
+
+    Args:
+        sigma: standard deviation, in the unit of the input.
+        tau: correlation time.
+
+    Raises:
+        StateError: if sigma is negative, tau is not positive, or one is not finite.
+    """
+
+    sigma: float
+    tau: float
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.sigma < np.inf and 0 < self.tau < np.inf):
+            raise StateError(f"{self} requires finite numbers sigma >= 0 and tau > 0")
+
+    def values(self, h: float, normals: Array) -> Array:
+        """Return (n, ..) values u at the beginnings of n steps of h, from normals."""
+        kept, values = np.exp(-abs(h) / self.tau), np.array(normals)
+        values[1:] *= np.sqrt(-np.expm1(-2 * abs(h) / self.tau))
+        for n in range(1, len(values)):
+            values[n] += kept * values[n - 1]
+        return self.sigma * values
+
+
+def normal_numbers(seed: int, trajectory: Any, step: Any, purpose: int, index: int) -> NDArray[np.complex128]:
+    """Return pairs of normal numbers, real and imaginary parts, of trajectories and steps that are broadcast.
+
+    They are those of ``templates/support/run/normals.h``, but for rounding: Philox4x32-10, then Box and Muller.
+    """
+    step, trajectory = np.broadcast_arrays(np.asarray(step, np.uint64), np.asarray(trajectory, np.uint64))
+    a, b, c, d = step & WORD, step >> 32, trajectory & WORD, np.full_like(step, purpose << 30 | index)
+    for n in range(10):
+        low, high = (seed + n * 0x9E3779B9) & WORD, ((seed >> 32) + n * 0xBB67AE85) & WORD
+        of_a, of_c = a * 0xD2511F53, c * 0xCD9E8D57
+        a, b, c, d = (of_c >> 32) ^ b ^ low, of_c & WORD, (of_a >> 32) ^ d ^ high, of_a & WORD
+    chance, turn = ((first << 21 | second >> 11).astype(float) for first, second in ((a, b), (c, d)))
+    length: NDArray[np.complex128] = np.sqrt(-2 * np.log((chance + 1) * 2.0**-53)) * np.exp(
+        2j * np.pi * turn * 2.0**-53
+    )
+    return length
+
+
+def with_sequences(
+    names: Sequence[str], inputs: Mapping[str, Any], seed: int | None, trajectory: Any, *, t: Any, h: Any, t_end: Any
+) -> dict[str, Any]:
+    """Return inputs, of coloured noise as values that are held in the steps of h from t to t_end.
+
+    ``trajectory``: number of the stream, or (k, 1) numbers.
+    """
+    replaced = dict(inputs)
+    for name, noise in inputs.items():
+        if isinstance(noise, ColouredNoise) and name in names:
+            if h is None:
+                raise StateError(
+                    f"the input '{name}' is {noise}, which requires fixed steps: give h and steps or t_end"
+                )
+            steps = np.arange(1 + int(steps_within(abs(float(t_end) - float(t)) or abs(h), h)))
+            key = checked_count(0 if seed is None else seed, "seed", least=0)
+            normals = normal_numbers(key, trajectory, steps, COLOURED_INPUT, names.index(name)).real
+            times, values = times_after(float(t), h, steps)[0], noise.values(h, normals.T).T
+            if h < 0:  # the value of each step at the earlier end
+                times, values = times[::-1], np.roll(values[..., ::-1], -1, axis=-1)
+            replaced[name] = times, values, "constant"
+    return replaced
 
 
 class Noise(NamedTuple):
@@ -21,12 +108,20 @@ class Noise(NamedTuple):
     metropolis: bool = False
 
     @classmethod
-    def checked(cls, stepper: Any, seed: int | None, metropolis: bool, trajectory: int = 0) -> Noise:
+    def checked(
+        cls,
+        stepper: Any,
+        seed: int | None,
+        metropolis: bool,
+        trajectory: int = 0,
+        inputs: Mapping[str, Any] | None = None,
+    ) -> Noise:
         """Return the stream of these arguments of a run; raise an error for those that the stepper excludes."""
         if seed is None and not metropolis and not trajectory:
             return DEFAULT_NOISE
         interface = stepper.interface
-        if interface.temperature is None and (seed is not None or metropolis):
+        coloured = any(isinstance(value, ColouredNoise) for value in (inputs or {}).values())
+        if interface.temperature is None and ((seed is not None and not coloured) or metropolis):
             raise StateError(f"{'metropolis' if seed is None else 'seed'}= {NO_BATH} '{interface.system}'")
         if metropolis and (interface.changes_energy != BATH_ENERGY or "symmetric" not in interface.notes):
             raise MethodError(
