@@ -188,7 +188,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             action: sum the action along the run, for :meth:`Trajectory.action`, which otherwise computes the steps
                 again. Runs with events that change the state ignore this; arrays of run-time sizes are compiled with
                 the sizes of the call.
-            seed: with a heat bath or coloured noise, key of the noise, a whole number, by default 0. Noise is a function
+            seed: with a bath or coloured noise, key of the noise, a whole number, by default 0. Noise is a function
                 of the seed, the trajectory, the number of the step and the coordinate.
             metropolis: accept or reject each step, so that averages have no error of the step size.
 

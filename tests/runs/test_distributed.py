@@ -71,6 +71,20 @@ class TestCluster:
         assert np.flatnonzero(~result.ok).tolist() == [5]
         assert result.steps[5] < 50
 
+    def test_streams_of_noise_are_those_of_the_trajectories(self, distributed: Any, cluster: Any):
+        """In SIMD lanes, with an odd start of a slice, and as inputs of a bath."""
+        warm = sc.LagrangianSystem.from_text(
+            *("warm", ["x"], "x_dot**2/2 - x**4/4"), forces={"x": "u"}, inputs=["u"], damping=1, temperature=1
+        )
+        stepper = sc.compile_stepper(warm, "stoermer-verlet", flags=QUICK_FLAGS)
+        assert stepper.ensemble is not None
+        q = states()[0][:, :1]
+        settings: dict[str, Any] = {"h": 0.1, "steps": 20, "inputs": {"u": sc.ColouredNoise(1.0, 0.5)}, "seed": 3}
+        runs = stepper.integrate_ensemble(q, 0 * q, **settings)
+        away = integrate_ensemble(stepper, q, 0 * q, **settings, address=cluster.scheduler_address, blocks=3)
+        assert (away.q == runs.q).all()
+        assert (runs.q[:, 0] == stepper.integrate(q[0], [0.0], **settings).q).all()
+
     @pytest.mark.rotated
     def test_killed_worker_loses_nothing(self, distributed: Any, cluster: Any, kepler: sc.Stepper):
         q, p = states()
