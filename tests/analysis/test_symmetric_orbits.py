@@ -127,3 +127,60 @@ def test_families_of_symmetric_orbits_are_those_of_whole_ones(moon, tmp_path):
     axial = lyapunov.bifurcations[0].switch(step=0.1, count=3)
     assert all(abs(orbit.q[2]) < 1e-6 < abs(orbit.p[2]) for orbit in axial[1:])
     assert max(closing(orbit) for orbit in axial) < 1e-8
+
+
+JPL = {
+    "Lyapunov": (
+        (0.8090546332188572, 0.0, 0.2818915604471463, 3.11687584914084, 3.016484309141973, 669.48058884107),
+        (0.7639124660495868, 0.0, 0.494238048295948, 2.99360571851105, 4.469774524567025, 129.75287390231),
+        (0.6474261879025457, 0.0, 0.7581649998051122, 2.91113555914615, 6.525492852637634, 53.6707952348081),
+    ),
+    "southern halo": (
+        (
+            0.8233908198365149,
+            -0.0009894136623591,
+            0.12634272983881797,
+            3.17434351933012,
+            2.743000798124153,
+            1180.40653413,
+        ),
+        (
+            0.8274662004681002,
+            -0.09588969939784973,
+            0.2111356427711061,
+            3.10806899103114,
+            2.784366428044787,
+            327.44261565,
+        ),
+        (
+            0.8778007990603793,
+            -0.19247025470406084,
+            0.22759832101134,
+            2.99818349237843,
+            2.1545977693007345,
+            1.0000000000,
+        ),
+        (
+            0.9216492528106669,
+            -0.21446239588562,
+            0.131453125080793,
+            3.00250626287494,
+            1.8041324586822214,
+            2.4961029560772,
+        ),
+    ),
+}
+"""x, z, dy/dt, Jacobi constant, period, index of orbits about L1 of Earth and Moon: Three-Body Periodic Orbits Catalog
+of JPL, ssd-api.jpl.nasa.gov/periodic_orbits.api?sys=earth-moon&libr=1, 2 October 2026."""
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("row", [row for rows in JPL.values() for row in rows], ids=lambda row: f"T={row[4]:.2f}")
+def test_orbits_about_l1_are_those_of_the_jet_propulsion_laboratory(moon, row):
+    x, z, speed, constant, period, index = row
+    at = {"velocity": [0.0, speed * (1 + 1e-6), 0.0], "period": period, "reversor": MIRROR, "error": 1e-12}
+    orbit = sc.periodic_orbit(moon, [x, 0.0, z], fixed=["z"] if z else ["x"], **at)
+    assert [orbit.q[0], orbit.q[2], orbit.p[1] - orbit.q[0]] == pytest.approx([x, z, speed], abs=1e-9)
+    assert orbit.period == pytest.approx(period, abs=1e-9)
+    assert -2 * orbit.energy == pytest.approx(constant, abs=1e-11)
+    assert max(1.0, abs(orbit.stability_indices).max()) == pytest.approx(index, rel=1e-7)

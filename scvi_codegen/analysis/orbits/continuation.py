@@ -72,6 +72,8 @@ LOCATED = 1e-10
 BRANCHES = 1e-6
 """Singular values of the closing equations below which another family crosses: between a bifurcation that is located to
 1e-10, where it is the error of the derivatives, 1e-9, and the next orbit, where it is the step."""
+SMALL_CHANGE = 1e-9
+"""Relative change of a monodromy matrix above rounding errors; 2^16 times as much is small, too."""
 FLAT = 1e-6
 """Square of the change of period and parameter along a family below which they are stationary: that of the energy, in
 units of the motion, has the error 1e-9 of the orbit."""
@@ -84,9 +86,6 @@ PHASES = 64
 """Number of states along an orbit among which the nearest to another state is sought."""
 BEND = math.tan(LARGEST_TURN / 4.0) / 2.0
 """Largest distance of a family from the chord of a step, relative to the chord: of an arc that turns by 30 degrees."""
-REST, COLLISION = 0.1, 1e-4
-"""Least speed relative to the mean one, and shortest step relative to the longest, of an orbit whose family ends at a
-homoclinic orbit and at a collision."""
 NEAR_START = 0.05
 """Time between start and nearest impact, relative to the period, below which the start is moved along the orbit."""
 
@@ -292,11 +291,12 @@ class Continuation:
         orbit, widths = point.orbit, point.orbit.sequence.widths
         times, states = _states_along(orbit, orbit.t, np.append(orbit.q, orbit.p), orbit.period)
         changes = np.linalg.norm(np.diff(states, axis=0) / self.search.sizes_of(states), axis=1)
-        if widths.min() <= COLLISION * widths.max():
-            return f"the orbit of the period {orbit.period:.6g} approaches a collision, and no other one follows"
-        if (changes / np.diff(times)).min() <= REST * changes.sum() / orbit.period:
-            return f"the orbit of the period {orbit.period:.6g} nearly rests at an equilibrium (homoclinic orbit)"
-        return "no orbit follows"
+        slowest = (changes / np.diff(times)).min() * orbit.period / changes.sum()
+        shortest = widths.min() / widths.max()
+        return (
+            f"no orbit follows that of the period {orbit.period:.6g}, whose least speed is {slowest:.1e} of the mean "
+            f"(0 at a homoclinic orbit) and whose shortest step {shortest:.1e} of the longest (0 at a collision),"
+        )
 
     def change_along(self, point: FamilyPoint) -> Array:
         """Return the change of the unknowns along the tangent of a point."""
@@ -590,12 +590,25 @@ class Continuation:
         closing = search.closing_equations(z)
         starts = z[:-1].reshape(1, 2, -1)
         column = self._by_parameter(search, closing, starts, float(z[-1])) / search.row_units(closing)
-        effect, parameter = float(np.linalg.norm(column)), abs(float(y[-1]))
+        effect = float(np.linalg.norm(column))
         if self.period_of is not None:
             effect += abs(self._period(search)[1]) * 2.0 * math.pi / float(z[-1])
-        if effect * max(parameter, 1.0) <= RESOLVED * roundoff(1):  # the orbit stays, its stability may not
-            effect = 1.0 / (parameter or 1.0)
+        if effect * abs(y[-1]) <= RESOLVED * roundoff(1):  # the orbit may stay, but not its multipliers
+            unit = self._unit_of_multipliers(search, y, closing, effect)
+            effect = effect if effect * unit > RESOLVED * roundoff(1) else 1.0 / unit
         return replace(self, parameter_unit=1.0 / effect)
+
+    def _unit_of_multipliers(self, search: OrbitSearch, y: Array, closing: ClosingEquations, effect: float) -> float:
+        """Return the change of the parameter that changes the monodromy matrix by its size, by that of a small one."""
+        reduced = search.reduced_sizes(closing.sizes)
+        for change in 2.0 ** np.arange(-320, 320, 16):
+            other = self._with_parameter(search, np.append(y[:-1], y[-1] + change)).closing_equations(y[:-1])
+            matrices = [part.monodromy / reduced[:, np.newaxis] * reduced for part in (closing, other)]
+            if (part := float(np.abs(matrices[1] - matrices[0]).max() / np.abs(matrices[0]).max())) > SMALL_CHANGE:
+                return float(change) / part
+        if effect > 0.0:
+            return math.inf
+        raise OrbitError(f"{search.stepper.parameters[self.parameter or 0]} changes neither orbit nor multipliers")
 
     def _same_orbit(self, search: OrbitSearch, linear: _Linearised, start: Array) -> tuple[Array, int]:
         """Return the orthonormal directions to the same orbit, and the number of conserved quantities.
