@@ -215,10 +215,10 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         return self._joined(lambda piece: in_modes(piece, piece.stepper._energy_parts))
 
     def energy_error(self) -> float:
-        """Return the largest error of the energy, relative to the largest sum of its absolute parts if known.
+        """Return the largest error of the energy, relative to the largest sum |T| + |E - T| of its absolute parts.
 
-        Otherwise it is relative to the largest energy or, if that is less than 1e-8 of p.v, to the largest p.v. Where
-        forces, damping or impacts change the energy, the error is that of the balance E - E0 - W.
+        T is p.v/2 where parts are not known, the kinetic energy of quadratic ones: where the energy is 0, too, its
+        parts have a size. Where forces, damping or impacts change the energy, the error is that of E - E0 - W.
 
         Raises:
             StateError: if the energy changes for another reason, or its work W is unknown: the change is no error.
@@ -230,11 +230,11 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
                 "unknown, so that the change is no error: use energy(). Work requires a method with a curve, L or H "
                 "without time, and at impacts all states (save_every=1)"
             )
-        energies, parts = np.abs(self.energies), np.isfinite(self.energies[0, 0])
-        size = np.max(energies[:, :2].sum(axis=1) if parts else energies[:, 2])
-        if not parts and size < 1e-8 * (action := np.abs(np.sum(self.p * self.velocity, axis=-1)).max()):
-            size = action
-        return float(relative(np.max(np.abs(account.values)), size))
+        parts = self.energies[:, :2]
+        if not np.isfinite(parts[0, 0]):
+            kinetic = 0.5 * np.sum(self.p * self.velocity, axis=-1)
+            parts = np.stack([kinetic, self.energy() - kinetic], axis=1)
+        return float(relative(np.max(np.abs(account.values)), np.max(np.abs(parts).sum(axis=1))))
 
     @property
     def t_low(self) -> Array:

@@ -686,6 +686,10 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
       status = sides_after_start(&step, &start, size);
     if (tried)
       copy_run(run, &before);
+    if (status != OK && unknown) {
+      size = control ? INFINITY : run->h;
+      status = sides_at_jump(&step, &start, control ? t_end - run->t : run->h);
+    }
 #ifdef EVENT_POWERS
     watch->first = tried ? fabs(size) : INFINITY;
 #endif

@@ -142,6 +142,29 @@ static int sides_after_start(const event_step *step, const event_sample *at, rea
   return status;
 }
 
+/* The same where no step by the formula exists, as of forces that point to a surface: side 1, or -1 if the motion of
+ * side 1 leaves to it. If that of side -1 returns, it slides. */
+static int sides_at_jump(const event_step *step, const event_sample *at, real length)
+{
+  int sign[EVENT_KINKS], starts[EVENT_KINKS], status = OK;
+  for (int k = 0; k < EVENT_KINKS; k++) {
+    starts[k] = SIDE_OF(step->watch, k) == 0.0;
+    if (starts[k])
+      set_side(step, k, 1);
+  }
+  for (int pass = 0; status == OK && pass < 2; pass++) {
+    status = signs_after(step, at, length, sign);
+    for (int k = 0; status == OK && k < EVENT_KINKS; k++) {
+      if (!starts[k] || sign[k] * SIDE_OF(step->watch, k) >= 0.0)
+        continue;
+      set_side(step, k, -1);
+      step->watch->sliding = pass ? FIRST_KINK + k + 1 : 0;
+      status = pass ? NOT_CONVERGED : OK;
+    }
+  }
+  return status;
+}
+
 #ifdef EVENT_REFRACTS
 /* Momenta beyond a surface u(q, t) = 0 where L jumps, by the corner conditions of Weierstrass and Erdmann: p+ = p- +
  * lambda n, n = u_q, H+(p+) - H-(p-) = -lambda u_t, n.v+ + u_t of the sign `toward`. H+ is convex along n: from that

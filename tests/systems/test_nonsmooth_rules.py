@@ -1,0 +1,207 @@
+"""Rules for kinks and contacts whose violation no other test shows; which test would show it, of all others.
+
+| rule | tests |
+| --- | --- |
+| L jumps at u(q, t) = 0: refraction, reflection; at times p is continuous | test_jumps; here |
+| powers that are not whole: order min(2s, k) at fixed steps, 1 < k < 2 refused | here; test_kinks; refusals |
+| fixed steps across located kinks are not symplectic, formulas are; derivatives across kinks | here; test_kinks |
+| constraints have no corners | refusals, test_continuity, test_tables |
+| kinks in velocities: in forces only; masses with kinks | refusals, test_kinks (drag); here |
+| two surfaces at once, starts on a surface | test_jumps (corners), test_contacts (joint at its limit); here |
+| forces that point to a surface: sliding named, relays accumulate | test_kinks (sliding); here |
+| two crossings in a step, grazing, chattering | test_kinks (short visits), test_jumps (grazes), test_mode_changes |
+| arrays: number of functions, lists; multiples of one function | test_mode_changes, test_many_contacts; here |
+| zeros of functions of time | test_mode_changes |
+| redundant contacts | test_many_contacts |
+| slip in space: its beginning, small minima | test_contacts (begins); here |
+| static above kinetic friction | test_contacts (belt); here (stops) |
+| first modes, bits of restarts and of ensembles | test_contact_runs (units), test_contacts; here |
+| features | test_jumps, test_features |
+| names of functions and tables | here; refusals, test_tables |
+| where contacts are stated | test_contacts (model file), test_robot_contacts |
+| impacts: cradles, Poisson, plates and blocks | test_contacts, test_contact_runs; here |
+| rest after accumulating impacts, starts within rounding, gaps that are distances | test_contacts, test_contact_runs |
+| d x/d d = -8, d x/d mu, tippe top, shaken floors, balance | test_contact_derivatives, _of_bodies, _runs |
+"""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from notation import lagrange
+from samples import QUICK_FLAGS
+from scipy.integrate import solve_ivp
+
+import scvi_codegen as sc
+
+pytestmark = pytest.mark.second
+STEPS = pytest.mark.parametrize("steps", [{"h": 0.3}, {}], ids=["fixed", "adaptive"])
+
+
+def made(text: str, coordinates: str = "x", method: str = "svi:3", contacts: Any = (), **given: Any) -> Any:
+    return sc.compile_stepper(
+        lagrange("rule", coordinates, text, **given), method, flags=QUICK_FLAGS, contacts=contacts
+    )
+
+
+@STEPS
+@pytest.mark.parametrize(
+    ("text", "x"),
+    [
+        ("x_dot**2/2 + 3/10*unit_step(t - 1)*x_dot", 1.7),
+        ("(1 + 3*unit_step(t - 1))*x_dot**2/2", 1.25),
+        ("x_dot**2/2 - x*unit_step(t - 1)", 1.5),
+    ],
+)
+def test_momenta_are_continuous_where_l_jumps_at_a_time(text: str, x: float, steps: dict[str, float]) -> None:
+    run = made(text).integrate([0.0], [1.0], t_end=2.0, **steps)
+    assert run.q[-1] == pytest.approx([x], abs=1e-15)
+    assert run.p[-1] == pytest.approx([0.0 if "x*unit" in text else 1.0], abs=1e-15)
+
+
+def test_fixed_steps_at_a_power_that_is_not_whole_have_its_order() -> None:
+    """Of steps between 1/32 and 1/512 in steps of 2^(1/4), whose errors depend on the place of the zero."""
+    text = "x_dot**2/2 - 40*positive_part(-x)**(5/2)"
+    run = made(text, method="svi:8").integrate([1.0], [-1.0], t_end=3.0, tolerance=1e-14)
+    stepper, counts = made(text, method="svi:4"), 2 ** np.arange(5, 9.1, 0.25)
+    errors = [abs(stepper.integrate([1.0], [-1.0], h=3.0 / n, t_end=3.0).q[-1, 0] - run.q[-1, 0]) for n in counts]
+    assert -np.polyfit(np.log(counts), np.log(errors), 1)[0] == pytest.approx(2.5, abs=0.7)
+
+
+def test_only_formulas_as_they_are_are_symplectic_across_a_kink() -> None:
+    system = lagrange("wall", "x", "x_dot**2/2 - 50*positive_part(x - 0.13)**2")
+    defects = []
+    for kinks in ("as formulas", "located"):
+        run = sc.compile_stepper(system, "stoermer-verlet", kinks=kinks).integrate([0.0], [1.0], h=0.1, steps=2)
+        defects.append(abs(np.linalg.det(run.tangent()[-1]) - 1.0))
+    assert defects[0] < 1e-14 < 1e-4 < defects[1]
+
+
+@STEPS
+def test_velocities_are_continuous_where_a_mass_has_a_kink(steps: dict[str, float]) -> None:
+    run = made("(1 + abs(x))*x_dot**2/2", method="svi:8").integrate([-1.0], [1.0], t_end=4.0, **steps)
+    assert len(run.switches[0]) == 1
+    assert run.velocity[:, 0] * np.sqrt(1 + abs(run.q[:, 0])) == pytest.approx(np.sqrt(0.5), abs=1e-12)
+
+
+@STEPS
+@pytest.mark.parametrize(
+    ("force", "x"),
+    [("unit_step(x)", 0.5), ("-unit_step(x)", 0.0), ("unit_step(-x)", 0.0), ("-unit_step(-x)", -0.5), ("sign(x)", 0.5)],
+)
+def test_starts_at_rest_on_a_surface_take_a_consistent_side(force: str, x: float, steps: dict[str, float]) -> None:
+    run = made("x_dot**2/2", forces={"x": force}).integrate([0.0], [0.0], t_end=1.0, **steps)
+    assert (run.q[-1], len(run.switches[0])) == (pytest.approx([x], abs=1e-15), 0)
+
+
+@STEPS
+def test_a_relay_accumulates_and_its_equilibrium_is_named(steps: dict[str, float]) -> None:
+    """x'' = -sign(x) - x'/2: amplitudes fall as 1/t; at x = 0, x' = 0 both sides point to the surface."""
+    relay = made("x_dot**2/2", forces={"x": "-sign(x) - x_dot/2"})
+    assert abs(relay.integrate([1.0], [0.0], t_end=15.0, **steps).q[-1, 0]) < 0.05
+    with pytest.raises(sc.EventError, match="slides on 'x' = 0 at t = 0"):
+        relay.integrate([0.0], [0.0], t_end=1.0, **steps)
+
+
+def test_multiples_of_a_switching_function_are_one() -> None:
+    assert made("x_dot**2/2 - positive_part(x - 1)**2 - positive_part(2 - 2*x)**2 - abs(5*x - 5)").modes == ("mode_1",)
+
+
+@STEPS
+@pytest.mark.parametrize("v", [1e-2, 1e-4, 1e-6])
+def test_a_slip_in_space_passes_near_zero_without_a_stop(v: float, steps: dict[str, float]) -> None:
+    """A block that is pushed back along its velocity, but for a small angle."""
+    block = made(
+        "(x_dot**2 + y_dot**2 + z_dot**2)/2 - 9.81*z + 4*x",
+        "x y z",
+        contacts=[sc.contact("z", slip=["x_dot", "y_dot"], friction=0.1)],
+    )
+
+    def rates(_: float, state: Any) -> list[float]:
+        d = state[2:] / np.hypot(*state[2:])
+        return [*state[2:], 4.0 - 0.981 * d[0], -0.981 * d[1]]
+
+    true = solve_ivp(rates, (0, 1), [0, 0, -1, v], "DOP853", rtol=1e-13, atol=1e-16).y[:, -1]
+    run = block.integrate([0, 0, 0], velocity=[-1, v, 0], t_end=1, **{name: h / 6 for name, h in steps.items()})
+    assert run.contact_modes == [(0.0, ("slip",))]
+    assert np.abs([*run.q[-1, :2], *run.velocity[-1, :2]] - true).max() < 2e-7
+
+
+@pytest.mark.parametrize("start", [1.0, 0.95, 0.55, 0.45, -1.0])
+def test_a_stop_sticks_only_below_the_static_limit(start: float) -> None:
+    """Each swing is shorter by 2 d; it ends at |x| <= d_s = 0.3."""
+    dry = made("x_dot**2/2 - x**2/2", contacts=[sc.friction("x_dot", limit=0.1, static_limit=0.3)])
+    swings = next(n for n in range(9) if abs(start) - 0.2 * n <= 0.3)
+    run = dry.integrate([start], velocity=[0], h=0.1, t_end=25.0)
+    assert run.q[-1, 0] == pytest.approx(np.copysign(abs(start) - 0.2 * swings, start * (-1) ** swings), abs=1e-12)
+    assert run.contact_modes == [(0.0, ("slip",)), (pytest.approx(swings * np.pi), ("stick",))]
+
+
+def test_restored_runs_and_members_have_the_modes_and_bits_of_runs() -> None:
+    ball = made(
+        "(x_dot**2 + y_dot**2)/2 - 9.81*y",
+        "x y",
+        contacts=[sc.contact("y", slip="x_dot", friction=0.1, restitution=0.5)],
+    )
+    starts = np.array([[0, 0], [0, 1], [0, 2e-3]]), np.array([[1, 0], [1, 0], [0, 0]])
+    members = ball.integrate_ensemble(starts[0], velocity=starts[1], h=0.03, steps=40)
+    for k, (q, v) in enumerate(zip(*starts, strict=True)):
+        run = ball.integrate(q, velocity=v, h=0.03, steps=40)
+        assert members[k].contact_modes == run.contact_modes
+        assert np.array_equal(members[k].q[-1], run.q[-1])
+        for steps in (1, 3, 17):
+            parts = ball.start(q, velocity=v, h=0.03)
+            parts.advance(steps)
+            again = ball.from_checkpoint(parts.checkpoint())
+            again.advance(40 - steps)
+            assert np.array_equal([again.q, again.p], [run.q[-1], run.p[-1]])
+
+
+@pytest.mark.parametrize("name", ["min", "max", "abs", "sign", "where"])
+def test_names_of_a_system_win_over_functions(name: str) -> None:
+    with pytest.warns(sc.SystemDefinitionWarning, match=rf"so the function {name}\(..\) is not available"):
+        stepper = made(f"x_dot**2/2 - {name}*x**2/2", **{name: 4.0})
+    assert stepper.integrate([1.0], [0.0], h=0.1, t_end=np.pi / 2).q[-1] == pytest.approx([-1.0], abs=1e-8)
+
+
+def test_a_closed_contact_takes_part_in_impacts_with_restitution_0() -> None:
+    """A plate of mass 2 at rest on a floor of restitution 0.8 stays; a ball bounces on it with 0.5."""
+    contacts = [sc.contact("y", restitution=0.8), sc.contact("z - y - 1", restitution=0.5)]
+    plate = made("(2*y_dot**2 + z_dot**2)/2 - 9.81*(2*y + z)", "y z", contacts=contacts)
+    run = plate.integrate([0, 1.5], velocity=[0, 0], h=0.01, t_end=0.5)
+    fall = np.sqrt(1 / 9.81)
+    after = 0.5 - fall
+    assert run.q[-1] == pytest.approx([0, 1 + 0.5 * 9.81 * fall * after - 9.81 / 2 * after**2], abs=1e-13)
+
+
+def test_a_rocking_block_loses_housners_part_of_its_rate() -> None:
+    """The rate of a block after an impact on its other corner is 1 - 3/2 sin^2 of that before (G. W. Housner 1963)."""
+    height, width = 1.0, 0.2
+    corners = [
+        sc.contact(
+            f"y - {height}*cos(a) {e:+}*{width}*sin(a)",
+            slip=f"x_dot + a_dot*({height}*cos(a) {-e:+}*{width}*sin(a))",
+            friction=5.0,
+        )
+        for e in (-1, 1)
+    ]
+    text = f"(x_dot**2 + y_dot**2)/2 + {(height**2 + width**2) / 3}*a_dot**2/2 - 9.81*y"
+    run = made(text, "x y a", contacts=corners).integrate(
+        [0, np.cos(0.1) + width * np.sin(0.1), 0.1], velocity=[0, 0, 0], h=0.02, t_end=3.0
+    )
+    hits = [t for t, _ in run.contact_modes[1:]]
+    speeds = np.abs(run.velocity[np.searchsorted(run.t, hits), 2])
+    ratio = 1 - 1.5 * np.sin(np.arctan(width / height)) ** 2
+    assert speeds[1:] / speeds[:-1] == pytest.approx(np.full(len(hits) - 1, ratio), abs=1e-12)
+    assert run.energy_error() < 1e-13
+
+
+@pytest.mark.parametrize("kinks", ["located", "as formulas"])
+def test_an_energy_that_is_0_has_the_size_of_its_parts(kinks: str) -> None:
+    """A mass that falls on a rope from rest: the error is a part of its kinetic energy, in any units."""
+    rope = lagrange("rope", "y", "m*(y_dot**2/2 + 9.81*y - 500*positive_part(y - 1)**2)", m=1.0)
+    stepper = sc.compile_stepper(rope, "svi:2", kinks=kinks)
+    errors = [
+        stepper.integrate([0.0], [0.0], h=0.005, t_end=2.0, parameters={"m": m}).energy_error() for m in (1.0, 2.0**-30)
+    ]
+    assert errors[0] == errors[1] < (1e-6 if kinks == "located" else 0.2)
