@@ -400,7 +400,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     if (status == OK && !far)
       status = search_step(step, &left, &right);
 #ifdef CONTACTS_IN_SPACE
-    if (status == NOT_CONVERGED && !adaptive && !step->watch->accumulated && halvings++ < CONTACT_HALVINGS) {
+    if (is_unsolved(status) && !adaptive && !step->watch->accumulated && halvings++ < CONTACT_HALVINGS) {
       *step->filled = first;
       longest = 0.5 * fabs(part);
       status = OK;
@@ -708,7 +708,7 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
       status = take_step(run, t_end, limited, &step, &size, &count);
     else if (status == OK)
       status = NOT_CONVERGED;
-    if (status == NOT_CONVERGED && !control && leave_slips(&step)) {
+    if (is_unsolved(status) && !control && leave_slips(&step)) {
       copy_run(run, &before);
       status = take_step(run, t_end, limited, &step, &size, &count);
     }
