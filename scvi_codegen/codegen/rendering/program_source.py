@@ -46,7 +46,7 @@ from scvi_codegen.codegen.rendering.text import (
     HeaderRecord,
 )
 from scvi_codegen.codegen.statements.printing import Layout
-from scvi_codegen.codegen.statements.steps import pair_rattle_functions, rattle_iteration, splitting_header
+from scvi_codegen.codegen.statements.steps import pair_rattle_functions, rattle_functions, splitting_header
 
 Embedded: TypeAlias = Literal["double", "single"]
 """Precision of C source for a microcontroller."""
@@ -471,7 +471,7 @@ def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") 
     program = context.get("program")
     if isinstance(program, Program) and program.rattle:
         features = [name.lower() for name in program.rattle.macros]
-        headers["support/constraints/iterate.h"] = rattle_iteration(program.rattle.part, features)
+        headers["support/constraints/iterate.h"] = rattle_functions(program.rattle.part, features)
         headers["support/double_double/correct_points.h"] = pair_rattle_functions()
     return Source(
         prefix=prefix,

@@ -52,10 +52,9 @@ def splitting_texts(split: Splitting) -> dict[str, str]:
 
 
 def rattle_texts(rattle: Rattle) -> dict[str, str]:
-    """Return the statements of an iteration of a constrained step, by their title."""
-    text = RATTLE if rattle.part == "rattle" else COUPLED_RATTLE
+    """Return the statements of a constrained step, by titles."""
     features = [name.lower() for name in rattle.macros]
-    return {"an iteration for the positions u and multipliers lam at the points": f"{selected(text, features)}\n"}
+    return {title: f"{selected(text, features)}\n" for title, _, _, text in CONSTRAINED[rattle.part]}
 
 
 def velocities_by_masses(statements: Iterable[Statement]) -> Iterator[Statement]:
@@ -163,6 +162,51 @@ u[i] = m[i]
 """The same for masses that depend on positions: y = M^-1 r with the residual r of the momenta,
 P x = (D I)^-1 (g + h G D y) / h^2, v += y - h M^-1 I G^T x."""
 
+FORCES = """
+if velocity_forces:
+    f[i] = force[i]
+else:
+    f[i] = former(force[i])
+f[col(e)] += former(derivative[e]) * lam[row(e)]
+"""
+BEGIN = """
+if momentum_terms:
+    shifted[i] = forced[i] + (RATTLE_SHIFT @ w[i])
+    a[i] = rate * (RATTLE_INVERSE @ shifted[i])
+    low[i] = RATTLE_DRIFT_LOW * (h * v0[i]) + hh * (RATTLE_RESPONSE_LOW @ a[i]) - h * (RATTLE_SHIFT_LOW @ w[i])
+else:
+    a[i] = rate * (RATTLE_INVERSE @ forced[i])
+    low[i] = RATTLE_DRIFT_LOW * (h * v0[i]) + hh * (RATTLE_RESPONSE_LOW @ a[i])
+if velocity_forces:
+    base_v[i] = v0[i] + (RATTLE_VELOCITY_START * v0[i] + h * (RATTLE_VELOCITY_LOW @ a[i]))
+base[i] = q0[i] + (carry_q[i] + (low[i] + RATTLE_DRIFT * (h * v0[i])))
+"""
+END = """
+a[i] = mass(f[i])
+all[i] = f[i]
+push[i] = RATTLE_START * v0[i] + h * ((RATTLE_MOMENTUM @ a[i]) + (RATTLE_MOMENTUM_LOW @ a[i]))
+if momentum_terms:
+    z[i] = v0[i] + (push[i] - (RATTLE_PROJECTION @ w[i]))
+else:
+    z[i] = v0[i] + push[i]
+"""
+"""Forces with reactions; accelerations of the guess, and positions without forces; velocities z of the curve."""
+
+COUPLED_FORCES = """
+f[i] = force[i]
+f[col(e)] += GROWN * former(derivative[e]) * lam[row(e)]
+"""
+COUPLED_POSITIONS = """
+base[i] = q0[i] + (carry_q[i] + h * (RATTLE_DISPLACEMENT_LOW @ v[i]))
+u[i] = base[i] + h * (RATTLE_DISPLACEMENT @ v[i])
+"""
+COUPLED_MOMENTA = """
+mean[i] = (RATTLE_MEAN_LOW @ p[i]) + RATTLE_MEAN_OF_LAST_LOW * last_p[i]
+base_p[i] = p0[i] + (h * (RATTLE_IMPULSE_LOW @ f[i]) - mean[i])
+"""
+COUPLED_END = "z[i] = RATTLE_UNKNOWNS @ v[i]"
+"""The same for masses that depend on positions; the guess has the low words of the tables."""
+
 PAIR_RESIDUALS = """
 f[i] = former(force[i])
 f[col(e)] += former(derivative[e]) * lam[row(e)]
@@ -203,16 +247,24 @@ VARYING_MASS = {name: text.replace("inverse_mass", "inverse_mass[g]") for name, 
 VECTOR_MASS = {"mass": "vector_accelerations(solved->inverse_mass, ARGUMENT, TARGET, g);"}
 
 
+TABLES_OF_POINTS = "DRIFT", "DRIFT_LOW", "START", "VELOCITY_START", "MEAN_OF_LAST", "MEAN_OF_LAST_LOW"
+"""Tables with a number for each point."""
+
+
 def _of_constraints() -> dict[str, Quantity]:
-    """Return the quantities of an iteration of a constrained step, which the headers declare."""
-    memory = {name: Quantity(f"now->{name}", Place.MEMORY) for name in "auwvyf"}
-    return memory | {
+    """Return the quantities of a constrained step, which the headers declare."""
+    memory = {name: Quantity(f"now->{name}", Place.MEMORY) for name in "auwvyp"}
+    memory |= {name: Quantity(name, Place.MEMORY) for name in ("forced", "all", "z")}
+    groups = {name: Quantity(f"now->{name}", Place.GROUPS) for name in ("base", "base_v", "base_p")}
+    start = {name: Quantity(f"step->{name}", uniform=True) for name in ("q0", "p0", "carry_q")}
+    start |= {name: Quantity(f"now->{name}", uniform=True) for name in ("v0", "last_p")}
+    tables = {f"RATTLE_{name}": Quantity(f"RATTLE_{name}", Place.TABLE) for name in TABLES_OF_POINTS}
+    return {**memory, **groups, **start, **tables} | {
         "derivative": Quantity("now->derivative", Place.MEMORY, first="now->first_derivative", index="e"),
         "force": Quantity("now->force", Place.MEMORY, first="now->first_force"),
         "turned": Quantity("now->change", Place.MEMORY),
         "g": Quantity("now->g", Place.MEMORY, index="k"),
         "lam": Quantity("now->lambda", Place.GROUPS, index="k"),
-        "base": Quantity("now->base", Place.GROUPS),
         "change": Quantity("change", Place.FLAT),
         "zero": Quantity("lanes_of(0)", Place.NUMBER),
         "h": _number("step->h"),
@@ -222,32 +274,52 @@ def _of_constraints() -> dict[str, Quantity]:
     }
 
 
-def rattle_iteration(part: str, features: Sequence[str]) -> str:
-    """Return the function of an iteration of a constrained step; ``part`` is the header that it belongs to."""
-    quantities, layout = _of_constraints(), PointsAsLanes()
+ITERATE = "iterate", ", factors *l, condition factorised, lanes *change"
+UNKNOWNS = ", number (*z)[GROUP_LANES]"
+CONSTRAINED = {
+    "rattle": (
+        ("An iteration for the positions u and multipliers lam at the points", *ITERATE, RATTLE),
+        (
+            "Accelerations of the guess, positions without them",
+            "begin_points",
+            ", number (*forced)[GROUP_LANES]",
+            BEGIN,
+        ),
+        ("All forces, and velocities z", "finish_points", f", number (*all)[GROUP_LANES]{UNKNOWNS}", FORCES + END),
+    ),
+    "coupled_rattle": (
+        ("An iteration for the velocities v and multipliers lam at the points", *ITERATE, COUPLED_RATTLE),
+        ("Positions of the guess", "begin_positions", "", COUPLED_POSITIONS),
+        ("Momenta without forces", "begin_momenta", "", COUPLED_FORCES + COUPLED_MOMENTA),
+        ("All forces, and unknowns z", "finish_points", UNKNOWNS, COUPLED_FORCES + COUPLED_END),
+    ),
+}
+"""Functions of the headers of constrained steps: title, name, arguments after those of the step, statements."""
+
+
+def rattle_functions(part: str, features: Sequence[str]) -> str:
+    """Return the functions of a constrained step; ``part`` is the header that they belong to."""
+    own = _of_constraints()
     if part == "rattle":
-        own = {name: quantities[name] for name in quantities if name not in ("v", "y", "f")}
-        lines = Printer(own, layout, OF_POINTS).function_of_points(read(RATTLE, features))
+        printer = Printer({name: own[name] for name in own if name not in "vyp"}, PointsAsLanes(), OF_POINTS)
     else:
-        own = {name: quantity for name, quantity in quantities.items() if name != "w"} | {
-            "p": Quantity("now->p", Place.MEMORY),
-            "s": Quantity("now->f", Place.MEMORY),
-            "c": Quantity("now->c", Place.MEMORY, index="k"),
-            "masses": Quantity("now->mass", Place.MEMORY, index="e"),
-            "last_p": Quantity("now->last_p", uniform=True),
-            "base_p": Quantity("now->base_p", Place.GROUPS),
-            "GROWN": Quantity("GROWN(now, g)", Place.NUMBER),
-            "RATTLE_MEAN_OF_LAST": Quantity("RATTLE_MEAN_OF_LAST", Place.TABLE),
-        }
-        lines = Printer(own, layout, VARYING_MASS).function_of_points(read(COUPLED_RATTLE))
-    head = """\
-/* One iteration: updates the multipliers, accelerations or velocities, and positions, the last by `change`. */
-static inline void iterate(const step_data *step, rattle_step *now, factors *l, condition factorised,
-    lanes *change)
-{
-  const real scale = 1 / (step->h * step->h);
-"""
-    return head + _indented(lines) + "}\n"
+        own["f"] = own["s"] = Quantity("now->f", Place.MEMORY)
+        own["c"] = Quantity("now->c", Place.MEMORY, index="k")
+        own["masses"] = Quantity("now->mass", Place.MEMORY, index="e")
+        own["GROWN"] = Quantity("GROWN(now, g)", Place.NUMBER)
+        printer = Printer({name: own[name] for name in own if name != "w"}, PointsAsLanes(), VARYING_MASS)
+    functions = []
+    for title, name, arguments, text in CONSTRAINED[part]:
+        lines = replace(printer, locals={}).function_of_points(read(text, features))
+        first = "const real scale = 1 / (step->h * step->h);" if "scale" in text else "(void)step;"
+        functions.append(f"""\
+/* {title}. */
+static inline void {name}(const step_data *step, rattle_step *now{arguments})
+{{
+  {first}
+{_indented(lines)}}}
+""")
+    return "\n".join(functions)
 
 
 def pair_rattle_functions() -> str:
@@ -266,6 +338,7 @@ def pair_rattle_functions() -> str:
         "r": Quantity("r", Place.MEMORY),
         "gh": Quantity("g_high", Place.MEMORY, index="k"),
     }
+    forces = Printer(pairs | {"f": Quantity("at->f", Place.GROUPS, 2)}, PointsAsLanes(2), VECTOR_MASS)
     residuals = Printer(pairs, PointsAsLanes(2), VECTOR_MASS).function_of_points(read(PAIR_RESIDUALS))
     words = _of_constraints()
     own = {name: words[name] for name in ("derivative", "scale", "hh", "zero")}
@@ -274,6 +347,11 @@ def pair_rattle_functions() -> str:
     memory = "real (*r)[GROUP_LANES], real (*g_high)[GROUP_LANES]"
     return (
         f"""\
+/* F + G^T lambda at all points but the last. */
+static inline void all_pair_forces(rattle_pairs *at)
+{{
+{_indented(forces.function_of_points(read(FORCES)))}}}
+
 /* Residuals r of the positions and g of the constraints, and h^2 R a + h c v0. */
 static inline void find_pair_residuals(const solved_step *solved, rattle_pairs *at, {memory})
 {{

@@ -165,32 +165,6 @@ static __attribute__((flatten)) void evaluate_points(const step_data *step, ratt
 #endif
 }
 
-/* Derivatives at all points but the last. */
-static inline void former_derivatives(const rattle_step *now, int g, lanes *derivative)
-{
-#pragma GCC unroll 64
-  for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-    derivative[e] = former(now->derivative[e], now->first_derivative[e], g);
-}
-
-/* Computes f = F + G^T lambda at all points but the last. */
-static inline void find_forces(rattle_step *now)
-{
-  for (int g = 0; g < GROUPS; g++) {
-    lanes derivative[CONSTRAINT_ENTRIES], f[M];
-    former_derivatives(now, g, derivative);
-    for (int i = 0; i < M; i++)
-      f[i] = load(now->force[i], g);
-#pragma GCC unroll 64
-    for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-      f[CONSTRAINT_ENTRY[e][1]] += GROWN(now, g) * derivative[e] * now->lambda[CONSTRAINT_ENTRY[e][0]][g];
-    for (int i = 0; i < M; i++)
-      store(now->f[i], g, f[i]);
-  }
-  IN_MEMORY(now->f);
-  IN_MEMORY(now->p);
-}
-
 #include "iterate.h"
 
 /* Sizes of the terms of the displacements, with reactions if requested. */
@@ -217,36 +191,23 @@ static void begin(const step_data *step, const rattle_data *run, const number *m
     for (int g = 0; g < GROUPS; g++)
       store(now->v[i], g, memory ? times(RATTLE_VELOCITIES, B, memory + i * B, g) : lanes_of_number(start[i]));
   IN_MEMORY(now->v);
-  for (int i = 0; i < M; i++)
-    for (int g = 0; g < GROUPS; g++) {
-      const lanes low = step->h * times(RATTLE_DISPLACEMENT_LOW, DEGREE, now->v[i], g);
-      now->base[i][g] = step->q0[i] + (step->carry_q[i] + low);
-      store(now->u[i], g, now->base[i][g] + step->h * times(RATTLE_DISPLACEMENT, DEGREE, now->v[i], g));
-    }
+  begin_positions(step, now);
   for (int k = 0; k < CONSTRAINTS; k++)
     for (int g = 0; g < GROUPS; g++)
       now->lambda[k][g] = memory ? times(RATTLE_MULTIPLIERS, B, memory + (M + k) * B, g) : lanes_of(0);
   evaluate_points(step, now);
-  find_forces(now);
-  for (int i = 0; i < M; i++)
-    for (int g = 0; g < GROUPS; g++) {
-      const lanes mean = times(RATTLE_MEAN_LOW, DEGREE, now->p[i], g) +
-          weights(RATTLE_MEAN_OF_LAST_LOW, g) * now->last_p[i];
-      now->base_p[i][g] = step->p0[i] + (step->h * times(RATTLE_IMPULSE_LOW, DEGREE, now->f[i], g) - mean);
-    }
+  begin_momenta(step, now);
 }
 
 /* Velocities z of the curve, p1 - p0 before the projection, and the masses at the end. */
 static inline void finish_curve(const step_data *step, rattle_step *now, number *velocities, number *dp)
 {
-  number z[GROUP_LANES], u[2 * M] = {0}, value[2 * M], mass[LOWER_MASSES];
+  number z[M][GROUP_LANES], u[2 * M] = {0}, value[2 * M], mass[LOWER_MASSES];
   lanes end_mass[LOWER_MASSES];
-  find_forces(now);
+  finish_points(step, now, z);
   for (int i = 0; i < M; i++) {
     number sum = RATTLE_WEIGHT[DEGREE] * now->last_force[i];
-    for (int g = 0; g < GROUPS; g++)
-      store(z, g, times(RATTLE_UNKNOWNS, DEGREE, now->v[i], g));
-    memcpy(velocities + i * B, z, sizeof(number) * DEGREE);
+    memcpy(velocities + i * B, z[i], sizeof(number) * DEGREE);
     for (int n = 0; n < DEGREE; n++)
       sum += RATTLE_WEIGHT[n] * now->f[i][n];
     dp[i] = step->h * sum;

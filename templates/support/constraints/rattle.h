@@ -206,22 +206,10 @@ static inline void former_derivatives(const rattle_step *now, int g, lanes *deri
 }
 
 #ifdef VELOCITY_FORCES
-#define FORCES_BEFORE_LAST(now, i, g) load((now)->force[i], g)
 #define FIRST_FORCE(now, i) (now)->force[i][0]
 #else
-#define FORCES_BEFORE_LAST(now, i, g) former((now)->force[i], (now)->first_force[i], g)
 #define FIRST_FORCE(now, i) (now)->first_force[i]
 #endif
-
-/* F + G^T lambda at all points but the last. */
-static inline void all_forces(const rattle_step *now, const lanes *derivative, int g, lanes *f)
-{
-  for (int i = 0; i < M; i++)
-    f[i] = FORCES_BEFORE_LAST(now, i, g);
-#pragma GCC unroll 64
-  for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-    f[CONSTRAINT_ENTRY[e][1]] += derivative[e] * now->lambda[CONSTRAINT_ENTRY[e][0]][g];
-}
 
 /* Sizes of the terms of the displacements, with reactions if requested. */
 static inline void term_sizes(const step_data *step, rattle_step *now, int reactions, number *size)
@@ -258,6 +246,7 @@ static inline void begin_first(const step_data *step, rattle_step *now)
 static void begin(const step_data *step, const rattle_data *run, const number *memory, const number *start,
     rattle_step *now)
 {
+  number forced[M][GROUP_LANES]; /* displacements by accelerations, divided by h */
   (void)start;
   memcpy(now->inverse_mass, run->inverse_mass, sizeof now->inverse_mass);
   begin_first(step, now);
@@ -267,33 +256,11 @@ static void begin(const step_data *step, const rattle_data *run, const number *m
       const lanes drift = weights(RATTLE_DRIFT, g);
       const lanes moved = memory ? step->h * z : drift * (step->h * now->v0[i]);
       store(now->u[i], g, step->q0[i] + (step->carry_q[i] + moved));
-      store(now->a[i], g, memory ? z - drift * now->v0[i] : z);
+      store(forced[i], g, memory ? z - drift * now->v0[i] : z);
     }
+  IN_MEMORY(forced);
   evaluate_momenta(step, now);
-  for (int i = 0; i < M; i++) {
-    const real rate = 1 / step->h;
-    const number v = now->v0[i], moved = step->h * v;
-    lanes a[GROUPS];
-    for (int g = 0; g < GROUPS; g++)
-      store(now->a[i], g, load(now->a[i], g) - OF_MOMENTA(-1, RATTLE_SHIFT, now->w[i], g));
-    IN_MEMORY(now->a[i]);
-    for (int g = 0; g < GROUPS; g++)
-      a[g] = rate * times(RATTLE_INVERSE, DEGREE, now->a[i], g);
-    for (int g = 0; g < GROUPS; g++)
-      store(now->a[i], g, a[g]);
-    IN_MEMORY(now->a[i]);
-    for (int g = 0; g < GROUPS; g++) {
-      const lanes low = weights(RATTLE_DRIFT_LOW, g) * moved +
-          step->h * step->h * times(RATTLE_RESPONSE_LOW, DEGREE, now->a[i], g) -
-          OF_MOMENTA(step->h, RATTLE_SHIFT_LOW, now->w[i], g);
-#ifdef VELOCITY_FORCES
-      const lanes change = weights(RATTLE_VELOCITY_START, g) * v +
-          step->h * times(RATTLE_VELOCITY_LOW, DEGREE, now->a[i], g);
-      now->base_v[i][g] = v + change;
-#endif
-      now->base[i][g] = step->q0[i] + (step->carry_q[i] + (low + weights(RATTLE_DRIFT, g) * moved));
-    }
-  }
+  begin_points(step, now, forced);
   for (int k = 0; k < CONSTRAINTS; k++)
     for (int g = 0; g < GROUPS; g++)
       now->lambda[k][g] = memory ? times(RATTLE_MULTIPLIERS, B, memory + (M + k) * B, g) : lanes_of(0);
@@ -336,27 +303,10 @@ static inline void end_velocity(const step_data *step, const rattle_step *now, c
 /* Velocities z of the curve, and p1 - p0 before the projection. */
 static inline void finish_curve(const step_data *step, rattle_step *now, number *velocities, number *dp)
 {
-  lanes derivative[CONSTRAINT_ENTRIES], f[M], a[M];
-  number force[M], all[M][GROUP_LANES], z[GROUP_LANES];
-  for (int g = 0; g < GROUPS; g++) {
-    former_derivatives(now, g, derivative);
-    all_forces(now, derivative, g, f);
-    find_accelerations(now->inverse_mass, f, a);
-    for (int i = 0; i < M; i++) {
-      store(all[i], g, f[i]);
-      store(now->a[i], g, a[i]);
-    }
-  }
-  IN_MEMORY(now->a);
-  for (int i = 0; i < M; i++) {
-    for (int g = 0; g < GROUPS; g++) {
-      const lanes push = times(RATTLE_MOMENTUM, DEGREE, now->a[i], g) +
-          times(RATTLE_MOMENTUM_LOW, DEGREE, now->a[i], g);
-      const lanes change = weights(RATTLE_START, g) * now->v0[i] + step->h * push;
-      store(z, g, now->v0[i] + (change - OF_MOMENTA(1, RATTLE_PROJECTION, now->w[i], g)));
-    }
-    memcpy(velocities + i * B, z, sizeof(number) * DEGREE);
-  }
+  number force[M], all[M][GROUP_LANES], z[M][GROUP_LANES];
+  finish_points(step, now, all, z);
+  for (int i = 0; i < M; i++)
+    memcpy(velocities + i * B, z[i], sizeof(number) * DEGREE);
   last_force(step, now, velocities, force);
   for (int i = 0; i < M; i++) {
     number sum = RATTLE_WEIGHT[DEGREE] * force[i];

@@ -108,20 +108,6 @@ static inline __attribute__((flatten)) void evaluate_pairs_of_points(const doubl
   }
 }
 
-/* F + G^T lambda at all points but the last. */
-static inline void all_pair_forces(rattle_pairs *at)
-{
-  for (int g = 0; g < GROUPS; g++) {
-    for (int i = 0; i < M; i++)
-      at->f[i][g] = former_pairs(at->force[i], at->first_force[i], g);
-    for (int e = 0; e < CONSTRAINT_ENTRIES; e++) {
-      const ddl derivative = former_pairs(at->derivative[e], at->first_derivative[e], g);
-      ddl *f = &at->f[CONSTRAINT_ENTRY[e][1]][g];
-      *f = ddl_add(*f, ddl_multiply(derivative, at->lambda[CONSTRAINT_ENTRY[e][0]][g]));
-    }
-  }
-}
-
 /* a = M^-1 f at a group of points. */
 static inline void vector_accelerations(const dd *inverse_mass, const ddl *f, ddl (*a)[GROUPS], int g)
 {

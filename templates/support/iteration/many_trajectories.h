@@ -137,28 +137,43 @@ static inline int any_positive(number x)
   return any;
 }
 
-/* is_one_stagnant in each lane. */
-static SELDOM int find_stagnant(progress *now, const solver_options *options, int k)
+/* Decides about the lanes that have not converged: by is_to_amplify if `amplifies`, else by is_one_stagnant; returns 1 if
+ * one of them is 1. */
+static SELDOM int decide_lanes(progress *now, const solver_options *options, int k, int amplifies)
 {
-  lane_view last = {now->last}, before = {now->before}, earlier = {now->earlier}, status = {now->status};
-  lane_view by_largest = {now->by_largest}, stagnant = {lanes_of(0.0)};
-  const lane_view amplified = {now->amplified};
-  int any = 0;
+  lane_view last = {now->last}, before = {now->before}, earlier = {now->earlier}, amplified = {now->amplified};
+  lane_view since = {now->since}, status = {now->status}, by_largest = {now->by_largest}, holds = {lanes_of(0.0)};
+  int any = 0, pending = 0;
   for (int j = 0; j < LANES; j++)
     if (status.lane[j] == 0.0 || status.lane[j] == -1.0) {
-      trajectory_progress seen = {0.0, last.lane[j], before.lane[j], earlier.lane[j], amplified.lane[j]};
-      seen.status = (int)status.lane[j];
-      seen.by_largest = by_largest.lane[j] > 0.0;
-      if (is_one_stagnant(&seen, options, k)) {
-        last.lane[j] = before.lane[j] = earlier.lane[j] = INFINITY;
-        status.lane[j] = 0.0;
-        by_largest.lane[j] = stagnant.lane[j] = 1.0;
-        now->pending = any = 1;
-      }
+      trajectory_progress seen = {0.0, last.lane[j], before.lane[j], earlier.lane[j], amplified.lane[j],
+          (int)status.lane[j], (int)since.lane[j], by_largest.lane[j] > 0.0};
+      holds.lane[j] = amplifies ? is_to_amplify(&seen, options, k) : is_one_stagnant(&seen, options, k);
+      any |= holds.lane[j] > 0.0;
+      last.lane[j] = seen.last, before.lane[j] = seen.before, earlier.lane[j] = seen.earlier;
+      amplified.lane[j] = seen.amplified, since.lane[j] = seen.since, by_largest.lane[j] = seen.by_largest;
+      status.lane[j] = amplifies && seen.status < 0 ? -2.0 : seen.status;
+      now->converged += seen.status == 1;
+      pending |= seen.status == 0;
     }
-  now->last = last.all, now->before = before.all, now->earlier = earlier.all;
-  now->status = status.all;
-  now->by_largest = by_largest.all, now->stagnant = stagnant.all;
+  now->pending = amplifies ? pending : now->pending | any;
+  now->last = last.all, now->before = before.all, now->earlier = earlier.all, now->amplified = amplified.all;
+  now->since = since.all, now->status = status.all, now->by_largest = by_largest.all;
+  if (amplifies)
+    now->amplification = AMPLIFICATION * holds.all;
+  else
+    now->stagnant = holds.all;
+  return any;
+}
+
+/* The same if a condition holds in some of them; `now` may stay in registers. */
+static inline int decide_if(int condition, progress *now, const solver_options *options, int k, int amplifies)
+{
+  if (k <= 1 || !condition)
+    return 0;
+  progress seen = *now;
+  const int any = decide_lanes(&seen, options, k, amplifies);
+  *now = seen;
   return any;
 }
 
@@ -170,13 +185,7 @@ static inline int is_stagnant(progress *now, const solver_options *options, int 
     stagnates |= (status.lane[j] == -1.0) |
         ((status.lane[j] == 0.0) & (last.lane[j] > STAGNANT * before.lane[j]) &
             (last.lane[j] > STAGNATION * earlier.lane[j]));
-  if (k > 1 && stagnates) {
-    progress seen = *now; /* so that `now` may stay in registers */
-    const int any = find_stagnant(&seen, options, k);
-    *now = seen;
-    return any;
-  }
-  return 0;
+  return decide_if(stagnates, now, options, k, 0);
 }
 
 /* Where is_stagnant returned 1. */
@@ -185,51 +194,13 @@ static inline lanes stagnant(const progress *now)
   return now->stagnant;
 }
 
-/* Decides about stagnation in the lanes that have not converged; returns 1 if changes have to be amplified. */
-static SELDOM int check_lanes(progress *now, const solver_options *options, int k)
-{
-  const lane_view before = {now->before}, earlier = {now->earlier};
-  lane_view last = {now->last}, amplified = {now->amplified}, since = {now->since}, status = {now->status};
-  lane_view factor = {lanes_of(0.0)};
-  int amplify = 0;
-  now->pending = 0;
-  for (int j = 0; j < LANES; j++)
-    if (status.lane[j] == 0.0 || status.lane[j] == -1.0) {
-      trajectory_progress seen = {0.0, last.lane[j], before.lane[j], earlier.lane[j], amplified.lane[j]};
-      int now_amplified;
-      seen.status = (int)status.lane[j];
-      seen.since = (int)since.lane[j];
-      now_amplified = is_to_amplify(&seen, options, k);
-      factor.lane[j] = now_amplified ? AMPLIFICATION : 0.0;
-      amplify |= now_amplified;
-      last.lane[j] = seen.last;
-      amplified.lane[j] = seen.amplified;
-      status.lane[j] = seen.status < 0 ? -2.0 : seen.status;
-      since.lane[j] = seen.since;
-      now->converged += seen.status == 1;
-      now->pending |= seen.status == 0;
-    }
-  now->last = last.all;
-  now->amplified = amplified.all;
-  now->since = since.all;
-  now->status = status.all;
-  now->amplification = factor.all;
-  return amplify;
-}
-
 static inline int must_amplify(progress *now, const solver_options *options, int k)
 {
   const lane_view status = {now->status};
   int undecided = 0;
   for (int j = 0; j < LANES; j++)
     undecided |= (status.lane[j] == 0.0) | (status.lane[j] == -1.0);
-  if (k > 1 && undecided) {
-    progress seen = *now; /* so that `now` may stay in registers */
-    const int amplify = check_lanes(&seen, options, k);
-    *now = seen;
-    return amplify;
-  }
-  return 0;
+  return decide_if(undecided, now, options, k, 1);
 }
 
 static inline lanes amplification(const progress *now)

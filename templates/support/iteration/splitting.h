@@ -9,22 +9,12 @@
 typedef real number; /* a value of the trajectory */
 #endif
 
+/* Constants of the drifts. Requires: of constant masses the kernel mass, else drift_velocity; of bodies
+ * free_rotation.h. */
+typedef struct {
 #ifdef CONSTANT_MASSES
-/* Drift with constant masses. Requires: the kernel mass. */
-typedef struct {
   number inverse_mass[M];
-} solver_data;
-
-static void prepare(const step_data *step, solver_data *data)
-{
-  mass(NULL, step->t, step->parameters, data->inverse_mass);
-  for (int i = 0; i < M; i++)
-    data->inverse_mass[i] = 1 / data->inverse_mass[i];
-}
-#else
-/* Drift with velocities v(p, t). Requires: the kernel drift_velocity; of bodies free_rotation.h. */
-typedef struct {
-#ifdef ROTATING_BODIES
+#elif defined(ROTATING_BODIES)
   free_body bodies[BODIES];
 #else
   int unused;
@@ -33,7 +23,11 @@ typedef struct {
 
 static void prepare(const step_data *step, solver_data *data)
 {
-#ifdef ROTATING_BODIES
+#ifdef CONSTANT_MASSES
+  mass(NULL, step->t, step->parameters, data->inverse_mass);
+  for (int i = 0; i < M; i++)
+    data->inverse_mass[i] = 1 / data->inverse_mass[i];
+#elif defined(ROTATING_BODIES)
   real rates[3 * BODIES];
   turning(NULL, step->t, step->parameters, rates);
   for (int k = 0; k < BODIES; k++)
@@ -43,7 +37,6 @@ static void prepare(const step_data *step, solver_data *data)
   data->unused = 0;
 #endif
 }
-#endif
 
 #include "leap.h"
 
