@@ -158,7 +158,7 @@ class TestTolerances:
             r"no pilot run over t = 4.71 is accurate, .*use adaptive step size \(t_end, --tolerance\)", refused
         )
 
-    @pytest.mark.tiers(0, 1)
+    @pytest.mark.rotated
     @pytest.mark.parametrize(
         ("name", "method"), [("planar-pendulum", "svi:2"), ("cart-pole", "svi:3"), ("harmonic-oscillator", "svi:3")]
     )

@@ -301,7 +301,7 @@ class TestEnsembles:
         alone = advise(system, SVI(8), q[advice.member], p[advice.member], 5000.0, 1e-8)
         assert advice.steps == pytest.approx(alone.steps, rel=0.25)
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_parameters_of_each_trajectory_count(self):
         """Oscillators of frequencies 1 and 5: the step is that of the second."""
         system, states = lagrange("oscillator", "q", "q_dot**2/2 - k*q**2/2", k=1.0), ([[1.0], [1.0]], [[0.0], [0.0]])
@@ -311,7 +311,7 @@ class TestEnsembles:
         assert advice.steps == pytest.approx(alone.steps, rel=0.1)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_symplecticity_is_not_claimed_under_forces():
     saved = advise(problem("duffing").system, SVI(4), [0.5], [0.0], 5.0, 1e-6)
     damped = lagrange("damped", "q", "q_dot**2/2 - q**2/2", dissipation="q_dot**2/10")

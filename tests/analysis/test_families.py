@@ -28,7 +28,7 @@ def moon():
     return sc.compile_stepper(RESTRICTED, "svi:8")
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_equilibria_have_the_frequencies_of_the_linear_motion(moon, pendulum):
     rest = sc.equilibrium(moon, [0.83, 0.01, 0.01])
     (x, y, z), mu = rest.q, moon.defaults[0]
@@ -161,7 +161,7 @@ def test_start_of_an_orbit_keeps_its_distance_from_impacts():
         assert min(times.min(), 1 - times.max()) > 0.05
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_families_of_rotations():
     """A body swings about its first and second axis as a pendulum: T = 4 K((E + 1)/2) sqrt(I)."""
     system = sc.LagrangianSystem.from_text(
@@ -255,7 +255,7 @@ def test_resonance_curve_has_two_folds():
     assert below.parameters[2] == pytest.approx(1.097960, abs=1e-5)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_resonance_of_weak_damping_is_a_circle():
     """The phasor F/(1 - w^2 + icw), of F = c = 1e-5, at w = 1 and beside it; energy is nearly conserved."""
     system = sc.LagrangianSystem.from_text(
@@ -303,7 +303,7 @@ def test_gait_of_a_walker_doubles_its_period():
     assert again.orbit.parameters[0] == pytest.approx(0.0176694, abs=1e-6)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize(("method", "error"), [("stoermer-verlet", 1e-8), ("svi:2", 1e-11), ("svi:8", 1e-13)])
 def test_eigenvalues_have_their_error(method, error):
     rest = sc.equilibrium(sc.compile_stepper(PENDULUM, method), [0.1])
@@ -348,7 +348,7 @@ def test_starts_without_a_family_are_refused(pendulum):
             sc.equilibrium(falling, [0.0], parameters={"k": k})
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_family_is_saved_and_drawn(pendulum, moon, tmp_path):
     family = sc.family(pendulum, sc.equilibrium(pendulum, [0.0]), amplitude=0.5, count=3)
     family.save(tmp_path / "family.npz")

@@ -120,7 +120,7 @@ def pushed():
     return stepper, push, run, times
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("segments", [1, 4])
 def test_fit_with_known_start_and_tabulated_inputs(pushed, segments):
     """The cart is pushed as measured; what is known is not found."""

@@ -75,7 +75,7 @@ def test_invalid_tolerances_are_reported() -> None:
     assert "1.0e-03, but 1.0e-09 was requested" in message
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_systems_without_a_largest_step_are_rejected() -> None:
     for span, tolerance in ((0.0, 1e-9), (1.0, 1.0), (1.0, -1.0)):
         with pytest.raises(sc.StateError, match=r"span = \S+ must not be 0, and tolerance"):

@@ -93,6 +93,7 @@ def test_a_path_through_a_singularity_is_dropped(kepler):
         kepler.path([1.0, 0.0], [-1.5, 0.0], T, steps=44, start=line)
 
 
+@pytest.mark.rotated
 def test_starts_go_around_a_centre(kepler):
     """Angles are those of the run of the path; the times of flight are those of Kepler's equation."""
     angle = np.arctan2(0.8, -0.5)
@@ -167,7 +168,7 @@ def test_hessian_by_both_ends_is_that_of_the_run():
     assert path.index == 5 == np.count_nonzero(np.diff(np.sign(determinants)))
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize(
     ("arguments", "q"),
     [
@@ -272,7 +273,7 @@ def test_paths_of_arrays_of_run_time_sizes():
     assert np.abs(run.q[-1] - ends[1]).max() < 1e-12
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_sparse_derivatives_of_a_lattice_are_those_of_all_columns():
     lattice = compiled(
         ["u[12]"], "sum(i in 12, u_dot[i]**2/2 + (u[i]**2 - 1)**2/4) + sum(i in 0..10, (u[i+1] - u[i])**2/4)", "svi:2"
@@ -291,6 +292,7 @@ def test_sparse_derivatives_of_a_lattice_are_those_of_all_columns():
     assert some.blocks.shape[-1] < 12 * 12
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize(
     ("arguments", "closed", "start", "energy", "m", "zero_modes"),
     [

@@ -236,7 +236,7 @@ def test_galactic_orbits_are_found_by_energy(galaxy):
     assert_allclose(turned.stability_indices, stable.stability_indices, rtol=0, atol=1e-9)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_forced_oscillator_has_the_period_of_its_force():
     """x'' = -x - c x' + cos(w t): the closed form; multipliers exp(-c/2 +- i ..), no pairs."""
     driven = sc.LagrangianSystem.from_text(

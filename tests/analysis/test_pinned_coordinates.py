@@ -58,7 +58,7 @@ def test_pinned_coordinates_are_certified(name: str) -> None:
     assert certificate.passed, certificate.to_text()
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize(("degree", "h"), [(2, 0.01), (3, 0.005)])
 def test_constraints_of_long_runs_hold_to_rounding(degree: int, h: float, as_users_compile: object) -> None:
     """Rounding at the pinned coordinates ended the iteration of the others at changes of 1e-11."""

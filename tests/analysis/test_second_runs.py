@@ -51,7 +51,7 @@ def run(system, h, q=0.75, p=-0.5):
     return sc.compile_stepper(system, "svi:2").integrate([q], [p], h=h, steps=steps, t=T, parameters=STIFFER)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("h", [0.125, 0.03125])
 def test_the_second_run_has_the_time_and_parameters_of_the_first(driven, h):
     trajectory = run(driven, h)

@@ -106,7 +106,6 @@ def test_code_compiles_without_warnings(method, share, tmp_path):
             check_symbols(Path(file).stem, tmp_path)
 
 
-@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(6)
 @pytest.mark.covering
 @pytest.mark.parametrize("share", range(SHARES))

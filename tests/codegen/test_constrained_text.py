@@ -72,7 +72,6 @@ def test_steps_are_those_of_the_equations_in_60_digits(s):
         assert_allclose(found[1], np.array(exact.p, dtype=float), rtol=0, atol=4e-15)
 
 
-@pytest.mark.second
 def test_model_files_select_compatible_points():
     stepper = sc.compile_stepper(LINKAGE, "svi:3")
     q, _ = stepper.project(NEAR)

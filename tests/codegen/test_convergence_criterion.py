@@ -45,7 +45,7 @@ def test_long_steps_of_an_oscillator_equal_those_in_an_ensemble(method):
             assert abs(found - float(q[0])) < 2 * STEPS * ROUNDING
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_slow_convergence_is_not_mistaken_for_rounding():
     """Near its limit the iteration of a coupled system stops shrinking a while, at 1e-10 of the state, and fails."""
     heavy = lagrange("heavy", "x", "x_dot**2*(1 + x**2/100)/2 - x**2/2")
@@ -59,7 +59,7 @@ def test_slow_convergence_is_not_mistaken_for_rounding():
             assert found == pytest.approx(np.concatenate(newton.step([1.0], [0.3], h)), abs=1e-12)
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("deviation", [1e-9, 1e-11])
 def test_rotating_iteration_that_stagnates_has_not_converged(deviation):
     """A rotation about a moving point contracts by h**2 in two iterations, the first of which enlarges the change."""

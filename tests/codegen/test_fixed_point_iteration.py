@@ -74,7 +74,7 @@ def close(found, expected) -> bool:
     return bool(np.max(np.abs(np.concatenate(found) - np.concatenate(expected))) < ROUNDING)
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize("system", [tangle(), pumped_cart_pole(), rotating()], ids=lambda system: system.name)
 def test_velocities_are_updated_by_the_full_mass_matrix_to_first_order(system):
     stepper, (force, momentum, mass) = iterated(system), functions(system)
@@ -106,7 +106,7 @@ def test_constant_masses_update_velocities_and_forces_at_the_same_iterate(system
         assert close(stepper.step(q0, p0, H, T, options=ONE_ITERATION), expected)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_many_coordinates_do_not_request_the_jacobian():
     """The Jacobian has the square of their number of entries; masses of the chain of nine depend on positions."""
     names = [f"a{k}" for k in range(9)]

@@ -77,7 +77,7 @@ def test_first_step_takes_few_trials(p, span):
     assert run.iterations <= 17
 
 
-@pytest.mark.tiers(1, 2)
+@pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize("name", CONTINUED)
 def test_predictor_from_two_steps_is_better_than_from_one(name):
     """Compare the residual of one iteration after the first and after the third step, which use different tables."""

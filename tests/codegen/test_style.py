@@ -42,7 +42,7 @@ def test_long_titles_are_wrapped():
     assert [line for text in source.files.values() for line in text.splitlines() if len(line) > 120] == []
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_amalgamated_text_computes_the_same_bits():
     system = problem("double-pendulum").system
     stepper = compile_stepper(system, SVI(3))

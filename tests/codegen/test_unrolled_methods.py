@@ -38,7 +38,7 @@ def both(case, monkeypatch, flags):
     return steppers
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("case", CASES)
 def test_unrolled_and_tabulated_methods_are_equal(case, monkeypatch):

@@ -26,7 +26,7 @@ def test_waves_leave_through_an_absorbing_end():
     assert run.energy()[-1] < 1e-3 * run.energy()[0]
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_damped_waves_in_one_legendre_interval():
     field = sc.FieldSystem.from_text(
         "string", ["u"], {"x": (0, 1)}, STRING, boundary={"x": (0, 0)}, parameters={"g": 0.4}, dissipation="g*u_t**2/2"

@@ -60,7 +60,7 @@ def test_operators_satisfy_summation_by_parts(order):
     assert largest < axis.stiffness[0] < 1.03 * largest
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("order", [2, 4, 6, 8])
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ def test_products_of_a_field_and_its_derivative_converge():
     assert np.log2(errors[0] / errors[1]) > 1.8
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_spectrum_and_derivative_of_a_line_with_ends():
     mesh = line((0, "natural")).discretise("finite-differences", order=8, points=65)
     x = mesh.points["x"]

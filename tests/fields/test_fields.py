@@ -128,7 +128,7 @@ def test_sympy_expressions_of_momenta_damping_and_places_are_those_of_text():
     assert symbolic.derive().to_text().endswith("conservation laws: none found, the density is damped\n")
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_other_parameters_and_arrays_of_a_run_replace_those_of_the_mesh():
     mesh = string("u_t**2/2 - c*u_x**2/2", boundary={"x": (0, 0)}, parameters={"c": 1}).discretise(
         "spectral-elements", degree=6, elements=2

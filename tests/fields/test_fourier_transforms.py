@@ -98,7 +98,7 @@ CONVOLVED = sc.LagrangianSystem.from_text(
 METHODS = [("stoermer-verlet", None), pytest.param("svi:2", None, marks=pytest.mark.full), ("svi:2", "newton")]
 
 
-@pytest.mark.tiers(1, 2)
+@pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize(("method", "solver"), METHODS)
 def test_convolutions_of_any_size_and_coefficients(method, solver):
     """Energies and forces of functions of convolutions and of their powers, along one axis and both, are NumPy's."""
@@ -182,7 +182,7 @@ LARGE = {
 }
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize("name", ["membrane", *(pytest.param(each, marks=pytest.mark.full) for each in [*LARGE][1:])])
 def test_products_of_large_steps_are_bounded(name):
     """Steps of 20 and 100 times the limit of the fixed-point iteration, with the Fourier preconditioner."""

@@ -107,7 +107,6 @@ def pairs_on(name, hamiltonian, method=None, end=2.5, **options):
     return field.discretise(method or default, **(options or further))
 
 
-@pytest.mark.tiers(0, 1)
 @pytest.mark.covering
 @pytest.mark.parametrize("name", HAMILTONIANS)
 def test_one_correction_solves_linear_hamiltonians(name):
@@ -214,7 +213,6 @@ def test_one_correction_solves_linear_dissipation_and_gyroscopic_forces():
     assert np.abs(np.concatenate([run.q["q"][-1], run.q["r"][-1]]) - state[:18]).max() < 1e-10
 
 
-@pytest.mark.second
 def test_hamiltonians_with_too_many_couplings_are_refused():
     all_pairs = hamilton("all pairs", "q[N]", "sum(i in N, p_q[i]**2/2) + sum(i < j in N, (q[i] - q[j])**4)")
     stepper = sc.compile_stepper(all_pairs, "svi:1", solver="newton", flags=QUICK_FLAGS)

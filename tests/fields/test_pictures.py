@@ -51,6 +51,7 @@ def test_space_time_diagram_and_image_have_the_values_of_the_field(tmp_path):
     assert mesh.points["y"][0, 0] == 0
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize(("made", "lines", "dimension"), [(on_a_line, 1, 2), (in_the_plane, 7, 3)])
 def test_animation_shows_the_graph_over_the_points(made, lines, dimension):
     mesh, run = made()

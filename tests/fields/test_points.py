@@ -33,7 +33,7 @@ def change(mesh, state, *, to, by="svi:4", h=0.01, steps=100):
     return [float(np.abs(run.q[name][-1] - to * values).max()) for name, values in state.items()]
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize("mode", [0, 1, 2])
 def test_string_with_a_mass_at_its_end_has_the_frequencies_of_the_transcendental_equation(mode):
     """m w = cot w for a string of length, density and tension 1."""
@@ -57,7 +57,7 @@ def test_oscillator_on_a_spring_at_a_place_inside():
     assert max(change(mesh, {"u": u, "X": np.array(k / (k - mass * w * w))}, to=cos(w))) < 2e-12
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize(
     ("method", "options", "bound"),
     [

@@ -22,7 +22,7 @@ def ring(density=STRING, **others):
     return sc.FieldSystem.from_text("ring", ["u"], {"x": (0, "2*pi")}, density, boundary={"x": "periodic"}, **others)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("method", MESHES)
 def test_runs_report_the_unresolved_part_and_warn_of_it(method, recwarn):
     mesh = ring("u_t**2/2 - u_x**2/2 - u_x**3/6").discretise("spectral-elements", degree=6, elements=20)
@@ -105,7 +105,7 @@ def test_explicit_steps_are_stable_up_to_the_largest_step(method):
     assert np.abs(unstable.q["u"]).max() > 1e3
 
 
-@pytest.mark.tiers(1, 2)
+@pytest.mark.tiers(1, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("points", [1, 2, 4, 8])
 def test_fixed_point_iterations_converge_up_to_the_largest_step(points):

@@ -255,7 +255,7 @@ def test_errors_of_elements_fall_exponentially_with_the_degree():
     assert found[-1] < 1e-10
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("order", [2, 4, 6, 8])
 def test_differences_have_their_order(order):

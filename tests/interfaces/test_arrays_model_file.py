@@ -72,7 +72,7 @@ def test_model_file_is_read_completely(net: Path) -> None:
     assert np.array_equal(own.q["r"], other.q["r"])
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_newton_that_requires_known_sizes_runs_with_those_of_the_model(net: Path) -> None:
     """Its states are those of the other solver; C for arrays of run-time sizes is refused."""
     net.write_text(net.read_text().replace('"svi:2"', '"stoermer-verlet"', 1))
@@ -168,7 +168,7 @@ span = 1.0
 """
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_models_of_arrays_have_inputs(tmp_path: Path) -> None:
     """The mean moves as the exact integral of the force; known sizes give the same states."""
     path = tmp_path / "driven.toml"

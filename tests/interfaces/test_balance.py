@@ -62,7 +62,6 @@ def test_conservative_systems_have_no_balance(changed):
     assert found["energy_balance"] is None
 
 
-@pytest.mark.second
 @pytest.mark.parametrize("sizes", [{"N": MOST_BALANCED_COORDINATES + 1}, None])
 def test_many_coordinates_have_no_balance_unless_it_is_asked_for(sizes):
     system = LagrangianSystem.from_text(

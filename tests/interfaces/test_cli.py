@@ -225,7 +225,7 @@ class TestChoices:
 
 
 class TestRun:
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_a_run_ends_at_its_span_with_a_shorter_last_step(self):
         """The last states of single runs, ensembles and array systems are those of Python's t_end."""
         Path("s.csv").write_text("q1,q2,q1_dot,q2_dot\n1.0,0.0,0.0,1.0\n")
@@ -278,7 +278,7 @@ class TestRun:
         assert "0 steps of 0.25" in output_of("run", "kepler", "--steps", "0", "-o", "a.npz")
         assert len(arrays("a.npz")["t"]) == 1
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     @pytest.mark.parametrize("inputs", ["", "inputs = ['u']\n[forces]\nx = 'u'\n[inputs]\nu = {file = 'u.csv'}\n"])
     def test_adaptive_run_that_fills_the_memory_writes_its_states(self, inputs, monkeypatch):
         monkeypatch.setattr("scvi_codegen.codegen.native.capacity.usable_memory", lambda: 30_000.0)

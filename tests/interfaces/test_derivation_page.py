@@ -172,7 +172,7 @@ class TestPage:
         assert f"/* .. {count - MOST_LINES} more lines */" in page
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize(("size", "scheme"), VIEWS)
 def test_page_renders_in_a_browser(browser, tmp_path, size, scheme):
     with opened(browser, kepler_page(sc.SCVI(2)), tmp_path / "kepler.html", size, scheme) as view:

@@ -115,7 +115,7 @@ def test_files_named_on_the_command_line_may_be_anywhere(folders):
     assert json.loads(printed)["steps"] == 5
 
 
-@pytest.mark.tiers(0, 2)
+@pytest.mark.rotated
 @pytest.mark.parametrize("name", KINDS)
 def test_files_in_folders_that_a_user_names_may_be_anywhere(folders, name):
     own, other = folders

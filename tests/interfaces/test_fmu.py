@@ -339,7 +339,7 @@ def _folders(root, *names):
         yield root / name
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_unsuitable_models_and_names_are_rejected(tmp_path):
     model = pushed()
     for wrong, words in (

@@ -35,6 +35,7 @@ def test_files_contain_the_time_transformation(time_transformation: str) -> None
     assert (again.h, again.tolerance) == (None, None)
 
 
+@pytest.mark.rotated
 def test_step_size_of_another_time_is_not_reused(model: sc.Model) -> None:
     text = dump_model(sc.Model.from_problem(sc.problem("kepler")))
     assert parse_model(text, {"system": {"time_transformation": "frequency"}}).h is None

@@ -50,6 +50,7 @@ def plain(model: sc.Model) -> sc.Stepper:
     return sc.compile_stepper(model.system, model.method)
 
 
+@pytest.mark.rotated
 def test_controller_of_a_time_transformation_can_be_replaced() -> None:
     both = {
         "system": {"time_transformation": "frequency"},
@@ -74,6 +75,7 @@ def test_unsuitable_time_transformation_is_reported(controller: str) -> None:
     assert "use another time transformation" in error_of(f"{FAR} {controller}", status=1)
 
 
+@pytest.mark.rotated
 def test_integrate_uses_the_controller(shaken: Path) -> None:
     model = sc.load_model(shaken)
     state: Any = [*model.q, *(model.p or ())]

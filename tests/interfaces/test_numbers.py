@@ -230,7 +230,7 @@ def assert_fields(numbers: dict[str, Any], expected: dict[str, Any]) -> None:
     assert wrong == {}
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(5)
 def test_every_field_of_the_json_is_correct(done):
     assert_fields(done.numbers, fields_of(done))

@@ -183,7 +183,7 @@ def test_unsuitable_folder_names_are_rejected_with_a_suggestion(pendulum, tmp_pa
     assert not (tmp_path / name).exists()
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_methods_without_text_form_are_generated_without_a_model_file(pendulum, tmp_path):
     own = sc.Quadrature(name="mine", points=(-0.5, 0.5), weights=(1, 1))
     folder = sc.generate_package(replace(pendulum, method=sc.SVI(1, own)), tmp_path / "own")

@@ -203,7 +203,7 @@ def test_unsupported_systems_are_refused(tmp_path, old, new, ranges, message):
         sc.page(written(tmp_path, OSCILLATOR.replace(old, new, 1)), ranges=ranges)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.usefixtures("without_compiler")
 def test_hamiltonians_start_from_momenta():
     """These need not be functions of the velocities."""
@@ -423,7 +423,7 @@ def test_the_webassembly_computes_the_bits_of_python_within_300_kilobytes(tmp_pa
     assert ("forward only" in state["turned"]) == bool(stepper.interface.contacts)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize(("text", "shown"), [(STICK_SLIP, (["F"], False)), (STIFF_FLOOR, ([], True))])
 @pytest.mark.usefixtures("without_compiler")
 def test_modes_have_no_sliders_and_kinks_conserve_energy(tmp_path, text, shown):

@@ -102,7 +102,7 @@ def test_precision_of_error(spring: Path) -> None:
 EXACT = {"q": "[0.1]", "q_dot": '["1/3"]', "w": "0.3"}
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize("words", [[], ["--q", "1/10", "--velocity", "1/3", "--parameter", "w=3/10"]])
 def test_decimals_and_fractions_are_exact(spring: Path, words: list[str]) -> None:
     """Numbers of a file and of flags are exact decimals and fractions; in double they are the nearest doubles."""
@@ -154,7 +154,7 @@ def test_ensembles_are_exact(spring: Path, file: str, text: str, starts: str) ->
             assert abs(mp.mpf(saved["q"][-1, j, 0]) + saved["q_low"][-1, j, 0] - exact) < 1e-30
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_precision_is_read_and_replaced(spring: Path) -> None:
     """The flag replaces the value of the file; unknown values are refused."""
     assert not sc.load_model(spring, {"run": {"precision": "double"}}).in_double_double

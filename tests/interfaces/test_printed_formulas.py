@@ -416,7 +416,7 @@ def test_the_printed_stage_equations_are_those_of_the_step(name):
         np.testing.assert_allclose(found.astype(float), expected, rtol=2e-14, atol=1e-15)
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", [name for name in NAMES if name.values[0] not in WITHOUT_STAGES])
 def test_printed_compiled_equations_are_those_of_the_step(name):
@@ -703,7 +703,7 @@ CHECKS: dict[str, Callable[[str, Entry, int], bool]] = {
 """By section of the page; what is not here fails."""
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize("name", NAMES)
 def test_every_entry_of_the_page_is_right(name):
     page, counts = made(name)[2], dict.fromkeys(CHECKS, 0)
@@ -753,7 +753,7 @@ def check_entries(name: str, table: PrintedTable) -> None:
                 assert abs(cell_number(cell) - known[own]) < mp.mpf("2e-17") * max(1, abs(known[own])) * 10, own
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize("name", NAMES)
 def test_tables_have_the_numbers_of_the_equations(name):
     (parameters, *tables, operations), parts = made(name)[2].tables, CASES[name][1].parts

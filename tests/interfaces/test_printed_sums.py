@@ -110,7 +110,7 @@ def test_kicks_and_drifts_are_the_step(method):
         np.testing.assert_allclose(found.astype(float), expected, rtol=1e-14, atol=1e-15)
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize(("system", "method"), [(RING, sc.SVI(2)), (RING, sc.Gauss(3)), (ROTORS, sc.Gauss(2))])
 def test_points_and_ends_are_the_step(system, method):
     """Lines as they stand, again and again until they converge."""

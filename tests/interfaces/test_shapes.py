@@ -45,7 +45,7 @@ walls = [["left", "wall"]]
 """
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_a_picture_is_drawn_in_films_and_written_to_files(tmp_path):
     pytest.importorskip("matplotlib")
     (tmp_path / "cart.toml").write_text(CART, encoding="utf-8")
@@ -109,7 +109,7 @@ def test_pictures_of_arrays_and_rotations_use_entries():
     assert np.allclose(state[:4], [[0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 0]])
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_bonds_of_a_table_are_lines_and_momenta_of_a_field_are_drawn():
     model = sc.load_model(MOTIONS / "cloth.toml")
     shape = shape_of(drawn_system_of_model(model))

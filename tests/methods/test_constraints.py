@@ -196,7 +196,7 @@ def test_the_matrix_of_multipliers_of_a_chain_is_a_band(terms, reach):
     assert f"CONSTRAINT_REACH = {reach}\n" in sc.generate_source(chain, lobatto(1))[0].amalgamated().code
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_adaptive_steps_are_rejected_where_the_iteration_of_multipliers_fails():
     """Newton's method takes the long steps that the error admits; the iteration of multipliers rejects them."""
     rods = two_rods(m=1.0)

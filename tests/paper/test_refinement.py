@@ -91,7 +91,7 @@ def test_compiled_errors_are_those_in_60_digits(case, scheme):
         assert list(compiled.values()) == pytest.approx(list(precise.values()), rel=1e-6, abs=1e-14)
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("scheme", "constant", "base"), [("SVI", 1e10, 0.03), ("SC", 1e7, 0.1)])
 def test_errors_on_the_circle_follow_the_lines_of_figure_16(scheme, constant, base):
     for points in (10, 14):

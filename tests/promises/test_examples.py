@@ -80,7 +80,7 @@ def test_every_example_is_tested():
     assert {path.stem for path in EXAMPLES.glob("*.toml")} == {*ENERGY_ERRORS, "shaken_tower", "fput_ring"}
 
 
-@pytest.mark.tiers(0, 2)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", ENERGY_ERRORS)
 def test_model_files_run_and_conserve_energy(name, tmp_path):
@@ -107,7 +107,6 @@ def test_ring_conserves_energy_and_momentum(tmp_path):
     assert np.ptp(p.sum(axis=1)) < 1e-14
 
 
-@pytest.mark.tiers(0, 1)
 def test_shaken_tower_agrees_with_dop853(tmp_path):
     """Compare with DOP853 between breakpoints of SciPy's spline through the same table."""
     assert "too long" not in invoke("run", EXAMPLES / "shaken_tower.toml", "-o", tmp_path / "run.csv").output
@@ -136,7 +135,6 @@ def test_kepler_conservation_distinguishes_the_methods(output_of):
     assert min(errors["explicit Euler"]) > 0.1
 
 
-@pytest.mark.tiers(0, 1)
 def test_eccentric_comet_conserves_energy(output_of):
     rows = [line[12:].split() for line in output_of("eccentric_comet").splitlines()[1:]]
     (stretched, regular) = ([float(word) for word in row] for row in rows)
@@ -171,7 +169,6 @@ def test_every_step_size_selection_has_its_documented_accuracy(output_of):
     assert max(error[way] for way in (controlled, transformed, reversible)) < 1e-8 < error[fixed]
 
 
-@pytest.mark.tiers(0, 1)
 def test_comet_returns_after_a_near_collision(output_of):
     errors = [float(line.split()[-1]) for line in output_of("collisions_in_space").splitlines()[1:]]
     assert max(errors) < 1e-11
@@ -311,7 +308,6 @@ def test_orbit_of_ceres_determines_the_mass_of_jupiter(output_of, tmp_path):
     assert (tmp_path / "ceres_orbit.png").stat().st_size > 10_000
 
 
-@pytest.mark.tiers(0, 1)
 def test_duffing_oscillator_is_identified_from_noisy_data(output_of):
     output = output_of("duffing_fit")
     for name, true in {"alpha": -1.0, "beta": 1.0, "delta": 0.3}.items():
