@@ -2,13 +2,14 @@
 
 The step comes first. Like :mod:`~scvi_codegen.codegen.rendering.own_names` this relies on the layout of the templates,
 where a declaration at file scope begins in the first column, and is not a C parser: a name counts as used wherever it
-occurs other than as a member.
+occurs other than as a member. The support headers serve all integrators, each of which uses a part of them, and no C
+compiler prints a source without what it does not use.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -19,26 +20,11 @@ FIRST = "NAME(step)"
 PREFIXED = {"NAME", "STATUS"}
 """Macros of the prefix, which stay."""
 WORD = re.compile(r"\b(?:NAME|STATUS)\(\w+\)|(?<![.\w])(?<!->)[A-Za-z_]\w*")
-OUTSIDE = re.compile(rf"/\*(?:[^*]|\*(?!/))*\*/|{WORD.pattern}")
-"""Comments and, outside of them, names."""
 COMMENTS = re.compile(r"/\*.*?\*/", re.DOTALL)
 REQUIRED = re.compile(r"\s+(?:\* )?Requires:.*?(?= \*/)", re.DOTALL)
-INTERNAL = re.compile(r"(?:typedef|struct|enum|static)\b|#")
-"""Begin of a declaration without external linkage, as far as macros do not hide it."""
 CHOICE = re.compile(r"\b[A-Z]{4,}(?:_[A-Z]+)*\b")
 """Name of an alternative or number in a comment."""
 CHOICES = "/* Choices of this integrator among the alternatives of the support headers. */\n"
-ENUMERATOR = re.compile(r"\s*(?P<name>\w+) = (?P<value>[^,]+)")
-STANDARD = {
-    "#include <float.h>": re.compile(r"(?:DBL|FLT)_"),
-    "#include <limits.h>": re.compile(r"U?L{0,2}(?:INT|LONG)_M"),
-}
-"""Headers of the C library that are omitted if none of their constants occurs."""
-ALIAS = re.compile(r"^typedef (?P<name>double|float|NAME\(\w+\)|struct NAME\(\w+\)) (?P<alias>\w+);.*\n", re.MULTILINE)
-STATUS = re.compile(r"^  (?P<alias>\w+) = (?P<name>STATUS\(\w+\)),?\n", re.MULTILINE)
-SHORT = re.compile(r"^#define (?P<macro>\w+) (?P<text>(?!\d)[\w ,]+|NAME\(\w+\))\n", re.MULTILINE)
-"""Macro for a name or words of a declaration, without a comment."""
-NAMING = re.compile(r"^#define (?P<macro>\w+)\((?P<of>\w+)\) (?P=of)(?:##(?P<end>\w+))?(?: /\*.*)?\n", re.MULTILINE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,35 +68,11 @@ def readable(code: str) -> str:
     """Return a source of one file without what no exported function reaches, the step first."""
     if "#define NAME(" not in code:
         return code
-    code = _without_aliases(code.replace(CHOICES, ""))
+    code = code.replace(CHOICES, "")
     scope = FileScope(code)
     parts = tuple(_parts(code.split("\n"), scope, ()))
     text = "\n".join(_lines(_without_alternatives(_ordered(_reached(parts)))))
     return re.sub(r"\n{3,}", "\n\n", text) + "\n"
-
-
-def _without_aliases(code: str) -> str:
-    """Return a source with the names that aliases have in C or in its header, and without macros of names."""
-    for pattern in (STATUS, ALIAS, ALIAS):  # an alias may be one of an alias
-        aliases = {match["alias"]: match["name"] for match in pattern.finditer(code)}
-        code = pattern.sub("", code).replace("enum {\n};\n", "")
-        code = _renamed(code, aliases)
-    for macro in re.findall(r"^#define (\w+) 1\n", code, re.MULTILINE):  # factors
-        if len(re.findall(rf"\b{macro}\b", code)) == len(re.findall(rf"\b{macro} \*", code)) + 1:
-            code = code.replace(f"#define {macro} 1\n", "").replace(f"{macro} * ", "")
-    for macro in [match["macro"] for match in SHORT.finditer(code)]:
-        if len(re.findall(rf"^ *#.*\b{macro}\b", code, re.MULTILINE)) == 1:
-            match = next(match for match in SHORT.finditer(code) if match["macro"] == macro)
-            code = _renamed(code.replace(match[0], ""), {macro: match["text"]})
-    for match in NAMING.finditer(code):
-        end = match["end"] or ""
-        code = re.sub(rf"\b{match['macro']}\(([\w.+-]+)\)", rf"\g<1>{end}", code.replace(match[0], ""))
-    return code
-
-
-def _renamed(code: str, names: Mapping[str, str]) -> str:
-    """Return a source with other names, but for comments and members."""
-    return OUTSIDE.sub(lambda match: names.get(match[0], match[0]), code)
 
 
 def _parts(lines: Sequence[str], scope: FileScope, conditions: tuple[str, ...]) -> Iterator[Part]:
@@ -198,7 +160,7 @@ def _reached(parts: Sequence[Part]) -> list[Part]:
     kept = [left for part in parts if (left := _kept(part, reached))]
     if any(part.branches for part in kept):  # what one branch uses is idle with another
         kept = [left for part in parts if (left := part if part.branches and not part.names else _kept(part, reached))]
-    return _without_unused_numbers(kept)
+    return kept
 
 
 def _kept(part: Part, reached: set[Part]) -> Part | None:
@@ -213,29 +175,6 @@ def _kept(part: Part, reached: set[Part]) -> Part | None:
         branches.append((line, tuple(left for inner in parts if (left := _kept(inner, reached | nameless)))))
     lines = [text for line, parts in branches for text in (line, *_lines(parts))]
     return replace(part, lines=(*lines, "#endif"), branches=tuple(branches))
-
-
-def _without_unused_numbers(parts: Sequence[Part]) -> list[Part]:
-    """Return parts without enumerators, and without headers of the C library, that nothing uses."""
-    words = set[str]().union(*(part.words for part in parts if part.lines[0] != "enum {"))
-    lists = [part for part in parts if part.lines[0] == "enum {"]
-    enumerators = {
-        match["name"]: match["value"] for part in lists for line in part.lines if (match := ENUMERATOR.match(line))
-    }
-    pending = [*words]
-    while pending:
-        values = WORD.findall(enumerators.pop(pending.pop(), ""))
-        pending += values
-        words.update(values)
-
-    def left(part: Part) -> Part:
-        if part not in lists:
-            return part
-        lines = [line for line in part.lines[1:-1] if not (match := ENUMERATOR.match(line)) or match["name"] in words]
-        return replace(part, lines=("enum {", *lines, "};"))
-
-    kept = [part for part in map(left, parts) if part.lines != ("enum {", "};")]
-    return [part for part in kept if not (of := STANDARD.get(part.lines[0])) or any(map(of.match, words))]
 
 
 def _ordered(parts: Sequence[Part]) -> list[Part]:
