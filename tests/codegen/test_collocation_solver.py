@@ -47,7 +47,7 @@ def test_more_points_than_lanes_use_newton(sample):
     assert fixed_point(system, sc.SCVI(2, "gauss-legendre:33", variational=False)) is None
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", [sc.SVI(3), sc.SCVI(2), sc.SpectralCollocation(3), PRINTED[0]], **named)
 def test_start_from_rest_does_not_need_newton(sample, compiled, method):

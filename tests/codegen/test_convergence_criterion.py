@@ -59,7 +59,7 @@ def test_slow_convergence_is_not_mistaken_for_rounding():
             assert found == pytest.approx(np.concatenate(newton.step([1.0], [0.3], h)), abs=1e-12)
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize("deviation", [1e-9, 1e-11])
 def test_rotating_iteration_that_stagnates_has_not_converged(deviation):
     """A rotation about a moving point contracts by h**2 in two iterations, the first of which enlarges the change."""

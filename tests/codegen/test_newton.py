@@ -107,7 +107,7 @@ class TestReusedFactors:
         assert np.array_equal(last.q[-1], expected.q[-1])
         assert np.array_equal(last.p[-1], expected.p[-1])
 
-    @pytest.mark.tiers(0, 1)
+    @pytest.mark.rotated
     def test_failed_step_does_not_change_the_run(self, method):
         q, p = state()
         run = chain(method).start(q, p, h=0.15)

@@ -452,7 +452,7 @@ def test_constraints_of_a_hamiltonian_equal_those_of_its_lagrangian():
         sc.HamiltonianSystem.from_text(hamiltonian=formula, constraints=circle, **text)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_unsupported_combinations_with_constraints_are_rejected():
     rolling = lagrange("blade", "x y", "(x_dot**2 + y_dot**2)/2", constraints=["x_dot = y*y_dot"])
     with pytest.raises(sc.SystemDefinitionError, match="nonholonomic constraints"):

@@ -197,7 +197,7 @@ def test_errors_state_the_remedy(call, words):
         call()
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("method", "order"),

@@ -40,7 +40,7 @@ def test_free_dumbbell_has_uniform_translation_and_rotation():
     assert_allclose(-2 * 0.8 * run.multipliers()[:, 0], 0.75 * turning**2 * 0.8, rtol=0, atol=1e-9)
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize("bend", [np.pi / 2, 0.7, 2.5])
 def test_angle_between_two_rods_equals_a_rigid_hook(bend):
     hook = JOINTS.bent_pendulum()

@@ -81,7 +81,7 @@ def test_exact_flow_agrees_with_a_fine_run():
     assert np.abs([run.q - q, run.p - p]).max() < 1e-12
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_exact_orbits_stay_on_their_ellipse_and_period():
     exact = Scheme("exact", sc.SVI(10), "exact")
     q, velocity = perihelion(0.5)

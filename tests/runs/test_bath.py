@@ -72,7 +72,7 @@ def test_half_steps_are_exact_and_harmonic_covariances_have_no_error(dissipation
     assert np.abs(np.r_[end.q[-1], end.p[-1]] - whole).max() < 1e-14
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_noise_of_a_step_has_the_covariance_of_fluctuation_and_dissipation():
     h, kT, count = 0.9, 1.3, 40000
     free = compiled("svi:1", **{**CHAIN, "lagrangian": CHAIN["lagrangian"].split(" - ")[0]},
@@ -173,7 +173,7 @@ def test_metropolised_and_plain_averages_in_a_double_well():
     assert 0.8 < well.integrate([1.0], [0.0], h=0.4, steps=2000, metropolis=True).acceptance < 0.95
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_metropolis_with_a_magnetic_field_has_a_direction_variable():
     # a charge in B = 2 and an asymmetric potential; flipped momenta would bias <x> by -.155 and <y^2> by .67
     charge = compiled(
@@ -196,7 +196,7 @@ def test_metropolis_with_a_magnetic_field_has_a_direction_variable():
     assert agrees(*averages(charge, [0, 0], 0.8, 6000, observe, metropolis=True), exact, 0.02)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_rods_by_constraints_and_by_angles_agree_with_quadrature():
     angle = (np.arange(800) + 0.5) * np.pi / 400
     a, b = np.meshgrid(angle, angle, indexing="ij")
@@ -226,7 +226,7 @@ def test_rods_by_constraints_and_by_angles_agree_with_quadrature():
     assert np.abs(rods.constraint_values(run.q, run.p)).max() < 1e-13
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("friction", [{"damping": 1.0}, {"dissipation": "omega_1**2 + omega_2**2/2"}])
 def test_rigid_dipole_has_the_average_of_langevin(friction):
     dipole = compiled(
@@ -258,7 +258,7 @@ def test_additive_noise_heats_at_its_rate():
     assert abs(energy.mean() - 0.5**2 * 20 / 2) < 4 * energy.std() / np.sqrt(4000)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_failed_steps_are_repeated_in_parts():
     stiff = {**WELL, "lagrangian": "x_dot**2/2*(1 + x**2) - 50*x**4", "parameters": {"kT": 20, "g": 1}}
     run = compiled("svi:1", "stiff", **stiff).integrate([1.0], [0.0], h=0.6, steps=200, seed=2)
@@ -314,7 +314,7 @@ def test_what_a_heat_bath_excludes_is_refused_by_name(tmp_path):
         sc.compile_stepper(system, "svi:2", precision="double-double")
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_model_files_and_generated_programs_have_the_same_noise(tmp_path):
     model = sc.Model(system=sc.LagrangianSystem.from_text("well", **WELL), method="svi:2", q=[1.0], p=[0.0], h=0.1,
                      steps=50, save_every=50, seed=0)  # fmt: skip

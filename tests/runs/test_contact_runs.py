@@ -112,7 +112,6 @@ def test_a_ball_rolls_off_the_edge_of_a_table(steps: dict[str, float]) -> None:
     assert run.q[-1] == pytest.approx([1.4, 0.1 - G / 2 * 0.2**2, 4.0], abs=1e-11)
 
 
-@pytest.mark.second
 @STEPS
 @pytest.mark.parametrize(("rise", "meets"), [(2.0, True), (8.0, False)])
 def test_a_ball_misses_a_wall_of_finite_height(rise: float, meets: bool, steps: dict[str, float]) -> None:

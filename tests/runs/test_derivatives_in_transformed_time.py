@@ -153,7 +153,7 @@ WAYS = {
 }
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("way", WAYS)
 def test_gradients_are_the_transpose_of_derivatives(way):
     """Functions of states, and of states and times."""

@@ -113,7 +113,7 @@ CHAOTIC = {
 }
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.covering(2)
 @pytest.mark.parametrize("tolerance", TOLERANCES)
 @pytest.mark.parametrize("name", [*REGULAR, *CHAOTIC])

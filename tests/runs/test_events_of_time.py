@@ -72,7 +72,7 @@ def test_coincident_events_and_ensembles() -> None:
     assert [runs[j].p[-1, 0] for j in range(2)] == [50.0, 50.5]
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_arrays() -> None:
     chain = sc.LagrangianSystem.from_text("chain", ["u[N]"], "sum(i in N, u_dot[i]**2/2)")
     state = {"q": {"u": [1.0, 2.0]}, "velocity": {"u": [0.0, 0.0]}}

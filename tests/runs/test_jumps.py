@@ -56,7 +56,7 @@ def test_a_square_well_and_a_moving_step():
         assert end(moving.integrate([x], [v], t_end=4.0)) == pytest.approx(exact, abs=2e-15)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_masses_relativistic_energies_and_constraints():
     mass = compiled("(1 + 3*unit_step(x))*x_dot**2/2", "x")
     assert end(mass.integrate([-1.0], [1.0], t_end=3.0)) == pytest.approx([1.0, 2.0], abs=1e-15)

@@ -43,7 +43,7 @@ def test_motions_across_kinks_are_within_tolerances(family):
     assert not wrong(family, [1], ["svi:4"], [kind for kind in KINDS if kind != "order"])
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @families
 def test_orders_across_kinks(family):
     """SVI(1), SVI(2) and SVI(4) have orders 2, 4 and 8."""

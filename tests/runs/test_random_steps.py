@@ -87,7 +87,6 @@ def adaptive_ratio(name, method, solver, q, p, t, tolerance):
     return max(displaced(q, end, np.ravel(run.q["x"][1])) - 1e-11, 0.0) / run.step_error
 
 
-@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("solver", ["fixed-point", "newton"])
 def test_adaptive_array_run_starts_with_a_correct_step(solver):
     """The curve of a step of three periods is smooth: its end was off by 50 times the state, at an estimate of 0.02."""

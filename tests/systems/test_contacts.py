@@ -280,7 +280,6 @@ def test_a_plastic_ball_leaves_a_shaken_floor_with_the_jerk(steps: dict[str, flo
     assert [time for time, _ in run.contact_modes] == pytest.approx(expected, abs=1e-10)
 
 
-@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("tangent", "consistent"), [(0.30, True), (0.31, False), (0.81, False), (0.83, True)])
 def test_painleve_is_named_where_rigid_bodies_have_no_motion(tangent: float, consistent: bool) -> None:
     floor = sc.contact("y - cos(a)", slip="x_dot - cos(a)*a_dot", friction=1.5)
@@ -351,7 +350,6 @@ def test_slip_on_a_shaken_table_begins_against_the_force(steps: dict[str, float]
     assert np.abs(np.concatenate([run.q[-1, :2], run.velocity[-1, :2]]) - true).max() < 2e-8
 
 
-@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("at_rest", [0.3, 0.301, 0.306])
 @pytest.mark.parametrize("steps", [{"h": 0.05}, {"h": 0.0125}, {}])
 def test_slip_in_space_begins_without_a_jump_of_friction(steps: dict[str, float], at_rest: float) -> None:
@@ -369,7 +367,6 @@ def test_slip_in_space_begins_without_a_jump_of_friction(steps: dict[str, float]
     assert np.abs(run.q[:, 2]).max() < 1e-14
 
 
-@pytest.mark.second
 def test_two_slips_in_space_begin_one_after_another() -> None:
     """Each as it does alone, while the other one slides."""
     blocks = [sc.contact(z, slip=[f"{x}_dot", f"{y}_dot"], friction=0.3) for x, y, z in ("xyz", "abc")]
@@ -487,7 +484,6 @@ def test_contacts_are_part_of_a_system_and_of_its_model_file(tmp_path: Any) -> N
 FLOOR = MODEL.partition("[[contacts]]")[0].replace("- m*g*y", "- m*g*y - 1e4*positive_part(r - y)**2")
 
 
-@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("text", [MODEL, FLOOR + MODEL[MODEL.index("[parameters]") :].replace("mu = 0.3\n", "")])
 def test_generated_programs_and_packages_have_the_modes_of_runs(text: str, tmp_path: Any) -> None:
     (tmp_path / "ball.toml").write_text(text.replace("q = [0.0, 0.5, 0.0]", "q = [0.0, 0.7, 0.0]"))
@@ -614,7 +610,6 @@ def test_a_ball_in_space_bounces_where_friction_stops_its_slip() -> None:
     assert not run.velocity[-1, :2].any()
 
 
-@pytest.mark.second
 def test_kinks_of_friction_coefficients_are_located() -> None:
     block = of(f"{PLANE} - 10*y", "x y", [sc.contact("y", slip="x_dot", friction="where(x > 0.1, 0.05, 0.3)")], "svi:2")
     run = block.integrate([0, 0], velocity=[1, 0], h=0.07, t_end=0.7)
@@ -635,7 +630,6 @@ def test_modes_at_a_kink_are_those_of_its_side(steps: dict[str, float]) -> None:
     assert run.q[-1, 0] == pytest.approx(0.1 + 0.7 * first * later + later**2 / 4, abs=1e-14)
 
 
-@pytest.mark.second
 @pytest.mark.parametrize("steps", [{"h": 0.02}, {}])
 @pytest.mark.parametrize("by", ["contact", "impact"])
 def test_drag_turns_with_the_velocity_at_impacts(steps: dict[str, float], by: str) -> None:
@@ -666,7 +660,6 @@ def test_kinks_of_what_rests_have_no_zeros(steps: dict[str, float]) -> None:
     assert run.contact_modes[1][0] == pytest.approx(np.arcsin(0.8)) == run.contact_modes[3][0] - np.pi
 
 
-@pytest.mark.second
 def test_stribeck_friction_of_the_size_of_a_slip() -> None:
     """Fixed and adaptive runs agree, slip begins at the limit of the spring force."""
     friction = sc.friction("x_dot - 0.2", limit="1/2 + 3/10*exp(-10*abs(x_dot - 0.2))", static_limit=0.8)

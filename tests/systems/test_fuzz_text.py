@@ -64,7 +64,7 @@ def try_formula(number: int) -> bool:
     return True
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_formulas_are_read_or_rejected():
     assert sum(map(try_formula, range(1000))) > 100
 
