@@ -218,7 +218,7 @@ def describe(
         return interface
     changes = " and ".join(filter(None, (BATH_ENERGY, interface.changes_energy)))
     account: dict[str, Any] = {"conserves_energy": False, "changes_energy": changes, "balances_energy": False}
-    return replace(interface, **account, temperature=program.bath.temperature)
+    return replace(interface, **account, temperature=program.bath.temperature, friction=program.bath.friction)
 
 
 def _interface(system: MechanicalSystem, method: Method, **of_kind: Any) -> Interface:
@@ -586,10 +586,18 @@ class ArraySources(Sources):
             solver="rattle" if system.constraints else self.solver,
             layout=layout,
             temperature=system.text_of(system.bath.temperature) if system.bath else None,
+            friction=_friction_of(system),
         )
 
     def variant(self, variant: Variant) -> None:
         """Return ``None``: variants are those of known sizes."""
+
+
+def _friction_of(system: Any) -> tuple[tuple[str, str], ...]:
+    """Return names and formulas of the coefficients of the friction of a heat bath of arrays."""
+    terms = [(f"dissipation of {at.array.name}_dot", c) for force in system.bath_terms[0] for at, c in force.targets]
+    damping = [("damping", system.bath.damping)] if system.bath else []
+    return tuple((name, system.text_of(formula)) for name, formula in [*damping, *terms])
 
 
 def _modes_of(kinks: Iterable[Kink]) -> tuple[tuple[str, ...], ...]:

@@ -116,6 +116,10 @@ def variational_system(system: MechanicalSystem, count: int) -> LagrangianSystem
     Raises:
         SystemDefinitionError: for other systems; use :meth:`Trajectory.tangent` for them.
     """
+    if system.bath:
+        raise SystemDefinitionError(
+            f"'{system.name}' has a heat bath, whose noise is that of one trajectory: omit temperature= and noise="
+        )
     twin, number = equivalent_lagrangian(system), checked_count(count, "count", least=1)
     system_of_both = with_tangent_vectors(twin, number) if twin else None
     if system_of_both is None:

@@ -63,6 +63,15 @@ def test_the_transient_is_omitted():
     assert sc.average(run_of(n, 0.5), x, burn_in=100).mean == x[200:].mean()
 
 
+@pytest.mark.parametrize("unit", [1e-200, 1e-26, 1e200])
+def test_units_and_times_of_values_do_not_matter(unit):
+    x, run = autoregressive(0.9, (4000,), 13), run_of(4000, 0.1)
+    expected = sc.average(run, x)
+    for result in (sc.average(run, unit * x), sc.average(SimpleNamespace(t=1e9 + run.t), unit * x)):
+        assert np.allclose(np.divide([*result], [unit, unit, 1]), [*expected], rtol=1e-5, atol=0)
+    assert sc.average(run, np.full(4000, 0.1)).error == 0.0
+
+
 def test_messages():
     with pytest.warns(sc.AccuracyWarning, match=r"299 long, 0 are omitted, .* of 50 required"):
         sc.average(run_of(300, 1.0), autoregressive(0.9, (300,), 1), burn_in=0)

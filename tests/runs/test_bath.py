@@ -302,6 +302,19 @@ def test_what_a_heat_bath_excludes_is_refused_by_name(tmp_path):
             operation()
     with pytest.raises(sc.StateError, match=r"kT = kT is -1 at t = 0"):
         well.integrate(*state, h=0.1, steps=3, parameters={"kT": -1})
+    negative = "damping of the heat bath of 'well', g, is -1 at t = 0: it must not be negative"
+    for start in (well.integrate, well.integrate_ensemble):
+        with pytest.raises(sc.StateError, match=negative):
+            start(*np.array(state)[:, np.newaxis] if start == well.integrate_ensemble else state, h=0.1, steps=3,
+                  parameters={"g": -1})  # fmt: skip
+    assert len(well.integrate(*state, h=0.1, steps=3, parameters={"g": -1, "kT": 0})) == 4
+    sliding = compiled("svi:2", "slope", **{**WELL, "damping": None, "dissipation": "g*x*x_dot**2/2"})
+    with pytest.raises(sc.StateError, match=r"dissipation of x_dot of the heat bath of 'slope', g.x, is -1 at t = 0"):
+        sliding.integrate([-1.0], [0.0], h=0.1, steps=3)
+    with pytest.raises(sc.StepFailedError, match=r"the dissipation of x_dot, g.x, is 0\.1 there"):
+        sliding.integrate([0.1], [-1.0], h=0.1, steps=30)
+    with pytest.raises(sc.SystemDefinitionError, match="whose noise is that of one trajectory"):
+        sc.variational_system(sc.LagrangianSystem.from_text("well", **WELL), 1)
     forced = compiled("svi:2", "forced", **WELL, forces={"x": "cos(t)"})
     with pytest.raises(sc.MethodError, match="metropolis=True is not available"):
         forced.integrate(*state, h=0.1, steps=3, metropolis=True)

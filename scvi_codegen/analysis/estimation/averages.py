@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.common.errors import AccuracyWarning, StateError
 from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.runs.ensembles.result import EnsembleRuns
@@ -62,20 +63,22 @@ def average(run: Any, quantity: Callable[[Any], ArrayLike] | ArrayLike, *, burn_
     shape = (len(t), len(run)) if isinstance(run, EnsembleRuns) else (len(t),)
     if x.shape[: len(shape)] != shape:
         raise StateError(f"quantity has shape {x.shape}: it must have shape {shape}, one value per state, or more axes")
-    if not np.isfinite(x).all():
-        raise StateError("quantity has values that are not finite: select the trajectories that succeeded by runs.ok")
+    if not (x.size and np.isfinite(x).all()):
+        raise StateError(
+            "quantity is empty or has values that are not finite: select the trajectories that succeeded by runs.ok"
+        )
     interval = (t[-1] - t[0]) / max(1, len(t) - 1)
-    if t.ndim != 1 or not interval > 0 or np.ptp(np.diff(t)) > 1e-6 * interval:
+    if t.ndim != 1 or not interval > 0 or np.ptp(np.diff(t)) > 1e-6 * interval + 4 * np.spacing(np.abs(t).max()):
         raise StateError("average requires at least two states at equal distances in time: give h, or t_eval=")
     further, half = x.shape[len(shape) :], len(t) // 2
     x = x.reshape(len(t), shape[-1] if len(shape) > 1 else 1, -1)
-    omitted = int(np.ceil(round((burn_in or 0.0) / interval, 9)))
+    omitted = 0 if burn_in is None else int(np.ceil(round(checked_number(burn_in, "burn_in") / interval, 9)))
     if burn_in is None:
         omitted = min(half, len(t) - 2, int(np.ceil(RELAXATION * _correlation_time(x[half:])[0].max())))
     elif not 0 <= omitted <= len(t) - 2:
         raise StateError(f"burn_in = {burn_in:g} must be at least 0 and leave two states of {t[-1] - t[0]:g}")
     x = x[omitted:]
-    tau, variance = _correlation_time(x)
+    tau, sigma = _correlation_time(x)
     times = x.shape[0] * x.shape[1] / tau
     if (burn_in is None and omitted == half) or times.min() < LEAST_TIMES:
         warnings.warn(
@@ -84,15 +87,18 @@ def average(run: Any, quantity: Callable[[Any], ArrayLike] | ArrayLike, *, burn_
             AccuracyWarning,
             stacklevel=3,
         )
-    columns = np.array([x.mean(axis=(0, 1)), np.sqrt(2 * variance / times), tau * interval])
+    columns = np.array([x.mean(axis=(0, 1)), sigma * np.sqrt(2 / times), tau * interval])
     mean, error, time = columns.reshape(3, *further) if further else columns[:, 0].tolist()
     return Average(mean=mean, error=error, tau=time, burn_in=float(omitted * interval))
 
 
 def _correlation_time(x: Array) -> tuple[Array, Array]:
-    """Return tau in units of the distance of the values, at least 1/2, and variance for each column of x (n, k, c)."""
+    """Return tau in units of the distance of the values, at least 1/2, and sigma for each column of x (n, k, c)."""
     n, k, columns = x.shape
-    centred, power = x - x.mean(axis=(0, 1)), np.zeros((n + 1, columns))
+    low, high = x.min(axis=(0, 1)), x.max(axis=(0, 1))
+    scale = np.where(high > low, high / 2 - low / 2, 1.0)  # squares of any unit neither overflow nor underflow
+    centred, power = (x - low) / scale, np.zeros((n + 1, columns))
+    centred -= centred.mean(axis=(0, 1))
     for part in np.array_split(centred, min(k, 1 + x.size // 2**20), axis=1):  # the summed power of all trajectories
         power += (np.abs(np.fft.rfft(part, 2 * n, axis=0)) ** 2).sum(axis=1)
     covariance = np.fft.irfft(power, axis=0)[:n] / (k * np.arange(n, 0, -1)[:, np.newaxis])
@@ -101,4 +107,4 @@ def _correlation_time(x: Array) -> tuple[Array, Array]:
     ends = np.arange(n)[:, np.newaxis] >= WINDOW * np.maximum(sums, 0.5)
     window = np.where(ends.any(axis=0), ends.argmax(axis=0), n - 1)
     tau = np.maximum(0.5, sums[window, np.arange(columns)] * (1 + (2 * window + 1) / (n * k)))
-    return tau, variance * (1 + 2 * tau / (n * k))
+    return tau, np.sqrt(variance * (1 + 2 * tau / (n * k))) * scale

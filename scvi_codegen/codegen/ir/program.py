@@ -180,6 +180,7 @@ class HeatBath:
 
     Attributes:
         temperature: kT as text.
+        friction: names and formulas of its coefficients, which must not be negative.
         kernel: kT, m momenta at rest, entries of masses, friction and normals, and strengths of noise.
         constant: whether they are functions of parameters alone.
         blocks: coordinates that are coupled.
@@ -188,6 +189,7 @@ class HeatBath:
     """
 
     temperature: str
+    friction: tuple[tuple[str, str], ...]
     kernel: Kernel
     constant: bool
     blocks: tuple[tuple[int, ...], ...]

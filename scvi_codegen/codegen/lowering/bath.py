@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import sympy
+from sympy import Expr
 
 from scvi_codegen.codegen.ir.program import HeatBath
 from scvi_codegen.codegen.lowering.stage_groups import system_kernel
 from scvi_codegen.common.errors import MethodError
+from scvi_codegen.systems.bath import Bath
 from scvi_codegen.systems.derived_expressions import coupled_blocks, forms_of
 from scvi_codegen.systems.formulas.expressions import hessian, jacobian
 from scvi_codegen.systems.formulas.symbols import symbol
@@ -53,6 +57,7 @@ def heat_bath_of(system: MechanicalSystem) -> HeatBath | None:
     }
     return HeatBath(
         temperature=system.text_of(bath.temperature),
+        friction=_friction_of(system, bath, rayleigh),
         kernel=system_kernel(system, "bath_terms", terms, u=system.coordinates, purpose=PURPOSE),
         constant=all(value.free_symbols <= {*system.parameters} for value in terms),
         blocks=tuple(map(tuple, blocks)),
@@ -65,3 +70,11 @@ def heat_bath_of(system: MechanicalSystem) -> HeatBath | None:
         },
         entries={name: tuple(places) or ((0, 0, 0),) for name, places in entries.items()},
     )
+
+
+def _friction_of(
+    system: MechanicalSystem, bath: Bath, rayleigh: Mapping[tuple[int, int], Expr]
+) -> tuple[tuple[str, str], ...]:
+    """Return names and formulas of the damping and of the diagonal of R of Rayleigh's function, each formula once."""
+    rates = {entry: f"dissipation of {system.coordinates[i].name}_dot" for (i, j), entry in rayleigh.items() if i == j}
+    return tuple((name, system.text_of(entry)) for entry, name in ({bath.damping: "damping"} | rates).items())

@@ -392,6 +392,7 @@ class Interface:
             (:mod:`scvi_codegen.systems.kinks`).
         contacts: places of each contact (:mod:`scvi_codegen.systems.contacts.modes`).
         temperature: formula of kT of a heat bath, ``None`` without one.
+        friction: names and formulas of the coefficients of its friction, which must not be negative.
     """
 
     prefix: str
@@ -435,6 +436,7 @@ class Interface:
     modes: tuple[tuple[str, ...], ...] = ()
     contacts: tuple[ContactRows, ...] = ()
     temperature: str | None = None
+    friction: tuple[tuple[str, ...], ...] = ()
 
     @property
     def mode_names(self) -> tuple[str, ...]:

@@ -30,6 +30,7 @@ from scvi_codegen.runs.states.validation import (
 from scvi_codegen.runs.states.words import Word, Words, stacked, with_low, word
 from scvi_codegen.runs.stepping.chunks import drive
 from scvi_codegen.runs.stepping.features import require
+from scvi_codegen.runs.stepping.friction import check_friction
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise, check_temperature, negative_temperature
 from scvi_codegen.runs.stepping.projection import check_reachable, singular_position
@@ -525,6 +526,8 @@ class Memory:
         if remark := negative_temperature(self.stepper, self.t + self._step_size, self._parameters):
             remark = f". Cause: {remark}"
         remark = remark or singular_position(self.stepper, self._q, self.t, self._parameters)
+        if self.stepper.interface.temperature is not None:
+            remark += check_friction(self.stepper, self.t, self._parameters, self._q)
         failures = self.stepper.binding.failures
         return step_failure(status, self._report, step=self.steps, h=self._step_size, remark=remark, failures=failures)
 
