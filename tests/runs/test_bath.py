@@ -300,7 +300,7 @@ def test_what_a_heat_bath_excludes_is_refused_by_name(tmp_path):
     ):
         with pytest.raises(sc.MethodError, match="in a heat bath"):
             operation()
-    with pytest.raises(sc.StateError, match=r"kT = kT is -1 at t = 0"):
+    with pytest.raises(sc.StateError, match="temperature kT of the heat bath of 'well', kT, is -1 at t = 0"):
         well.integrate(*state, h=0.1, steps=3, parameters={"kT": -1})
     negative = "damping of the heat bath of 'well', g, is -1 at t = 0: it must not be negative"
     for start in (well.integrate, well.integrate_ensemble):

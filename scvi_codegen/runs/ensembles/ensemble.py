@@ -37,9 +37,9 @@ from scvi_codegen.runs.states.validation import (
 )
 from scvi_codegen.runs.states.words import check_doubles, hashed, stacked
 from scvi_codegen.runs.stepping.features import check_together, require
-from scvi_codegen.runs.stepping.friction import check_friction
 from scvi_codegen.runs.stepping.integrator import Integrator
-from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise, check_temperature, with_sequences
+from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise, with_sequences
+from scvi_codegen.runs.stepping.noise_strength import check_strengths
 from scvi_codegen.runs.stepping.projection import make_consistent
 from scvi_codegen.runs.stepping.state_functions import neither_or_both
 from scvi_codegen.runs.stepping.step_plan import Adaptive, ErrorControl, KindOfSteps, check_max_step, planned_steps
@@ -237,8 +237,7 @@ class Ensemble:
         noise = Noise.checked(stepper, settings.seed, settings.metropolis, settings.trajectory, settings.inputs)
         start: dict[str, Any] = {"t0": t0, "q": positions, "p": momenta, "parameters": values, "noise": noise}
         for member in np.unique(values, axis=0) if stepper.interface.temperature is not None else ():
-            check_temperature(stepper, t0, member)
-            check_friction(stepper, t0, member)
+            check_strengths(stepper, t0, member)
         ensemble = cls(stepper=stepper, settings=settings, **start, inputs=inputs, fixed=fixed, save_every=save_every)
         if not stepper._has_energy(parameters):
             for member, at, momentum in zip(values, positions, momenta, strict=True):

@@ -30,9 +30,9 @@ from scvi_codegen.runs.states.validation import (
 from scvi_codegen.runs.states.words import Word, Words, stacked, with_low, word
 from scvi_codegen.runs.stepping.chunks import drive
 from scvi_codegen.runs.stepping.features import require
-from scvi_codegen.runs.stepping.friction import check_friction
 from scvi_codegen.runs.stepping.integrator import Integrator
-from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise, check_temperature, negative_temperature
+from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise
+from scvi_codegen.runs.stepping.noise_strength import check_strengths, negative_strength, remark_on_strengths
 from scvi_codegen.runs.stepping.projection import check_reachable, singular_position
 from scvi_codegen.runs.stepping.saving import checkpoint
 from scvi_codegen.runs.stepping.step_plan import (
@@ -204,7 +204,7 @@ class Memory:
         if growth and self._can_measure_growth:
             self._memory.measures_growth = growth
         if self.stepper.interface.temperature is not None:
-            check_temperature(self.stepper, t, self._parameters)
+            check_strengths(self.stepper, t, self._parameters, self._q)
             self._noise.store(self._memory)
 
     def _set_up(self, plan: StepPlan, initial: InitialData) -> None:
@@ -523,11 +523,12 @@ class Memory:
         drive(self._taken, steps, ended=lambda: self.arrived or stop(), progress=progress)
 
     def _failure(self, status: int) -> StepFailedError:
-        if remark := negative_temperature(self.stepper, self.t + self._step_size, self._parameters):
-            remark = f". Cause: {remark}"
-        remark = remark or singular_position(self.stepper, self._q, self.t, self._parameters)
-        if self.stepper.interface.temperature is not None:
-            remark += check_friction(self.stepper, self.t, self._parameters, self._q)
+        remark, stepper, here = "", self.stepper, (self._parameters, self._q)
+        if stepper.interface.temperature is not None:
+            ends = (self.t, self.t + self._step_size)
+            remark = next((f". Cause: {cause}" for t in ends if (cause := negative_strength(stepper, t, *here))), "")
+            remark = remark or remark_on_strengths(stepper, self.t, *here)
+        remark = remark or singular_position(stepper, self._q, self.t, self._parameters)
         failures = self.stepper.binding.failures
         return step_failure(status, self._report, step=self.steps, h=self._step_size, remark=remark, failures=failures)
 

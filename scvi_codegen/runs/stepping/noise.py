@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.states.times import steps_within, times_after
-from scvi_codegen.runs.states.validation import Array, evaluation
+from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.systems.system import BATH_ENERGY
 
 NO_BATH = "requires a heat bath: give temperature= or noise= to the system"
@@ -152,20 +151,3 @@ def report_of(memory: Any) -> BathReport | None:
         return None
     accepted = memory.accepted / memory.step if memory.metropolis and memory.step else 1.0
     return BathReport(int(memory.seed), float(memory.heat), accepted)
-
-
-def negative_temperature(stepper: Any, t: float, parameters: Array) -> str:
-    """Return a sentence on a negative kT at a time, or ""; without the values of inputs it is not checked."""
-    interface = stepper.interface
-    evaluate, names = evaluation(interface.temperature or "0")
-    values = {"t": float(t), **dict(zip(interface.parameters, map(float, parameters), strict=False))}
-    with suppress(KeyError):
-        if (kT := evaluate([values[name] for name in names])) < 0.0:
-            return f"the temperature kT = {interface.temperature} is {kT:g} at t = {t:g}: it must not be negative"
-    return ""
-
-
-def check_temperature(stepper: Any, t: float, parameters: Array) -> None:
-    """Raise :class:`StateError` if kT is negative at a time."""
-    if message := negative_temperature(stepper, t, parameters):
-        raise StateError(message)
