@@ -15,8 +15,8 @@ from functools import cached_property
 
 from scvi_codegen.codegen.rendering.own_names import FileScope
 
-FIRST = "NAME(step)"
-"""Function whose source comes first."""
+FIRST = "solve", "NAME(step)"
+"""Functions whose source comes first."""
 PREFIXED = {"NAME", "STATUS"}
 """Macros of the prefix, which stay."""
 WORD = re.compile(r"\b(?:NAME|STATUS)\(\w+\)|(?<![.\w])(?<!->)[A-Za-z_]\w*")
@@ -197,7 +197,12 @@ def _ordered(parts: Sequence[Part]) -> list[Part]:
 
     placing = set[Part]()
     first = [part for part in parts if not part.names]
-    for part in (*first, *(part for part in parts if FIRST in part.names), *filter(_is_exported, parts), *parts):
+    for part in (
+        *first,
+        *(part for name in FIRST for part in parts if name in part.names),
+        *filter(_is_exported, parts),
+        *parts,
+    ):
         place(part)
     return [*order]
 
