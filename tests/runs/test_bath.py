@@ -258,12 +258,61 @@ def test_additive_noise_heats_at_its_rate():
     assert abs(energy.mean() - 0.5**2 * 20 / 2) < 4 * energy.std() / np.sqrt(4000)
 
 
-@pytest.mark.rotated
-def test_failed_steps_are_repeated_in_parts():
-    stiff = {**WELL, "lagrangian": "x_dot**2/2*(1 + x**2) - 50*x**4", "parameters": {"kT": 20, "g": 1}}
-    run = compiled("svi:1", "stiff", **stiff).integrate([1.0], [0.0], h=0.6, steps=200, seed=2)
-    assert np.isfinite(run.q).all()
-    assert len(run) == 201
+@pytest.mark.second
+def test_failed_steps_are_repeated_in_halves():
+    """Without friction, runs have the bits of single steps that a recursion halves where they fail."""
+    stiff = {**WELL, "lagrangian": "x_dot**2/2*(1 + x**2) - 50*x**4"}
+    stepper, levels = compiled("svi:1", "stiff", **stiff), set()
+
+    def halved(q, p, h, level=0):
+        levels.add(level)
+        try:
+            return stepper.step(q, p, h)[:2]
+        except sc.StepFailedError:
+            return halved(*halved(q, p, h / 2, level + 1), h / 2, level + 1)
+
+    for q, p in np.random.default_rng(0).normal(size=(60, 2, 1)) * [[2], [6]]:
+        run = stepper.integrate(q, p, h=0.6, steps=1, parameters={"kT": 0, "g": 0})
+        assert np.array_equal((run.q[1], run.p[1]), halved(q, p, 0.6))
+    assert levels == {0, 1, 2}
+    well = compiled("svi:1", "edge", **{**WELL, "lagrangian": "x_dot**2/2 + sqrt(x)"})
+    with pytest.raises(sc.StepFailedError):  # at the edge of the domain of L
+        well.integrate([1.0], [-100.0], h=1.0, steps=1, parameters={"kT": 0, "g": 0})
+
+
+@pytest.mark.second
+def test_metropolis_rejects_steps_that_fail_or_do_not_return():
+    """Each step from the saved state: O, Phi of the present direction, energies, Phi back, or the other direction."""
+    h, kT, count = 2.0, 2.0, 60
+    arguments = {**WELL, "lagrangian": "x_dot**2/2*(1 + x**4) - x**2", "parameters": {"kT": kT, "g": 1.0}}
+    stepper, way, reasons = compiled("svi:1", "folded", **arguments), 1, []
+    run = stepper.integrate([1.0], [0.0], h=h, steps=count, seed=4, metropolis=True)
+    draws, chances = (normal_numbers(4, 0, np.arange(count), purpose, 0) for purpose in (0, 1))
+
+    def heated(q, p, xi):
+        kept = np.exp(-h / 2)
+        return kept * p + np.sqrt(kT * (1 + q**4) * (1 - kept**2)) * xi
+
+    for n in range(count):
+        q, reason = run.q[n], "accepted"
+        p = heated(q, run.p[n], draws[n].real)
+        before = stepper.energy(q, p)
+        try:
+            there = stepper.step(q, p, way * h)[:2]
+            back = stepper.step(*there, -way * h)[0]
+        except sc.StepFailedError:
+            reason = "failed"
+        else:
+            log_chance = -(abs(chances[n]) ** 2) / 2  # of the same words, r^2 = -2 log(chance)
+            if log_chance > (before - stepper.energy(*there)) / kT:
+                reason = "energy"
+            elif abs(back - q).max() > 1e-8 * (abs(q) + abs(there[0] - q)).max():
+                reason = "does not return"
+        reasons.append(reason)
+        q, p, way = (*there, way) if reason == "accepted" else (q, p, -way)
+        assert np.abs([run.q[n + 1] - q, run.p[n + 1] - heated(q, p, draws[n].imag)]).max() < 1e-9
+    assert run.acceptance == reasons.count("accepted") / count
+    assert min(map(reasons.count, ("failed", "energy", "does not return"))) > 0
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@
  * e^(-dH/kT)); otherwise the state stays and s changes its sign (Lelievre, Rousset & Stoltz, Free Energy
  * Computations, 2010, sec. 2.2). Requires: run.h, bath.h, energies.h. */
 
-#define MOST_PARTS 64 /* of a failed step */
+#define MOST_PARTS 64 /* of a failed step: it is halved six times */
 #define LARGEST_RETURN_ERROR 1e-8 /* of Phi_-h(Phi_h(q)) relative to |q| and the step: it is reversible */
 #define RETURN_ROUNDING 1e-14 /* relative to the largest coordinate, in which others may round */
 
@@ -30,20 +30,26 @@ static void half_of_bath(run_memory *run, const bath_factors *bath, const double
 #endif
 }
 
-/* Repeats a failed step from a state as 2, 4, .. steps: a function of the state alone. */
-static int step_in_parts(const bath_call *call, const state *before, double h, double *q, double *p)
+/* Repeats a failed step as two of h / 2, each in the same way if it fails: a function of the state alone. */
+static int step_in_halves(const bath_call *call, const state *before, double h, double *q, double *p)
 {
-  int status = NOT_CONVERGED;
-  for (int parts = 2; status != OK && parts <= MOST_PARTS; parts *= 2) {
-    memcpy(q, before->q, sizeof before->q);
-    memcpy(p, before->p, sizeof before->p);
-    status = OK;
-    for (int n = 0; n < parts && status == OK; n++) {
-      double q0[M], p0[M];
-      memcpy(q0, q, sizeof q0);
-      memcpy(p0, p, sizeof p0);
-      status = NAME(step)(before->t + n * h / parts, h / parts, q0, p0, call->parameters, call->options, q, p,
-          call->report, call->workspace);
+  int status = OK;
+  memcpy(q, before->q, sizeof before->q);
+  memcpy(p, before->p, sizeof before->p);
+  for (int done = 0, size = MOST_PARTS / 2; done < MOST_PARTS; size = status == OK ? done & -done : size / 2) {
+    const double part = h / MOST_PARTS;
+    double q0[M], p0[M];
+    memcpy(q0, q, sizeof q0);
+    memcpy(p0, p, sizeof p0);
+    status = NAME(step)(before->t + done * part, size * part, q0, p0, call->parameters, call->options, q, p,
+        call->report, call->workspace);
+    if (status == OK)
+      done += size;
+    else if (size == 1)
+      break;
+    else {
+      memcpy(q, q0, sizeof q0);
+      memcpy(p, p0, sizeof p0);
     }
   }
   return status;
@@ -102,7 +108,7 @@ static int step_of_bath(const bath_call *call, run_memory *run, double temperatu
       run->reversed = !run->reversed;
     }
   } else {
-    status = step_in_parts(call, &before, h, q, p);
+    status = step_in_halves(call, &before, h, q, p);
     if (status != OK)
       return status;
     memcpy(run->q, q, sizeof q);
