@@ -115,6 +115,9 @@ span = 8.0
 function = "x - 4"
 terminal = true
 """
+BROWNIAN = (
+    OSCILLATOR.replace("[parameters]", 'temperature = "kT"\ndamping = "k"\n[parameters]\nkT = 0.5') + "seed = 7\n"
+)
 STIFF_FLOOR = """[system]
 name = "ball on a stiff floor"
 coordinates = ["y"]
@@ -399,6 +402,8 @@ def computed(text, steps):
         pytest.param(STICK_SLIP, 200, [0, 0], id="dry friction"),
         pytest.param(BALL, 60, [0, 100], id="a contact with friction, adaptive"),
         pytest.param(STIFF_FLOOR, 200, [0, 0], id="a kink"),
+        pytest.param(BROWNIAN, 200, [0, 0], id="a heat bath"),
+        pytest.param(BROWNIAN + "metropolis = true\n", 200, [0, 0], id="Metropolis steps"),
     ],
 )
 def test_the_webassembly_computes_the_bits_of_python_within_300_kilobytes(tmp_path, text, steps, statuses):
@@ -412,6 +417,7 @@ def test_the_webassembly_computes_the_bits_of_python_within_300_kilobytes(tmp_pa
     model = sc.load_model(path)
     stepper = sc.compile_stepper(model.system, model.method, flags=PORTABLE_FLAGS, events=page.model.events or None)
     known = {"inputs": model.inputs} if model.inputs else {}
+    known |= {"seed": model.seed, "metropolis": model.metropolis} if model.system.bath else {}
     adaptive = {"tolerance": model.tolerance, "max_step": model.max_step, "t_end": model.end}
     h = {"h": model.h, "steps": steps} if model.h else adaptive
     run = stepper.integrate(model.q, model.momenta(stepper), parameters=model.parameters, **h, **known)
@@ -420,7 +426,7 @@ def test_the_webassembly_computes_the_bits_of_python_within_300_kilobytes(tmp_pa
     assert np.array_equal(state["p"], run.p[-1])
     assert state["energy"] == run.energy()[-1]
     assert state["stored"] == len(run.t) - 1
-    assert ("forward only" in state["turned"]) == bool(stepper.interface.contacts)
+    assert ("forward only" in state["turned"]) == bool(stepper.interface.contacts or model.system.bath)
 
 
 @pytest.mark.rotated

@@ -45,6 +45,7 @@ from scvi_codegen.interfaces.pages.webassembly import LICENCES, check_compiler, 
 from scvi_codegen.interfaces.pictures.recognition import shape_of
 from scvi_codegen.interfaces.pictures.shape import DrawnSystem, shape_of_picture
 from scvi_codegen.runs.stepping.array_interface import read_arrays
+from scvi_codegen.runs.stepping.noise import Noise
 from scvi_codegen.systems.formulas.grammar import parse_expression
 from scvi_codegen.systems.formulas.rotations import Rotation, RotationNames, Spin
 from scvi_codegen.systems.formulas.symbols import input_parameters, symbol
@@ -64,7 +65,7 @@ CAUSES = (
     "The initial state is behind a wall. Use other initial values.",
     "The step failed: it has too many events. Use a smaller step size.",
     "The contacts have no motion, as in Painlevé's paradox: use less friction, or other initial values.",
-    "With contacts time goes forward only: restart.",
+    "With contacts or a heat bath time goes forward only: restart.",
     "The motion slides on a surface where a force jumps: use dry friction of a contact instead.",
 )
 """Text of each status of the generated C, then of ``entry.c.jinja``."""
@@ -188,8 +189,6 @@ def _check(model: Model, ranges: Mapping[str, tuple[float, float]]) -> None:
     for input_name, value in model.inputs.items():
         if isinstance(value, tuple):
             raise MethodError(f"a slider sets the input {input_name} of {name}, which is a table: give a number")
-    if model.system.bath:
-        raise MethodError(f"a page has no heat bath, unlike {name}: use runs and films, or a generated program")
     if model.h is None and model.tolerance is None:
         raise MethodError(f"a page requires a step size or tolerance; {name} has neither: give [run] step or tolerance")
     if model.h is None and model.has_time_transformation:
@@ -288,6 +287,7 @@ def _entry(model: Model, interface: Interface, initial: Sequence[str], adaptive:
             acting=any(event.changes_state for event in events), contacts=interface.contacts, modes=interface.modes,
             velocities=not starts_from_momenta(model),
             level=interface.energy_index if interface.in_tau else None,
+            noise=Noise.checked(model.stepper(), model.seed, model.metropolis) if model.system.bath else None,
             axes={f"at_{name}": nodes for name, nodes in axes.items()},
             names={f"at_{name}": k for k, name in enumerate(interface.parameters)},
         )
