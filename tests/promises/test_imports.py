@@ -220,7 +220,7 @@ def test_importing_the_package_loads_no_heavy_library(tmp_path):
     assert loaded.isdisjoint([*HEAVY, "numpy", "cffi"])
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize("use", [STEPPING, RECORDING], ids=["stepping", "recording"])
 def test_a_generated_package_loads_no_heavy_library(tmp_path, use):
     folder = generate_package(Model.from_problem(problem("planar-pendulum")), tmp_path / "pendulum_svi")

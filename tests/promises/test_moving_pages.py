@@ -232,6 +232,7 @@ def test_a_page_fits_the_screen_is_readable_and_named(browser, pages, width):
         page.close()
 
 
+@pytest.mark.rotated
 def test_the_form_writes_a_model_file_that_is_read(view, tmp_path):
     pytest.importorskip("sphinx", reason="the form is a directive of the site")
     view.set_content(extension("motions").OWN)

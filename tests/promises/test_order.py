@@ -148,7 +148,7 @@ def test_compositions_have_their_order_with_forces_of_time(quickly_compiled):
     assert np.log2(errors[0] / errors[1]) == pytest.approx(8, abs=0.4), errors
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize("name", ["kepler", "planar-pendulum"])

@@ -109,6 +109,7 @@ def test_kepler_conserves_angular_momentum_to_round_off(compiled, method):
     assert np.abs(L - L[0]).max() < 2e-14
 
 
+@pytest.mark.rotated
 def test_methods_without_a_discrete_lagrangian_do_not_conserve_angular_momentum(compiled):
     """Counterexample to the tests above: these methods do not conserve the quantity."""
     entry = sc.problem("kepler")

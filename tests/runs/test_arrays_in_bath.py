@@ -35,7 +35,7 @@ def test_motion_is_that_of_named_coordinates(method):
     assert not run.momentum_maps().size
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_temperatures_of_a_mixture_of_atoms_and_bits():
     """Friction on one of two species heats both to kT, within four standard errors; total momentum is not conserved."""
     square = "sum(a in 3, wrap(r[i, a] - r[j, a], box)**2)"

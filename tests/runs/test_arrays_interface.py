@@ -61,7 +61,7 @@ def test_functions_of_states_equal_those_of_known_sizes(steppers) -> None:
             assert values[:, any_size.momentum_map_names.index("momentum of q")] == pytest.approx(flat.sum(axis=1))
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 def test_energies_in_the_memory_of_a_run_do_not_change_it(steppers) -> None:
     any_size, _, (q, p), parameters = steppers
     array = any_size.interface.coordinates[0]

@@ -254,7 +254,7 @@ def test_parameters_are_named_rows_or_one_row_per_trajectory() -> None:
     assert np.array_equal(same.parameters, np.tile(each.parameters[0], (3, 1)))
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_ensembles_with_few_or_no_steps() -> None:
     stepper = stepper_for("kepler", sc.SVI(5))
     q, p = states("kepler", 9)

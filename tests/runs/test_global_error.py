@@ -427,7 +427,7 @@ class TestOtherRuns:
 
 
 class TestSolveMotion:
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_unconfirmed_result_is_not_a_success(self, burrau_stepper):
         with pytest.warns(sc.AccuracyWarning, match="confirmed until"):
             motion = sc.solve_ivp(burrau_stepper, (0.0, 30.0), np.concatenate(PYTHAGOREAN), error=1e-9)

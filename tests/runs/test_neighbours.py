@@ -157,7 +157,7 @@ def of_other_kind(kind: str, near: str) -> Any:
     return sc.LagrangianSystem.from_text(**given, lagrangian=lagrangian, dissipation=friction)
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("kind", "method"), [("hamiltonian", "svi:2"), ("bonds", "stoermer-verlet"), ("friction", "svi:2")]

@@ -116,7 +116,7 @@ def differences(function, x, width=1e-4):
     return np.array(columns).T
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize(("name", "changes"), CASES)
 def test_derivatives_of_runs_are_products_of_those_of_steps(name, changes):
     motion = MOTIONS[name]

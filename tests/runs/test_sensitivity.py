@@ -138,7 +138,7 @@ def test_second_derivatives_of_a_step_by_all_arguments(name):
         assert abs(direction @ scaled @ direction - exact) < tolerance * np.abs(direction).sum() ** 2
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize("name", NAMES)
 def test_vector_products_agree_with_the_jacobian(name):
     _, stepper, q, p, h = given(name)

@@ -51,7 +51,7 @@ def test_checkpoints_contain_the_parameters(kepler):
     assert not same(kepler.from_checkpoint(saved, parameters={"mu": 1.0}).record(5), expected)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_checkpoints_of_other_systems_are_rejected(kepler):
     """Their memory may have the same size."""
     text = "a_dot**2/2 + b_dot**2/2 - (a - b)**4/4 - mu*a**2"

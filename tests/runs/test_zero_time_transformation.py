@@ -40,7 +40,7 @@ def test_solve_ivp_reports_a_zero_time_transformation():
     assert "reaches 0" in motion.message
 
 
-@pytest.mark.tiers(1)
+@pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize("time_transformation", ["frequency", "q1**2 + q2**2"])
 def test_close_encounters_do_not_stop_a_run(time_transformation):
     stretched = sc.compile_stepper(sc.reparametrise(KEPLER, time_transformation), sc.SVI(8))

@@ -114,7 +114,7 @@ def test_velocities_where_a_pivot_vanishes() -> None:
         _ = stepper.integrate((d, -10.0, b, c), h=1e-3, steps=0).velocity
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_one_forms_that_depend_on_time_change_the_energy() -> None:
     """H changes by 20 %, without a warning that the motion amplifies errors; at rest in time it is conserved."""
     for factor, conserved in (("sin(t)", False), ("1/3", True)):

@@ -38,7 +38,7 @@ def assert_moves_alike(mechanism: Mechanism, steps: int = 200) -> None:
     np.testing.assert_allclose(run.velocity[-1], v, rtol=0, atol=1e-9)
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", MECHANISMS)
 def test_trajectories_agree_with_sympys_equations(name: str) -> None:
@@ -126,7 +126,7 @@ def test_time_dependent_forces_are_inputs_or_set_to_zero_order_hold() -> None:
         taken(method)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_weights_and_springs_become_a_potential_and_dampers_remain_forces() -> None:
     mechanism = MECHANISMS["particles on a spring"]()
     system = mechanism.system().with_parameters(c=0.0, g=0.0)

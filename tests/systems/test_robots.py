@@ -566,7 +566,7 @@ def test_robot_in_which_nothing_moves_is_refused(tmp_path):
         sc.LagrangianSystem.from_urdf(tmp_path / "none.urdf")
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_robots_of_a_folder_are_listed_with_their_outcome(tmp_path):
     """By the script of the benchmarks; with MuJoCo, those of MJCF are equal."""
     script = Path(__file__).parents[2] / "benchmarks" / "robot_files.py"
