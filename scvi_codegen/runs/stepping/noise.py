@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,7 +46,8 @@ class ColouredNoise:
     tau: float
 
     def __post_init__(self) -> None:
-        if not (0 <= self.sigma < np.inf and 0 < self.tau < np.inf):
+        numbers = all(isinstance(value, Real) for value in (self.sigma, self.tau))
+        if not (numbers and 0 <= self.sigma < np.inf and 0 < self.tau < np.inf):
             raise StateError(f"{self} requires finite numbers sigma >= 0 and tau > 0")
 
     def values(self, h: float, normals: Array) -> Array:
