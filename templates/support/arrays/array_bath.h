@@ -24,7 +24,9 @@ static int prepare_bath(run_memory *run)
 static void half_of_bath(run_memory *run, long long n, int second)
 {
   const double *decay = run->bath, *strength = run->bath + n;
-  double first[NORMALS_AT_ONCE], *later = run->bath + 2 * n;
+  double first[NORMALS_AT_ONCE], taken[NORMALS_AT_ONCE], *later = run->bath + 2 * n;
+  double *restrict p = run->p, *restrict carry = run->carry_p;
+  const double *inverse_mass = run->inverse_mass;
   sums heat;
   wait_at_barrier(run);
   begin_sums(&heat, run, n);
@@ -36,11 +38,16 @@ static void half_of_bath(run_memory *run, long long n, int second)
       if (!second)
         normals(run->seed, (uint64_t)run->step, 1, HEAT, (int)from, (int)count, (uint32_t)run->trajectory, 1, first,
             later + from);
-      for (long long j = 0, i = from; j < count; j++, i++) {
-        const double old = run->p[i] + run->carry_p[i], change = fma(decay[i], old, strength[i] * xi[j]);
-        sum += change * (old + 0.5 * change) * run->inverse_mass[i];
-        run->p[i] = old + change, run->carry_p[i] = 0.0;
+      memset(taken, 0, sizeof taken);
+      for (long long j = 0; j < count; j++) {
+        const double old = p[from + j] + carry[from + j], change = fma(decay[from + j], old, strength[from + j] * xi[j]);
+        taken[j] = change * (old + 0.5 * change) * inverse_mass[from + j];
+        p[from + j] = old + change, carry[from + j] = 0.0;
       }
+      for (int half = NORMALS_AT_ONCE / 2; half > 0; half /= 2) /* a sum in vectors */
+        for (int j = 0; j < half; j++)
+          taken[j] += taken[half + j];
+      sum += taken[0];
     }
     add_block(&heat, sum, 0.0);
   }
