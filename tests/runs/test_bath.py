@@ -227,16 +227,22 @@ def test_rods_by_constraints_and_by_angles_agree_with_quadrature():
 
 
 @pytest.mark.rotated
-@pytest.mark.parametrize("friction", [{"damping": 1.0}, {"dissipation": "omega_1**2 + omega_2**2/2"}])
-def test_rigid_dipole_has_the_average_of_langevin(friction):
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"damping": 1.0},
+        {"dissipation": "omega_1**2 + omega_2**2/2"},
+        {"damping": 1.0, "lagrangian": "(omega_1**2 + omega_2**2 + omega_3**2/2)/2 + 2*R_33"},  # in a moving frame
+    ],
+)
+def test_rigid_dipole_has_the_average_of_langevin(arguments):
     dipole = compiled(
         "svi:1",
         "dipole",
         rotations={"R": "omega"},
-        lagrangian="(omega_1**2 + 2*omega_2**2 + 5*omega_3**2/2)/2 + 2*R_33",
         parameters={"kT": 1},
         temperature="kT",
-        **friction,
+        **{"lagrangian": "(omega_1**2 + 2*omega_2**2 + 5*omega_3**2/2)/2 + 2*R_33", **arguments},
     )
     exact = np.array([1 / np.tanh(2) - 0.5])
 

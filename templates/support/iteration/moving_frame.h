@@ -173,7 +173,7 @@ static inline double excess(const double *d)
 }
 
 /* q <- q g, p <- p g for g - 1 of each body; its length is corrected. High words are in one lane, low in another. */
-static inline void rotate(frame_state *at, const double *g)
+static inline void rotate_state(frame_state *at, const double *g)
 {
   for (int i = 0; i < M; i += 4) {
     const lanes w[3] = {lanes_of(g[i + 1]), lanes_of(g[i + 2]), lanes_of(g[i + 3])};
@@ -230,7 +230,7 @@ static inline void rotate_freely(const step_data *step, frame_state *at, int end
     for (int k = 0; k < 4 * TURNS; k += 4)
       join(g + k, turn + k);
   }
-  rotate(at, g);
+  rotate_state(at, g);
 }
 
 /* Returns the step from the state in the moving frame, which is stored in `at`. */
