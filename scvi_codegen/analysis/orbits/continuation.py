@@ -31,7 +31,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.analysis.estimation.fixed_steps import tangents_along
 from scvi_codegen.analysis.orbits.equilibrium import Equilibrium
 from scvi_codegen.analysis.orbits.solver import (
     DIFFERENCE_INCREMENT,
@@ -467,7 +466,7 @@ class Continuation:
             return search
         parameters = search.parameters.copy()
         parameters[self.parameter] = y[-1]
-        return replace(search, parameters=parameters)
+        return replace(search, parameters=parameters, varied=self.parameter)
 
     def _in_segments(self, search: OrbitSearch, y: Array, former: FamilyPoint | None) -> Array:
         """Return unknowns with the starts of more segments where tangent vectors grow along the orbit."""
@@ -534,7 +533,7 @@ class Continuation:
         into = _block_diagonal([inward, np.eye(tail)])
         if self.parameter is not None:
             units = np.append(units, self.parameter_unit)
-            columns.append(self._by_parameter(search, closing, starts, period)[:, np.newaxis])
+            columns.append(self._by_parameter(search, closing, starts[0])[:, np.newaxis])
         jacobian = np.hstack(columns) * units / rows[:, np.newaxis]
         fixed = search.fixed_rows(len(states) + 1) @ into[: len(states) + 1] * units
         jacobian = np.vstack([jacobian, fixed / np.abs(fixed).max(axis=1, keepdims=True)]) if len(fixed) else jacobian
@@ -555,22 +554,14 @@ class Continuation:
             return search.period, 0.0
         return self.period_of(values), self.period_of.derivative(names[self.parameter])(values)
 
-    def _by_parameter(self, search: OrbitSearch, closing: ClosingEquations, starts: Array, period: float) -> Array:
+    def _by_parameter(self, search: OrbitSearch, closing: ClosingEquations, start: Array) -> Array:
         """Return the derivatives of the closing equations by the parameter."""
         assert self.parameter is not None
-        steps, bounds = search.steps, search.bounds(len(starts))
-        tangent = np.zeros((1, search.stepper._input_size))
-        tangent[0, starts[0].size + self.parameter] = 1.0
-        column = []
-        for k, segment in enumerate(closing.segments):
-            part = slice(bounds[k], bounds[k + 1])
-            times, sizes = search.t + period * steps.ends[:-1][part], period * steps.widths[part]
-            at = times, sizes, tangent, search.parameters, search.options, np.zeros((len(sizes), 1))
-            column.append(search.leaving(segment) @ tangents_along(search.stepper, starts[k].ravel(), *at)[1][-1][0])
+        column = [search.leaving(segment) @ segment.by_parameter for segment in closing.segments]
         column[-1][np.flatnonzero(search.drifts)] = 0.0
         column[-1] = closing.returning @ column[-1]
         if search.energy is not None:
-            column.append(np.array([self._energy_by_parameter(search, starts[0], self.parameter)]))
+            column.append(np.array([self._energy_by_parameter(search, start, self.parameter)]))
         return np.concatenate(column)
 
     def _energy_by_parameter(self, search: OrbitSearch, start: Array, parameter: int) -> float:
@@ -588,8 +579,7 @@ class Continuation:
         y = np.append(z, self.search.parameters[self.parameter])
         search = replace(self._search_at(y, TOLERANCES[0] * self.bound), energy=None)
         closing = search.closing_equations(z)
-        starts = z[:-1].reshape(1, 2, -1)
-        column = self._by_parameter(search, closing, starts, float(z[-1])) / search.row_units(closing)
+        column = self._by_parameter(search, closing, z[:-1].reshape(2, -1)) / search.row_units(closing)
         effect = float(np.linalg.norm(column))
         if self.period_of is not None:
             effect += abs(self._period(search)[1]) * 2.0 * math.pi / float(z[-1])

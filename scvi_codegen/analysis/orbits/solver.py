@@ -377,6 +377,7 @@ class OrbitSearch:
         gain: (m,) increase of the positions over a period.
         drifts: (m,) mask of positions with another increase, which is unknown.
         reversor: of symmetric orbits, whose steps and segments are those of half a period.
+        varied: index of the parameter by which ends of segments are differentiated.
     """
 
     stepper: Stepper
@@ -393,6 +394,7 @@ class OrbitSearch:
     parameters: Array
     options: SolverOptions | None
     reversor: Reversor | None = None
+    varied: int | None = None
 
     @classmethod
     def at(
@@ -798,11 +800,13 @@ class OrbitSearch:
     def _segment(self, start: Array, steps: StepSequence, first: int, last: int, period: float) -> _Segment:
         """Integrate from the start of step ``first`` of a sequence to the start of step ``last``."""
         size, ends, widths = len(start), steps.ends[first : last + 1], steps.widths[first:last]
-        tangents = np.zeros((size + 2, self.stepper._input_size))
+        tangents = np.zeros((size + 2 + (self.varied is not None), self.stepper._input_size))
         tangents[:size, :size] = np.eye(size)
+        if self.varied is not None:
+            tangents[-1, size + self.varied] = 1.0
         tangents[size, -2] = ends[0]
         tangents[size + 1, -2] = 1.0
-        variations = np.zeros((last - first, size + 2))
+        variations = np.zeros((last - first, len(tangents)))
         variations[:, size] = widths
         at = self.t + period * ends[:-1], period * widths, tangents, self.parameters, self.options, variations
         states, vectors, _ = tangents_along(self.stepper, start, *at)
@@ -814,6 +818,7 @@ class OrbitSearch:
             monodromy=partials[:, :size],
             by_period=partials[:, size],
             by_time=partials[:, size + 1],
+            by_parameter=partials[:, -1],
         )
 
     def _discretisation_error(self, z: Array, equations: ClosingEquations) -> float:
@@ -943,7 +948,8 @@ class _Segment:
     Attributes:
         states: (n, 2m) states after each step.
         start_time, end_time: times of its ends.
-        monodromy, by_period, by_time: derivatives of the end; the last is 0 for autonomous systems.
+        monodromy, by_period, by_time, by_parameter: derivatives of the end; by time 0 for autonomous systems, and by
+            the parameter that varies, if one does.
     """
 
     states: Array
@@ -952,6 +958,7 @@ class _Segment:
     monodromy: Array
     by_period: Array
     by_time: Array
+    by_parameter: Array
 
 
 @dataclass(frozen=True, eq=False)
