@@ -5,7 +5,7 @@ enum {
   CONTACT_HALVINGS = 1000 /* of parts of a step whose iterations do not converge */
 };
 
-#define CONTACT_BEGIN 1e-6 /* first part of a slip in space, relative to a step */
+#define CONTACT_BEGIN 1e-4 /* first part of a slip in space, relative to a step: longer than that of rounding */
 #define CONTACT_BRAKES 0.25 /* longest parts relative to the time to its stop .. */
 #define CONTACT_GROWS 0.2 /* .. to that from its beginning .. */
 #define CONTACT_RELAXES 2.0 /* .. and to the relaxation of its direction, for which iterations on stages converge .. */

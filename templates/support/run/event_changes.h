@@ -110,7 +110,8 @@ static int refine_crossing(const event_step *step, long long first, const event_
   at->t = crossing->t;
   copy_state(at->q, at->p, crossing->q, crossing->p);
 #ifdef EVENT_CONSTRAINTS /* momenta of constrained steps of the size of rounding are ill-conditioned: interpolated */
-  for (int k = 0; k < M && fabs(*part) < EVENT_TIE * fabs(step->whole); k++)
+  const real short_part = fmax(EVENT_TIE * fabs(step->whole), 4.0 * DBL_EPSILON * fabs(step->t));
+  for (int k = 0; k < M && fabs(*part) < short_part; k++)
     at->p[k] = step->p[k] + *part / step->h * (right->p[k] - step->p[k]);
   for (long long i = first; i < *step->filled; i++)
     copy_state(step->found[i].q, step->found[i].p, at->q, at->p);
