@@ -24,6 +24,9 @@ MJCF = """<mujoco><compiler {compiler}/><option gravity="0 1 -9" {option}><flag 
 A, B = '<joint name="x" axis="1 2 3" {}/>', '<joint name="y" axis="0 1 0" {}/>'
 PATH = '<tendon><spatial name="t" stiffness="3"><site site="w"/>{}<site site="e"/></spatial></tendon>'
 MUSCLE, SERVO = '<actuator><muscle joint="x"/></actuator>', '<actuator><position name="u" joint="x" kv="1"/></actuator>'
+ELLIPSOIDS = (
+    '<geom type="{}" size="{}" pos=".1 0 .2" euler=".3 .2 .1" fluidshape="ellipsoid" fluidcoef=".3 .2 1 .7 .6"/>'
+)
 FLUID = {"option": 'density="9" viscosity="1"'}
 ROWS: dict[str, tuple[dict[str, str], str | None]] = {
     "degrees": ({"a": A.format('ref="20" springref="30" stiffness="1"')}, EQUAL),
@@ -48,8 +51,20 @@ ROWS: dict[str, tuple[dict[str, str], str | None]] = {
     "servo": ({"rest": SERVO}, EQUAL),
     "limits and dry friction": ({"a": A.format('range="-1 1" frictionloss=".1"')}, EQUAL),
     "ellipsoids in a medium": (
-        FLUID | {"b": B + '<geom size=".1" fluidshape="ellipsoid"/>'},
-        "has fluidshape='ellipsoid' in a medium, whose forces are not computed: remove it",
+        FLUID | {"b": B + ELLIPSOIDS.format("sphere", ".1") + ELLIPSOIDS.format("ellipsoid", ".3 .1 .2")},
+        EQUAL,
+    ),
+    "other ellipsoids in a medium": (
+        FLUID
+        | {
+            "a": '<freejoint name="f"/>' + ELLIPSOIDS.format("cylinder", ".1 .3"),
+            "b": B.replace("/>", ' type="ball"/>') + ELLIPSOIDS.format("capsule", ".1 .2"),
+        },
+        EQUAL,
+    ),
+    "ellipsoid of a mesh": (
+        FLUID | {"b": B + '<geom type="mesh" mesh="m" fluidshape="ellipsoid"/>'},
+        "is a mesh with fluidshape='ellipsoid', which is read of sphere, ellipsoid, box, cylinder, capsule",
     ),
     "wind": ({"option": 'wind="1 0 0"'}, "wind='1 0 0', which changes the motion and is not read: remove it"),
     "pulley": ({"rest": PATH.format('<pulley divisor="2"/>')}, "which is read through sites only, without wrapping"),

@@ -291,13 +291,13 @@ class _Graph:
 def _primitive(total: sympy.Add) -> tuple[sympy.Rational, Sequence[sympy.Expr]]:
     """Return content and terms of SymPy's ``primitive()``, which takes ten times as long for products."""
     pairs = [term.as_coeff_Mul() for term in total.args]
-    content = sympy.Rational(math.gcd(*(c.p for c, _ in pairs)), math.lcm(*(c.q for c, _ in pairs)))
-    if content == 1 or not all(isinstance(rest, sympy.Symbol | sympy.Mul | Intermediate) for _, rest in pairs):
+    divisor, multiple = math.gcd(*(c.p for c, _ in pairs)), math.lcm(*(c.q for c, _ in pairs))
+    if divisor == multiple or not all(isinstance(rest, sympy.Symbol | sympy.Mul | Intermediate) for _, rest in pairs):
         content, primitive = total.primitive()
         return content, primitive.args
-    scaled = [(c / content, rest) for c, rest in pairs]
+    scaled = [(sympy.Integer(c.p // divisor * (multiple // c.q)), rest) for c, rest in pairs]
     terms = [rest if c == 1 else sympy.Mul._from_args((c, *sympy.Mul.make_args(rest))) for c, rest in scaled]
-    return content, sorted(terms, key=cmp_to_key(sympy.Basic.compare))
+    return sympy.Rational(divisor, multiple), sorted(terms, key=cmp_to_key(sympy.Basic.compare))
 
 
 def lower_kernel(

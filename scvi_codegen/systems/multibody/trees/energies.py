@@ -44,6 +44,7 @@ from sympy import Abs, Add, Expr, Matrix, Rational, S, Symbol, atan2, cos, eye, 
 
 from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
 from scvi_codegen.systems.contact import ContactLike, contact, friction
+from scvi_codegen.systems.formulas.expressions import gradient_tuple
 from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.formulas.rotations import Rotation, RotationNames
 from scvi_codegen.systems.formulas.symbols import DOT, default_momenta, symbol
@@ -239,15 +240,21 @@ class Tree:
         yield atan2(sqrt(Add(*(x**2 for x in twice)) / 4 + TINY), (turn.trace() - 1) / 2)
 
     def dissipation(self) -> Expr:
-        """Return Rayleigh's function of the damping of joints and of the medium."""
-        terms = [self.of_rates(joint, joint.damping) for joint in self.joints.values()]
-        motions = self.motions(free=True) if any(link.inertia.drag for link in self.links) else []
-        for link, (w, v) in zip(self.links, motions, strict=False):
-            for pose, coefficients in link.inertia.drag:
-                velocities = w, v + w.cross(exact_vector(pose.position))
-                rates = [x for vector in velocities for x in as_quantities(exact_matrix(pose.rotation).T * vector)]
-                terms += [integral(pair, Abs(x)) for pair, x in zip(coefficients, rates, strict=True)]
-        return Add(*terms)
+        """Return Rayleigh's function of the damping of joints."""
+        return Add(*(self.of_rates(joint, joint.damping) for joint in self.joints.values()))
+
+    def forces_of_medium(self, rates: Sequence[Symbol]) -> Iterator[Expr]:
+        """Yield the force of the medium on each rate u, the sum of F dv/du over velocities v and their loads F."""
+        loads: dict[Symbol, Expr] = {}
+        power, at_rest = [S.Zero], not any(link.inertia.drag for link in self.links)
+        for link, (w, v) in zip(self.links, [] if at_rest else self.motions(free=True), strict=False):
+            for pose, law in link.inertia.drag:
+                axes = exact_matrix(pose.rotation).T
+                spin, speed = (as_quantities(axes * x) for x in (w, v + w.cross(exact_vector(pose.position))))
+                for load, rate in zip(law(spin, speed), (*spin, *speed), strict=True):
+                    power.append(Symbol(f"_load_{len(loads)}", real=True) * rate)
+                    loads[Symbol(f"_load_{len(loads)}", real=True)] = intermediate(load)
+        yield from (part.xreplace(loads) for part in gradient_tuple(Add(*power), rates))
 
     def contacts(self, restitution: float) -> Iterator[ContactLike]:
         """Yield the contacts of joints with limits, and the dry friction of joints.
@@ -289,12 +296,17 @@ class Tree:
                 raise SystemDefinitionError(f"there is no hinge or slide '{name}' to act on{closest(name, singles)}")
         free = [joint for joint in self.joints.values() if joint.kind == "free"]
         turning = [rotation_of(joint) for joint in self.joints.values() if joint.kind in ("ball", "free")]
+        names_of_q = [*chain.from_iterable(map(position_of, free)), *singles]
+        spins = (rate for rotation in turning for rate in rotation.rates)
+        loads = self.forces_of_medium([*(symbol(name + DOT) for name in names_of_q), *spins])
+        forces = {name: next(loads) + (symbol(f"tau_{name}") if name in driven else 0) for name in names_of_q}
         return {
-            "coordinates": [symbol(name) for name in (*chain.from_iterable(map(position_of, free)), *singles)],
+            "coordinates": [*map(symbol, names_of_q)],
             "rotations": {rotation.name: rotation.rate for rotation in turning},
             "lagrangian": self.kinetic_energy() - self.potential_energy(),
             "dissipation": self.dissipation(),
-            "forces": {name: symbol(f"tau_{name}") for name in driven},
+            "forces": {name: force for name, force in forces.items() if force != 0},
+            "torques": {turn.name: load for turn in turning if any(load := [next(loads) for _ in range(3)])},
             "inputs": [f"tau_{name}" for name in driven],
         }
 

@@ -8,6 +8,7 @@ import re
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import combinations, zip_longest
 from os import PathLike
 from pathlib import Path
@@ -22,6 +23,7 @@ from scvi_codegen.systems.multibody.trees.actuators import Actuator, Range, actu
 from scvi_codegen.systems.multibody.trees.closures import Closure, Coupling, at_reference
 from scvi_codegen.systems.multibody.trees.contacts import Touch
 from scvi_codegen.systems.multibody.trees.document import Element, Unread, checked_limits, root_of
+from scvi_codegen.systems.multibody.trees.fluid import box, ellipsoid
 from scvi_codegen.systems.multibody.trees.geoms import Geom, Pair
 from scvi_codegen.systems.multibody.trees.macros import Macros
 from scvi_codegen.systems.multibody.trees.meshes import inertia_of
@@ -508,8 +510,18 @@ class _MujocoModel:
             return inertia.scaled(density if np.isnan(mass) else mass / inertia.mass).seen_from(self.pose(geom))
         if shape not in SHAPES or geom.has("mesh") or shell:
             geom.refuse(f"is a {shape} whose inertia is not computed: give its body an <inertial>")
-        count, volume_and_inertia = SHAPES[shape]
-        size = geom.vector("size", sizes=(1, 2, 3))
+        size = self.size(geom, shape)
+        with np.errstate(all="ignore"):
+            volume, moments = SHAPES[shape][1](size)
+        if not (0 < volume < np.inf and np.isfinite(moments).all()):
+            geom.refuse(f"has size='{geom.text('size')}', whose volume is {volume:g}: use other units of length")
+        mass = density * volume if np.isnan(mass) else mass
+        return Inertia(mass, matrix=mass * np.diag(moments)).seen_from(self.pose(geom))
+
+    @staticmethod
+    def size(geom: Element, shape: str) -> Vector:
+        """Return the sizes of a geom, by ``size`` and ``fromto``."""
+        count, size = SHAPES[shape][0], geom.vector("size", sizes=(1, 2, 3))
         if geom.has("fromto"):
             ends = geom.vector("fromto", sizes=(6,))
             if shape == "sphere":
@@ -517,34 +529,30 @@ class _MujocoModel:
             size = np.array([size[0]] * (count - 1) + [float(np.linalg.norm(ends[3:] - ends[:3])) / 2])
         if len(size) < count or (size[:count] <= 0).any():
             geom.refuse(f"is a {shape} and has size='{geom.text('size')}': {count} numbers > 0 are needed")
-        with np.errstate(all="ignore"):
-            volume, moments = volume_and_inertia(size[:count])
-        if not (0 < volume < np.inf and np.isfinite(moments).all()):
-            geom.refuse(f"has size='{geom.text('size')}', whose volume is {volume:g}: use other units of length")
-        mass = density * volume if np.isnan(mass) else mass
-        return Inertia(mass, matrix=mass * np.diag(moments)).seen_from(self.pose(geom))
+        return size[:count]
 
     def drag(self, body: Element, inertia: Inertia) -> tuple[tuple[Pose, Any], ...]:
-        """Return the drag on a body in a medium, of the box with the edges b of the same mass and inertia.
-
-        In its axes the torque is -pi beta m^3 w_i - rho/64 b_i (b_j^4 + b_k^4) |w_i| w_i, the force -3 pi beta m v_i
-        - rho/2 b_j b_k |v_i| v_i, with the mean m of b. https://mujoco.readthedocs.io/en/stable/computation/fluid.html
-        """
+        """Return the drag of the ellipsoids of a body in a medium; without any, of the box of its mass and inertia."""
         if not any(self.medium) or inertia.mass < NO_MASS:
             return ()
         parts = [(part, frame @ self.pose(part)) for part, frame in self.contents(body, "geom", "inertial")]
-        for part, _ in parts:
-            if part.text("fluidshape", "none") != "none":
-                part.refuse("has fluidshape='ellipsoid' in a medium, whose forces are not computed: remove it")
+        ellipsoids: list[tuple[Pose, Any]] = []
+        for geom, pose in parts:
+            if geom.choice("fluidshape", "none", "ellipsoid") == "ellipsoid":
+                if (shape := geom.text("type", "sphere")) not in SHAPES or geom.has("mesh"):
+                    geom.refuse(f"is a {shape} with fluidshape='ellipsoid', which is read of {', '.join(SHAPES)}")
+                size = self.size(geom, shape)
+                r = size[[0, 0, -1] if len(size) < 3 else [0, 1, 2]] + (shape == "capsule") * size[0] * AXES["z"]
+                coefficients = geom.vector("fluidcoef", (0.5, 0.25, 1.5, 1, 1), (5,))
+                ellipsoids.append((pose, partial(ellipsoid, r, coefficients, *self.medium)))
+        if ellipsoids:
+            return tuple(ellipsoids)
         turns = [*(pose.rotation for _, pose in parts), np.eye(3), np.linalg.eigh(inertia.matrix)[1]]
         inner = [turn.T @ inertia.matrix @ turn for turn in turns]  # of equal moments, the axes are those of a geom
         off = [np.abs(matrix - np.diag(np.diag(matrix))).max() < 1e-9 * np.abs(matrix).max() for matrix in inner]
         moments = np.diag(inner[k := (*off[:-1], True).index(True)])
         b = np.sqrt(6 * np.maximum(moments.sum() - 2 * moments, NO_MASS) / inertia.mass)
-        (rho, beta), m, (c, d) = self.medium, b.mean(), (np.roll(b, -1), np.roll(b, -2))
-        linear = np.repeat([np.pi * beta * m**3, 3 * np.pi * beta * m], 3)
-        square = [*(rho / 64 * b * (c**4 + d**4)), *(rho / 2 * c * d)]
-        return ((Pose(inertia.center, turns[k]), [*zip(linear, square, strict=True)]),)
+        return ((Pose(inertia.center, turns[k]), partial(box, b, *self.medium)),)
 
     @staticmethod
     def pose(element: Element) -> Pose:

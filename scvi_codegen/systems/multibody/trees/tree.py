@@ -53,21 +53,21 @@ class Inertia:
 
     Attributes:
         lift: mass whose weight is compensated, and its first moment.
-        drag: poses of bodies in a medium, and the coefficients b1 and b2 of the loads -b1 x - b2 |x| x for each
-            component x of their angular velocity and of their velocity.
+        drag: poses of bodies in a medium, and their torque and force as functions of angular velocity and velocity, in
+            their axes (:mod:`fluid`).
     """
 
     mass: float = 0.0
     center: Vector = field(default_factory=lambda: np.zeros(3))
     matrix: Vector = field(default_factory=lambda: np.zeros((3, 3)))
     lift: tuple[float, Vector] = field(default_factory=lambda: (0.0, np.zeros(3)))
-    drag: tuple[tuple[Pose, Sequence[tuple[float, float]]], ...] = ()
+    drag: tuple[tuple[Pose, Any], ...] = ()
 
     def seen_from(self, pose: Pose) -> Inertia:
         """Return the inertia in the frame in which its own frame has the given pose."""
         turned = pose.rotation @ self.matrix @ pose.rotation.T
         lift = self.lift[0], self.lift[0] * pose.position + pose.rotation @ self.lift[1]
-        drag = tuple((pose @ at, coefficients) for at, coefficients in self.drag)
+        drag = tuple((pose @ at, law) for at, law in self.drag)
         return Inertia(self.mass, pose.position + pose.rotation @ self.center, turned, lift, drag)
 
     def scaled(self, factor: float) -> Inertia:
