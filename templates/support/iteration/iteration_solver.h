@@ -9,7 +9,7 @@
 #include "../newton/library_fallback.h"
 #elif defined(NO_FALLBACK)
 /* No fallback: if the fixed-point iteration fails, the step fails. */
-#define fall_back(status, ...) (status)
+#define fall_back(status, step, dq, dp, options, report, workspace, ...) ((void)(workspace), (status))
 #else
 #include "../newton/newton_from_line.h"
 
