@@ -76,9 +76,17 @@ def room_of(module: str) -> str:
     return module.split(".")[0]
 
 
+def statements(body: list[ast.stmt]) -> Iterator[ast.AST]:
+    """Statements and those within them."""
+    for node in body:
+        yield node
+        for name in ("body", "orelse", "finalbody", "handlers", "cases"):
+            yield from statements(getattr(node, name, []))
+
+
 def imports(tree: ast.Module, *, deep: bool = True) -> Iterator[str]:
     """Dotted names imported anywhere in a module, or, not deep, at its top."""
-    for node in ast.walk(tree) if deep else tree.body:
+    for node in statements(tree.body) if deep else tree.body:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
