@@ -38,8 +38,7 @@ from scvi_codegen.runs.states.validation import (
 from scvi_codegen.runs.states.words import check_doubles, hashed, stacked
 from scvi_codegen.runs.stepping.features import check_together, require
 from scvi_codegen.runs.stepping.integrator import Integrator
-from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise, with_sequences
-from scvi_codegen.runs.stepping.noise_strength import check_strengths
+from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise, check_strengths, with_sequences
 from scvi_codegen.runs.stepping.projection import make_consistent
 from scvi_codegen.runs.stepping.state_functions import neither_or_both
 from scvi_codegen.runs.stepping.step_plan import Adaptive, ErrorControl, KindOfSteps, check_max_step, planned_steps

@@ -31,8 +31,13 @@ from scvi_codegen.runs.states.words import Word, Words, stacked, with_low, word
 from scvi_codegen.runs.stepping.chunks import drive
 from scvi_codegen.runs.stepping.features import require
 from scvi_codegen.runs.stepping.integrator import Integrator
-from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise
-from scvi_codegen.runs.stepping.noise_strength import check_strengths, negative_strength, remark_on_strengths
+from scvi_codegen.runs.stepping.noise import (
+    DEFAULT_NOISE,
+    Noise,
+    check_strengths,
+    negative_strength,
+    remark_on_strengths,
+)
 from scvi_codegen.runs.stepping.projection import check_reachable, singular_position
 from scvi_codegen.runs.stepping.saving import checkpoint
 from scvi_codegen.runs.stepping.step_plan import (
