@@ -446,9 +446,8 @@ class OrbitSearch:
         detects = reversor == "detect"
         for own in Reversor.fitting(state) if detects else [Reversor.of(stepper.coordinates, texts)]:
             guess = guess_of(own)
-            z = np.append((guess[:-1] + own(guess[:-1])) / 2.0, guess[-1])  # in the fixed set
-            if self.of_reversor(own).irreversibility(z) <= REVERSED:
-                return self.of_reversor(own), z
+            if self.of_reversor(own).irreversibility(guess) <= REVERSED:
+                return self.of_reversor(own), np.append((guess[:-1] + own(guess[:-1])) / 2.0, guess[-1])
         tried = "no change of signs that keeps the guess reverses" if detects else "it does not reverse"
         raise StateError(f"reversor={reversor!r}: {tried} the steps of '{stepper.title}'; give a symmetry, or omit it")
 
