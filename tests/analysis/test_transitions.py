@@ -16,9 +16,19 @@ from scvi_codegen.systems.kinks import located_kinks
 
 BOUNCES = [sc.contact("y", slip="x_dot", friction=0.2, restitution=0.5)]
 BELT = [sc.friction("x_dot - 0.3", limit=0.25, static_limit=0.4)]
+SPACE = [sc.contact("z", slip=["x_dot", "y_dot"], friction=0.5, restitution=0.4)]
+HITS = {"complementarity", "impacts of contacts"}
 PLANE = "(x_dot**2 + y_dot**2)/2"
 SYSTEMS: dict[str, tuple[str, str, list[Any], list[float], list[float], set[str]]] = {
-    "bounces": ("x y", f"{PLANE} - 9.81*y - x**2", BOUNCES, [0, 1], [1, 0], {"complementarity", "friction"}),
+    "bounces": ("x y", f"{PLANE} - 9.81*y - x**2", BOUNCES, [0, 1], [1, 0], {"friction"} | HITS),
+    "space": (
+        "x y z",
+        f"{PLANE} + z_dot**2/2 - 9.81*(z - x/3)",
+        SPACE,
+        [0, 0, 0.2],
+        [0.3, 1.5, 0],
+        {"friction"} | HITS,
+    ),
     "belt": ("x", "x_dot**2/2 - x**2/2", BELT, [0], [0.3], {"friction", "closed contacts"}),
     "floor": ("y", "y_dot**2/2 - 9.8*y - 1e3*positive_part(-y)**2", [], [1], [0], {"sides of kinks"}),
     "lens": ("x y", f"{PLANE} - 0.3*unit_step(x) - x**2*(1 + y/9)", [], [-1, 0.2], [1.5, 0.6], {"states at kinks"}),
@@ -52,6 +62,8 @@ def test_runs_with_transitions_are_certified(name: str) -> None:
         ("belt", 0, 0, 1e-9, "closed contacts"),
         ("belt", 0, 0.5, 0, "friction"),
         ("bounces", 0, -1e-9, 0, "complementarity"),
+        ("bounces", 0, 0, 1e-9, "impacts of contacts"),
+        ("space", 0, 0, 1e-9, "impacts of contacts"),
         ("floor", 0, 0.1, 0, "sides of kinks"),
         ("lens", 0, 0, 1e-9, "states at kinks"),
         ("lens", 0, 0, 0, None),

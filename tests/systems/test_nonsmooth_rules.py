@@ -14,7 +14,7 @@
 | zeros of functions of time | test_mode_changes |
 | redundant contacts | test_many_contacts |
 | slip in space: its beginning, small minima | test_contacts (begins); here |
-| static above kinetic friction | test_contacts (belt); here (stops) |
+| static above kinetic friction, starts at the limit | test_contacts (belt); here |
 | first modes, bits of restarts and of ensembles | test_contact_runs (units), test_contacts; here |
 | features | test_jumps, test_features |
 | names of functions and tables | here; refusals, test_tables |
@@ -135,6 +135,18 @@ def test_a_stop_sticks_only_below_the_static_limit(start: float) -> None:
     run = dry.integrate([start], velocity=[0], h=0.1, t_end=25.0)
     assert run.q[-1, 0] == pytest.approx(np.copysign(abs(start) - 0.2 * swings, start * (-1) ** swings), abs=1e-12)
     assert run.contact_modes == [(0.0, ("slip",)), (pytest.approx(swings * np.pi), ("stick",))]
+
+
+@STEPS
+@pytest.mark.parametrize("beyond", [0.0, 1e-16, 1e-14, 1e-12, 1e-10, 1e-9])
+def test_friction_at_its_limit_lets_a_body_go_that_is_pushed_harder(beyond: float, steps: dict[str, float]) -> None:
+    """Within rounding of the limit a body may stick; forces that leave the cone then have no zero."""
+    text, floor = "(x_dot**2 + y_dot**2)/2 - y + x*(f + t)", sc.contact("y", slip="x_dot", friction=1.0)
+    for f, contacts in ((0.1, [sc.contact("y"), sc.friction("x_dot", limit=0.1)]), (1.0, [floor])):
+        run = made(text, "x y", contacts=contacts, f=f).integrate(
+            [0.0, 0.0], velocity=[0.0, 0.0], t_end=1.0, parameters={"f": f * (1 + beyond)}, **steps
+        )
+        assert run.q[-1] == pytest.approx([1 / 6 + f * beyond / 2, 0.0], abs=1e-14)
 
 
 def test_restored_runs_and_members_have_the_modes_and_bits_of_runs() -> None:

@@ -28,6 +28,7 @@ from scvi_codegen.runs.results.saved_states import parameters_on_sides
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.trajectory import Trajectory
+from scvi_codegen.systems.contact import coefficients
 from scvi_codegen.systems.event import Crossings, Kink
 from scvi_codegen.systems.formulas.expressions import Tape
 from scvi_codegen.systems.formulas.symbols import TIME, symbol
@@ -319,6 +320,8 @@ def transition_checks(tested: SystemUnderTest, run: Trajectory) -> Iterator[Chec
             yield from checked(name, statement, partial(_conditions, of, rows_of_kinds))
     statement = "continuous; where L jumps p+ - p- = lambda u_q and H+ - H- = -lambda u_t (60 digits)"
     yield from checked("states at kinks", statement, partial(_states_at_kinks, of))
+    statement = "v_n+ = -e v_n- of a contact alone, with friction at most; v_n+ = 0 if it closes (60 digits)"
+    yield from checked("impacts of contacts", statement, partial(_impacts_of_contacts, of))
     statement = f"order {tested.method.order} in h of the end of a run, and of its balance H - W"
     yield from checked("order across transitions", statement, partial(_order, of))
 
@@ -351,6 +354,29 @@ def _states_at_kinks(of: RunInModes) -> Finding | None:
             jump = np.array([*jump[:m], *(jump[m:-1] - impulse * n[:m]), new - old + impulse * n[-1]])
         errors.append(float(max(abs(jump)) / max(1, *abs(before))))
     return Finding(max(errors), ROUNDED, f"relative, {len(errors)} crossings") if errors else None
+
+
+def _impacts_of_contacts(of: RunInModes) -> Finding | None:
+    """Return the largest violation of the law of impact of contacts that meet alone; with friction v_n+ may be less."""
+    stepper, errors, m = of.run.stepper, list[float](), of.run.stepper.dimension
+    contacts, first = stepper.interface.contacts, len(of.tested.system.constraints) - stepper.interface.masked
+    for _, k, *ends, (old, new) in of.changes:
+        contact, named = getattr(stepper.searched[k], "contact", 0), stepper.parameters_by_name(old)
+        if getattr(stepper.searched[k], "kind", "") != "closes" or any(named[c.closed] for c in contacts if c.closed):
+            continue
+        closed, imposed, rates, size = str(contacts[contact].closed), old.copy(), [], mp.mpf(0)
+        imposed[stepper.interface.parameters.index(closed)] = 1.0
+        motion, row = of.motion(imposed), first + cast(int, contacts[contact].normal)
+        for q, p, t in ((x[:m], x[m:-1], x[-1]) for x in ends):
+            v = motion.velocity(q, p, t)
+            normal, _, terms = motion.constraint_terms(q, v, t)
+            rates.append(terms[2][row])
+            size += np.abs(normal[row]) @ np.abs(v) + abs(terms[2][row])
+        laws = Tape(coefficients(of.tested.system), motion.symbols)([*q, *v, t, *motion.parameters])
+        friction, _, restitution = laws[3 * contact : 3 * contact + 3]
+        excess = rates[1] + (0 if stepper.parameters_by_name(new)[closed] else restitution) * rates[0]
+        errors.append(float((max(excess, -rates[1]) if friction else abs(excess)) / size))
+    return Finding(max(errors), ROUNDED, f"relative to its terms, {len(errors)} impacts") if errors else None
 
 
 def _order(of: RunInModes) -> Finding:

@@ -10,6 +10,8 @@
  * (P. Painleve, C. R. Acad. Sci. 121, 1895; F. Genot & B. Brogliato, Eur. J. Mech. A 18, 1999) or several may be.
  * Impacts obey the same conditions for impulses and velocities (C. Glocker, Set-Valued Force Laws, 2001). Requires:
  * parts/contacts.c.jinja. */
+#define CONTACT_OUTSIDE 1e-9 /* part of its size by which a force may leave its cone: more than CONTACT_ROUNDING */
+#define CONTACT_START 0x1p-40 /* part of a step after its start at which such a mode ends */
 #define CONTACT_MISSED 128.0 /* effects of rounding beyond which a negative gap shows a missed transition */
 
 /* Whether a slip that vanishes along its former direction stops: in space it may pass near 0. */
@@ -156,14 +158,55 @@ static int is_kept(int transition)
   return kind == CONTACT_LEAVES || (kind == CONTACT_CLOSES && !IS_CONDITIONAL[FIRST_TRANSITION + transition]);
 }
 
-/* Fails if a gap is negative at the end of a step in which no transition was found. */
+/* Whether forces are outside of their cone by the function of a transition, beyond rounding of those that alone cancel
+ * the second rates of the contact; without limits on steps, which such forces leave. */
+static int is_outside(const contact_terms *of, int transition, real value)
+{
+  const int k = TRANSITION[transition][0], kind = TRANSITION[transition][1], normal = CONTACTS[k].normal;
+  real size = normal < 0 ? of->coefficient[3 * k + 1] : fabs(of->second[normal] / of->W[normal * (CONTACT_ROWS + 1)]);
+  for (int row = CONTACTS[k].tangential; row >= 0 && row < CONTACTS[k].tangential + CONTACTS[k].slips; row++)
+    size += fabs(of->second[row]) / of->W[row * (CONTACT_ROWS + 1)];
+  size *= CONTACT_OUTSIDE;
+  return kind != CONTACT_CLOSES && kind != CONTACT_LEAVES && kind != CONTACT_STOPS &&
+      value < -(kind == CONTACT_BEGINS ? size * size : size);
+}
+
+/* Ends modes at the start of a step whose forces are outside of their cone there within rounding, and more at its end:
+ * their functions have no zero. */
+static int end_modes_at_start(const event_step *step, const event_sample *right)
+{
+  contact_terms of;
+  int known = 0, status = OK;
+  for (int i = 0; status == OK && i < TRANSITIONS; i++) {
+    const int e = EVENT_FIRST[FIRST_TRANSITION + i];
+    const real before = values_at(step, 0)[e], after = values_at(step, EVENT_DEGREE)[e];
+    event_crossing *crossing = step->found + *step->filled;
+    event_sample start;
+    if (!(before < 0.0 && after < before))
+      continue;
+    status = known ? OK : terms_at(step, right, &of);
+    known = 1;
+    if (status != OK || !is_outside(&of, i, after))
+      continue;
+    status = take_sample(step, e, CONTACT_START, &start);
+    if (status == OK &&
+        (*step->filled == step->room || !place_crossing(step->watch, crossing, step->room)))
+      return EVENT_NO_ROOM;
+    *crossing = (event_crossing){.t = start.t, .fraction = CONTACT_START, .function = FIRST_TRANSITION + i, .direction = -1};
+    copy_state(crossing->q, crossing->p, start.q, start.p);
+    ++*step->filled;
+  }
+  return status;
+}
+
+/* Fails if a gap is negative at the end of a step in which no transition was found, or forces are outside their cone. */
 static int check_gaps(const event_step *step, const event_sample *right)
 {
   contact_terms of;
   real value[EVENTS];
   int doubtful = 0, status = evaluate_functions(step, right, value);
   for (int i = 0; i < TRANSITIONS; i++)
-    doubtful |= is_kept(i) && value[EVENT_FIRST[FIRST_TRANSITION + i]] < 0.0;
+    doubtful |= value[EVENT_FIRST[FIRST_TRANSITION + i]] < 0.0;
   if (status != OK || !doubtful)
     return status;
   memcpy(values_at(step, 0), value, BYTES(EVENTS));
@@ -171,10 +214,10 @@ static int check_gaps(const event_step *step, const event_sample *right)
   if (status == OK)
     status = terms_at(step, right, &of);
   for (int i = 0; status == OK && i < TRANSITIONS; i++) {
-    const int e = EVENT_FIRST[FIRST_TRANSITION + i];
+    const int e = EVENT_FIRST[FIRST_TRANSITION + i], row = CONTACTS[TRANSITION[i][0]].normal;
     const real rounding = CONTACT_MISSED * values_at(step, EVENT_DEGREE + 2)[e] + step->watch->history[e].slack +
-        CONTACT_ROUNDING * of.size[CONTACTS[TRANSITION[i][0]].normal];
-    if (is_kept(i) && value[e] < -rounding) {
+        (row < 0 ? 0.0 : CONTACT_ROUNDING * of.size[row]);
+    if (is_outside(&of, i, value[e]) || (is_kept(i) && value[e] < -rounding)) {
       step->watch->through = FIRST_TRANSITION + i + 1;
       return NOT_CONVERGED;
     }

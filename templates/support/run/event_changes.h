@@ -414,6 +414,10 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       note_rates(step);
 #endif
     step->rounding_known |= !step->watch->started;
+#ifdef EVENT_CONTACTS
+    if (status == OK)
+      status = end_modes_at_start(step, &right);
+#endif
     if (status == OK)
       status = settle_crossings(step, first);
     if (status == NOT_CONVERGED && step->watch->accumulated) {
