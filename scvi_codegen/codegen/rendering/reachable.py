@@ -197,12 +197,8 @@ def _ordered(parts: Sequence[Part]) -> list[Part]:
 
     placing = set[Part]()
     first = [part for part in parts if not part.names]
-    for part in (
-        *first,
-        *(part for name in FIRST for part in parts if name in part.names),
-        *filter(_is_exported, parts),
-        *parts,
-    ):
+    steps = [part for name in FIRST for part in parts if name in part.names]
+    for part in (*first, *steps, *filter(_is_exported, parts), *parts):
         place(part)
     return [*order]
 

@@ -25,10 +25,7 @@ static inline number number_of(double x)
   return lanes_of(x);
 }
 
-static inline lanes lanes_of_number(number x)
-{
-  return x;
-}
+#define lanes_of_number(x) (x)
 
 LANE_BY_LANE(magnitude, fabs);
 LANE_BY_LANE(exponential, exp);
@@ -175,10 +172,7 @@ static inline number total_of(lanes *sums)
 }
 
 /* Change of each trajectory. */
-static inline number total_change(lanes change)
-{
-  return change;
-}
+#define total_change(change) (change)
 
 /* Arguments and report of a batched step. Requires: the header, NAME, STATUS. */
 enum {
