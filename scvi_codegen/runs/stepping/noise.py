@@ -179,7 +179,9 @@ def _strengths(stepper: Any, t: float, parameters: Array, q: Array | None = None
 
 
 def _value(formula: str, values: dict[str, float]) -> float | None:
-    """Return the value of a formula, ``None`` if it contains other names."""
+    """Return the value of a formula, ``None`` if it contains other names or entries of arrays."""
+    if "[" in formula:
+        return None
     evaluate, names = evaluation(formula)
     return evaluate([values[name] for name in names]) if values.keys() >= {*names} else None
 
