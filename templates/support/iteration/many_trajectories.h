@@ -137,8 +137,8 @@ static inline int any_positive(number x)
   return any;
 }
 
-/* Decides about the lanes that have not converged: by is_to_amplify if `amplifies`, else by is_one_stagnant; returns 1 if
- * one of them is 1. */
+/* Decides about the lanes that have not converged, by is_to_amplify if `amplifies`, else by is_one_stagnant; returns 1
+ * if that holds in one of them. */
 static SELDOM int decide_lanes(progress *now, const solver_options *options, int k, int amplifies)
 {
   lane_view last = {now->last}, before = {now->before}, earlier = {now->earlier}, amplified = {now->amplified};
