@@ -1,5 +1,6 @@
 """Largest step of tau for a requested accuracy, and reports of runs that miss it."""
 
+import math
 from functools import cache
 from typing import Any
 
@@ -56,6 +57,17 @@ def test_integrate_runs_in_transformed_time() -> None:
 
 
 @pytest.mark.second
+def test_steps_from_rest_are_as_long_as_those_of_a_motion() -> None:
+    """The first short step from rest is its own curvature, relative to which svi:2 has an error at any step."""
+    system = sc.LagrangianSystem.from_text("vibration", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2")
+    vibration = sc.compile_stepper(system, "svi:2", time_transformation="1/(1 + q**2)")
+    lengths = [largest_step(vibration, [0.3], [p], 0.3, 1e-10) for p in (0.0, 0.2)]
+    assert 0.25 < lengths[0] / lengths[1] < 1
+    run = vibration.integrate([0.3], [0.0], t_end=0.3, error=1e-6)
+    assert len(run) < 300
+    assert abs(run.q[-1, 0] - 0.3 * math.cos(0.3)) < 1e-12
+
+
 def test_unsuitable_time_transformation_is_detected_later() -> None:
     """Slow for hundreds of steps far out, with a rate that hardly changes; then the comet is at the sun."""
     far = [2.0 - 1e-4, 0.0, 0.0, (1e-4 / (2.0 - 1e-4)) ** 0.5]

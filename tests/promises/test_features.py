@@ -138,7 +138,7 @@ def rows_of(run):
 
 OPERATIONS = {
     "adaptive": lambda s: s.integrate(*state_of(s), t_end=0.3),
-    "error": lambda s: s.integrate(*state_of(s), t_end=0.3, error=1e-4),
+    "error": lambda s: s.integrate(*state_of(s), t_end=0.3, error=1e-6),
     "check_growth": lambda s: s.integrate(*state_of(s), t_end=0.3, check_growth=True, **step_of_tau(s)),
     "t_eval": lambda s: run_of(s, steps=None, t_end=0.4, t_eval=[0.1]),
     "observe": lambda s: run_of(s, observe=lambda run: run.energy),

@@ -25,6 +25,8 @@ REFINEMENTS = 4
 MOST_HALVINGS = 60
 ALLOWED = 10.0
 """Factor by which the error of a run may exceed the tolerance of its pilot run."""
+SIZES = "largest_v", "largest_a", "largest_dq", "largest_bend"
+"""Sizes of the motion of a run in its memory in C (``sizes.h``)."""
 
 
 def largest_step(
@@ -63,7 +65,8 @@ def largest_step(
     first = abs(length) if reversible else length
     values = start(h=first, parameters=parameters).parameters
     rate = float(stepper.rates(q, p, values)[0])
-    return _longest(lambda h: _pilot(start(h=h, parameters=values), end), first / rate, bound or ROUND_OFF)
+    sizes: dict[str, list[float]] = {}
+    return _longest(lambda h: _pilot(start(h=h, parameters=values), end, sizes), first / rate, bound or ROUND_OFF)
 
 
 def _longest(pilot: Callable[[float], tuple[float, int]], h: float, allowed: float) -> float:
@@ -88,9 +91,15 @@ def _longest(pilot: Callable[[float], tuple[float, int]], h: float, allowed: flo
 
 
 @without_accuracy_warnings()
-def _pilot(run: Run, end: float) -> tuple[float, int]:
-    """Return the largest error of the first steps of a run, infinite if one fails, and their number."""
+def _pilot(run: Run, end: float, sizes: dict[str, list[float]]) -> tuple[float, int]:
+    """Return the largest error of the first steps of a run, infinite if one fails, and their number.
+
+    Errors are relative to the motions of all pilot runs, ``sizes``: from rest, the motion of a first
+    short step is its own curvature, of which no step is small enough.
+    """
     error, done, fixed = 0.0, 0, isinstance(run.plan, FixedSteps)
+    for name, of_runs in sizes.items():
+        getattr(run._memory, name)[0 : len(of_runs)] = of_runs
     while done < PILOT_STEPS and not run.arrived and not (fixed and (end - run.t) * run._step_size <= 0.0):
         size = max(1, done)
         try:
@@ -100,6 +109,8 @@ def _pilot(run: Run, end: float) -> tuple[float, int]:
         if math.isnan(error):
             raise MethodError(f"{run.stepper.interface.title} has no error estimate: give h")
         done = run.steps
+        if error < 1.0:
+            sizes.update({name: list(getattr(run._memory, name)) for name in SIZES})
     return error, done
 
 
