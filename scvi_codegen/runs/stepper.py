@@ -212,9 +212,8 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             check_together(inputs=inputs, t_eval=t_eval, observe=observe, save_every=stride, error=error)
             if inputs is not None:
                 noise = Noise.checked(stepper, seed, metropolis, inputs=inputs)
-                end = None if h is None else final_time(t, h, steps, t_end)
-                inputs = with_sequences(interface.inputs, inputs, seed, 0, t=t, h=h, t_end=end)
-                inputs = checked_inputs(interface, inputs)
+                end = partial(final_time, t, h, steps, t_end)
+                inputs = checked_inputs(interface, with_sequences(interface.inputs, inputs, seed, t=t, h=h, end=end))
         if interface.rotations or interface.variables:
             q, p, velocity = self._states.start(q, p, velocity)
         if error is not None:

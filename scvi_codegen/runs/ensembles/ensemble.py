@@ -219,7 +219,7 @@ class Ensemble:
         if settings.inputs is not None:
             count = len(layout.members(q, "q"))
             streams = settings.trajectory + np.arange(count)[:, np.newaxis]
-            schedule = {"t": t0, "h": settings.h, "t_end": ends}
+            schedule = {"t": t0, "h": settings.h, "end": lambda: cast(float, ends)}
             given = with_sequences(stepper.interface.inputs, settings.inputs, settings.seed, streams, **schedule)
             inputs = checked_inputs(stepper.interface, given, count)
             check_left_to_inputs(stepper.interface, parameters)

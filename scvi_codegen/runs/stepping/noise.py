@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from typing import Any, NamedTuple
@@ -78,9 +78,16 @@ def normal_numbers(seed: int, trajectory: Any, step: Any, purpose: int, index: i
 
 
 def with_sequences(
-    names: Sequence[str], inputs: Mapping[str, Any], seed: int | None, trajectory: Any, *, t: Any, h: Any, t_end: Any
+    names: Sequence[str],
+    inputs: Mapping[str, Any],
+    seed: int | None,
+    trajectory: Any = 0,
+    *,
+    t: Any,
+    h: Any,
+    end: Callable[[], float],
 ) -> dict[str, Any]:
-    """Return inputs, of coloured noise as values that are held in the steps of h from t to t_end.
+    """Return inputs, of coloured noise as values that are held in the steps of h from t to the time ``end()``.
 
     ``trajectory``: number of the stream, or (k, 1) numbers.
     """
@@ -91,7 +98,7 @@ def with_sequences(
                 raise StateError(
                     f"the input '{name}' is {noise}, which requires fixed steps: give h and steps or t_end"
                 )
-            steps = np.arange(1 + int(steps_within(abs(float(t_end) - float(t)) or abs(h), h)))
+            steps = np.arange(1 + int(steps_within(abs(float(end()) - float(t)) or abs(h), h)))
             key = checked_count(0 if seed is None else seed, "seed", least=0)
             normals = normal_numbers(key, trajectory, steps, COLOURED_INPUT, names.index(name)).real
             times, values = times_after(float(t), h, steps)[0], noise.values(h, normals.T).T
