@@ -218,7 +218,8 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         """Return the largest error of the energy, relative to the largest sum |T| + |E - T| of its absolute parts.
 
         T is p.v/2 where parts are not known, the kinetic energy of quadratic ones: where the energy is 0, too, its
-        parts have a size. Where forces, damping or impacts change the energy, the error is that of E - E0 - W.
+        parts have a size. They are those of saved states, and not below the largest |E| of all. Where forces, damping
+        or impacts change the energy, the error is that of E - E0 - W.
 
         Raises:
             StateError: if the energy changes for another reason, or its work W is unknown: the change is no error.
@@ -230,11 +231,13 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
                 "unknown, so that the change is no error: use energy(). Work requires a method with a curve, L or H "
                 "without time, and at impacts all states (save_every=1)"
             )
-        parts = self.energies[:, :2]
+        parts, energies = self.energies[:, :2], self.energies[:, 2:]
         if not np.isfinite(parts[0, 0]):
             kinetic = 0.5 * np.sum(self.p * self.velocity, axis=-1)
-            parts = np.stack([kinetic, self.energy() - kinetic], axis=1)
-        return float(relative(np.max(np.abs(account.values)), np.max(np.abs(parts).sum(axis=1))))
+            stride = 1 if self.conserved is None else max(1, len(energies) - 1)  # with an observer both ends are saved
+            parts = np.stack([kinetic, self.energy()[::stride] - kinetic], axis=1)
+        size = max(np.max(np.abs(of).sum(axis=1)) for of in (parts, energies))
+        return float(relative(np.max(np.abs(account.values)), size))
 
     @property
     def t_low(self) -> Array:

@@ -16,9 +16,9 @@ CALLS = """
 #include "normals.h"
 void words(uint64_t seed, uint32_t *of) {
   noise_words x;
-  for (int k = 0; k < 4; k++) x[k][0] = of[k];
-  philox(seed, 1, x);
-  for (int k = 0; k < 4; k++) of[k] = x[k][0];
+  for (int k = 0; k < 4; k++) x.of[k][0] = of[k];
+  philox(seed, 1, &x);
+  for (int k = 0; k < 4; k++) of[k] = (uint32_t)x.of[k][0];
 }
 void values(uint32_t high, uint32_t low, double *of) {
   of[0] = uniform_of_words(high, low), of[1] = log_of_uniform(of[0]), cos_and_sin_of_words(high, low, of + 2, of + 3);

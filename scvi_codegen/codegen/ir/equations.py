@@ -455,7 +455,8 @@ class Control:
         stage_growth: factor of the error estimate per level for Newton's method; 0 if there is no estimate.
         density: values of a time transformation at (q, v), or (q, p) of a Hamiltonian; instead of the predictor.
         growth: of errors, measured along runs; ``None`` if it is not.
-        arrays: first and end of the named coordinates of each array of known size, which are to be accurate as a whole.
+        arrays: first and end of the named coordinates of each array of known size, rotation or direction, which are to
+            be accurate as a whole.
         localised: whether forces may be confined to a short time or a small region.
     """
 

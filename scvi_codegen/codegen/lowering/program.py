@@ -196,8 +196,11 @@ def lower(
         layout=Layout(
             coordinates=tuple(Array(q.name, ()) for q in system.coordinates),
             inputs=tuple((name, system.parameters.index(symbol(f"{name}_0"))) for name in system.inputs),
-            whole=tuple(_ranges_of((array for array in system.arrays if array.axes), system)),
-            coupled=tuple(_ranges_of((array for array in system.arrays if array.is_field), system)),
+            whole=(
+                *_ranges_of((array.elements for array in system.arrays if array.axes), system),
+                *_ranges_of((rotation.coordinates for rotation in system.rotations), system),
+            ),
+            coupled=tuple(_ranges_of((array.elements for array in system.arrays if array.is_field), system)),
             **_numbers_of(system),
         ),
         fixed_point=fixed_point,
@@ -275,10 +278,10 @@ def _numbers_of(system: MechanicalSystem) -> dict[str, Any]:
     return {"parameters": tuple(parameter.name for parameter in system.parameters), "defaults": system.defaults}
 
 
-def _ranges_of(arrays: Iterable[Array], system: MechanicalSystem) -> Iterator[tuple[int, int]]:
-    """Yield first and end of the coordinates that are the entries of an array of known size."""
+def _ranges_of(groups: Iterable[Sequence[str]], system: MechanicalSystem) -> Iterator[tuple[int, int]]:
+    """Yield first and end of the coordinates of each group: an array of known size, a quaternion, a direction."""
     names = [q.name for q in system.coordinates]
-    for elements in (array.elements for array in arrays):
+    for elements in groups:
         first = names.index(elements[0]) if elements[0] in names else len(names)
         if names[first : first + len(elements)] == [*elements]:
             yield first, first + len(elements)
