@@ -215,11 +215,11 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         return self._joined(lambda piece: in_modes(piece, piece.stepper._energy_parts))
 
     def energy_error(self) -> float:
-        """Return the largest error of the energy, relative to the largest sum |T| + |E - T| of its absolute parts.
+        """Return the largest error of the energy, relative to the largest sum of its parts, abs(T) + abs(E - T).
 
         T is p.v/2 where parts are not known, the kinetic energy of quadratic ones: where the energy is 0, too, its
-        parts have a size. They are those of saved states, and not below the largest |E| of all. Where forces, damping
-        or impacts change the energy, the error is that of E - E0 - W.
+        parts have a size. They are those of saved states, and not below the largest abs(E) of all. Where forces,
+        damping or impacts change the energy, the error is that of E - E0 - W.
 
         Raises:
             StateError: if the energy changes for another reason, or its work W is unknown: the change is no error.

@@ -20,7 +20,7 @@ FLAGS = ("-std=gnu99", *TUNED_FLAGS, "-w", "-DSCVI_THREADS", "-pthread", "-DSCVI
 
 def ratios(name: str, rounds: int) -> tuple[float, float, float]:
     """Time of the recorded program in milliseconds; relative to it, of the new one and of the recorded one again."""
-    rolled = () if any(word in name for word in ("newton", "ring", "rotors")) else NO_UNROLL_FLAGS
+    rolled = () if any(word in name for word in ("many", "newton", "ring", "rotors")) else NO_UNROLL_FLAGS
     with tempfile.TemporaryDirectory() as place:
         programs = []
         for number, each in enumerate((recorded()[name], program(name), recorded()[name])):

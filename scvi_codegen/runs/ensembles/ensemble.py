@@ -220,8 +220,8 @@ class Ensemble:
             count = len(layout.members(q, "q"))
             streams = settings.trajectory + np.arange(count)[:, np.newaxis]
             schedule = {"t": t0, "h": settings.h, "end": lambda: cast(float, ends)}
-            given = with_sequences(stepper.interface.inputs, settings.inputs, settings.seed, streams, **schedule)
-            inputs = checked_inputs(stepper.interface, given, count)
+            by_name = with_sequences(stepper.interface.inputs, settings.inputs, settings.seed, streams, **schedule)
+            inputs = checked_inputs(stepper.interface, by_name, count)
             check_left_to_inputs(stepper.interface, parameters)
             values = layout.parameters_of_each(parameters, len(layout.members(q, "q")))
             first_end = 0.0 if ends is None else float(ends.flat[0])

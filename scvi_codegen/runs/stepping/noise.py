@@ -26,11 +26,11 @@ WORD = 2**32 - 1
 
 @dataclass(frozen=True, slots=True)
 class ColouredNoise:
-    """Input of runs with fixed steps: stationary noise u with <u(t) u(s)> = sigma^2 e^(-|t - s|/tau).
+    """Input of runs with fixed steps: stationary noise u with <u(t) u(s)> = sigma^2 exp(-abs(t - s)/tau).
 
     It is the process of Ornstein and Uhlenbeck, exact at the steps (D. T. Gillespie, Phys. Rev. E 54 (1996) 2084),
 
-        u_0 = sigma xi_0,   u_(n+1) = E u_n + sigma (1 - E^2)^(1/2) xi_(n+1),   E = e^(-|h|/tau),
+        u_0 = sigma xi_0,   u_(n+1) = E u_n + sigma (1 - E^2)^(1/2) xi_(n+1),   E = exp(-abs(h)/tau),
 
     and constant in step n + 1. The normal xi_n is a function of the seed, the trajectory, n and the input.
 

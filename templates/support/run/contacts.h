@@ -176,7 +176,7 @@ static int is_outside(const contact_terms *of, int transition, real value)
 static int end_modes_at_start(const event_step *step, const event_sample *right)
 {
   contact_terms of;
-  int known = 0, status = OK;
+  int has_terms = 0, status = OK;
   for (int i = 0; status == OK && i < TRANSITIONS; i++) {
     const int e = EVENT_FIRST[FIRST_TRANSITION + i];
     const real before = values_at(step, 0)[e], after = values_at(step, EVENT_DEGREE)[e];
@@ -184,22 +184,23 @@ static int end_modes_at_start(const event_step *step, const event_sample *right)
     event_sample start;
     if (!(before < 0.0 && after < before))
       continue;
-    status = known ? OK : terms_at(step, right, &of);
-    known = 1;
+    status = has_terms ? OK : terms_at(step, right, &of);
+    has_terms = 1;
     if (status != OK || !is_outside(&of, i, after))
       continue;
     status = take_sample(step, e, CONTACT_START, &start);
     if (status == OK &&
         (*step->filled == step->room || !place_crossing(step->watch, crossing, step->room)))
       return EVENT_NO_ROOM;
-    *crossing = (event_crossing){.t = start.t, .fraction = CONTACT_START, .function = FIRST_TRANSITION + i, .direction = -1};
+    *crossing = (event_crossing){.t = start.t, .fraction = CONTACT_START, .direction = -1};
+    crossing->function = FIRST_TRANSITION + i;
     copy_state(crossing->q, crossing->p, start.q, start.p);
     ++*step->filled;
   }
   return status;
 }
 
-/* Fails if a gap is negative at the end of a step in which no transition was found, or forces are outside their cone. */
+/* Fails if a gap is negative at the end of a step without a transition, or forces are outside of their cone. */
 static int check_gaps(const event_step *step, const event_sample *right)
 {
   contact_terms of;
