@@ -155,6 +155,9 @@ def test_json_of_paths_is_that_of_the_model_file_and_of_the_interface():
 def test_json_of_families_is_that_of_the_model_file_and_of_a_file_that_continues():
     words = ("--q", "0", "--amplitude", "0.3", "--stride", "0.2", "--fixed", "p_q", "--method", "svi:4")
     whole = json_of("family", "planar-pendulum", *words, "--count", "4")
+    symmetric = json_of("family", "planar-pendulum", *words, "--count", "2", "--reversor", "detect")
+    for half_way, orbit in zip(symmetric["orbits"], whole["orbits"], strict=False):
+        assert half_way["period"] == pytest.approx(orbit["period"], rel=1e-10)
     text = invoke("systems", "planar-pendulum").stdout.replace("q = [0.5]", "q = [0.0]")
     section = '[family]\namplitude = 0.3\nstride = 0.2\nfixed = "p_q"\ncount = 2\n'
     Path("own.toml").write_text(f"{text}\n{section}")
@@ -168,7 +171,11 @@ def test_json_of_families_is_that_of_the_model_file_and_of_a_file_that_continues
         [orbit["period"] for orbit in whole["orbits"]], rel=1e-9
     )
     assert again["orbits"][-1]["period"] == pytest.approx(4 * ellipk((1 + again["orbits"][-1]["energy"]) / 2), rel=1e-9)
-    for wrong, message in (("until = 3", r"[family] until must be a text, not 3"), ("form = 1", "unknown key 'form'")):
+    for wrong, message in (
+        ("until = 3", r"[family] until must be a text, not 3"),
+        ("form = 1", "unknown key 'form'"),
+        ("reversor = 1", r"[family] reversor must be a text, not 1"),
+    ):
         Path("wrong.toml").write_text(f"{text}\n[family]\n{wrong}\n")
         assert message in invoke("family", "wrong.toml", status=2).output
 

@@ -109,7 +109,7 @@ def _pilot(run: Run, end: float, sizes: dict[str, list[float]]) -> tuple[float, 
         if math.isnan(error):
             raise MethodError(f"{run.stepper.interface.title} has no error estimate: give h")
         done = run.steps
-        if error < 1.0:
+        if error < 1.0:  # a step whose error is its motion has no size
             sizes.update({name: list(getattr(run._memory, name)) for name in SIZES})
     return error, done
 
