@@ -1,4 +1,4 @@
-"""Sphinx configuration: ``python -m sphinx -W docs site`` builds the site without network access.
+"""Sphinx configuration: ``python -m sphinx -W -j auto docs site`` builds the site without network access.
 
 ``-t online`` adds links to the documentation of Python, NumPy, SciPy and SymPy, whose object inventories are fetched.
 """

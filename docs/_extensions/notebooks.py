@@ -120,29 +120,32 @@ def to_markdown(path: Path, results: list[list[dict[str, str]]]) -> str:
 
 
 def setup(app: Any) -> dict[str, Any]:
-    """Begin the notebooks of outdated pages before any page is read, and put the results in their place."""
-    running: dict[str, tuple[Path, subprocess.Popen[str]]] = {}
+    """Run the notebooks of outdated pages before any page is read, and put the results in their place."""
+    pages: dict[str, tuple[Path, str]] = {}
 
-    def begin(app: Any, environment: Any, names: list[str]) -> None:
+    def run(app: Any, environment: Any, names: list[str]) -> None:
+        processes = {}
         for name in names:
             page = Path(environment.doc2path(name))
             match = DIRECTIVE.fullmatch(page.read_text(encoding="utf-8"))
             if match:
                 path = (page.parent / match[1]).resolve()
-                running[name] = path, run_in_process(path)
-
-    def replace(app: Any, name: str, source: list[str]) -> None:
-        if name in running:
-            path, process = running.pop(name)
+                processes[name] = path, run_in_process(path)
+        for name, (path, process) in processes.items():
             output, errors = process.communicate()
             if process.returncode:
                 raise RuntimeError(f"{path.name} failed:\n{errors[-3000:]}")
+            pages[name] = path, output
+
+    def replace(app: Any, name: str, source: list[str]) -> None:
+        if name in pages:
+            path, output = pages[name]
             app.env.note_dependency(str(path))
             source[0] = to_markdown(path, json.loads(output))
 
-    app.connect("env-before-read-docs", begin)
+    app.connect("env-before-read-docs", run)
     app.connect("source-read", replace)
-    return {"parallel_read_safe": False, "parallel_write_safe": True}
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
 
 
 if __name__ == "__main__":
