@@ -3,19 +3,16 @@
 import importlib
 import io
 import math
-import os
 import re
-import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 import sympy
+from browsing import seen_by_firefox
 from printed_formulas import mp, names, trees_of_mathml, value
-from programs import needs
 from sympy import Float, Function, Matrix, Mul, Pow, Rational, Symbol, cos, exp, pi, sin, sqrt, symbols
 
 from scvi_codegen import SCVI, SVI, Gauss, SpectralCollocation, derive, problem
@@ -217,15 +214,6 @@ def screenshot_by_chromium(browser, page, height):
     return picture
 
 
-def screenshot_by_firefox(page, height):
-    """Return a picture of a page by a Firefox of its own profile."""
-    picture = page.with_suffix(".png")
-    options = ["--headless", "--profile", str(page.parent), f"--window-size=1200,{height}"]
-    command = ["firefox", *options, "--screenshot", str(picture), page.as_uri()]
-    subprocess.run(command, check=True, capture_output=True, timeout=240, env={**os.environ, "HOME": str(page.parent)})
-    return picture.read_bytes()
-
-
 @pytest.mark.second
 class TestInABrowser:
     """Formulas in the font that pages bring along, whatever the machine has: ink is counted in a screenshot."""
@@ -234,11 +222,11 @@ class TestInABrowser:
     def pieces(self, request, tmp_path):
         """Return a function from formulas to the numbers of their rows of ink, and the widths of their gaps in em."""
         image = pytest.importorskip("PIL.Image")
-        if request.param == "chromium":
-            screenshot = partial(screenshot_by_chromium, request.getfixturevalue("browser"))
-        else:
-            needs("firefox")
-            screenshot = screenshot_by_firefox
+
+        def screenshot(page: Path, height: int) -> bytes:
+            if request.param == "firefox":
+                return seen_by_firefox(page, height)[0]
+            return screenshot_by_chromium(request.getfixturevalue("browser"), page, height)
 
         def look(*formulas: str) -> list[tuple[int, list[float]]]:
             style = f'{mathematics_font()} math {{ font: 100px "STIX Two Math", serif }} body {{ margin: 0 }}'

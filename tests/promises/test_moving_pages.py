@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browsing import UNREADABLE
+from browsing import UNREADABLE, seen_by_firefox
 
 import scvi_codegen as sc
 from scvi_codegen.codegen.native.building import PORTABLE_FLAGS
@@ -87,8 +87,6 @@ def middle_of(view: Any) -> tuple[float, float]:
     return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
 
 
-@pytest.mark.second
-@pytest.mark.second
 def test_a_page_computes_the_bits_of_python_and_asks_for_nothing(view, pages):
     state = opened(view, pages["figure_eight"], "#.n=1000", 1000)
     model = sc.load_model(DOCS / "motions" / "figure_eight.toml")
@@ -105,6 +103,24 @@ def test_a_page_computes_the_bits_of_python_and_asks_for_nothing(view, pages):
     assert all(url.startswith(("file:", "about:", "data:")) for url in view.asked)
     text = pages["kinks"].read_text(encoding="utf-8").replace("http://www.w3.org/1998/Math/MathML", "")
     assert "://" not in text
+
+
+LOADED_WHEN_RUN = """<script>
+const pending = document.body.appendChild(document.createElement('iframe')).contentDocument;
+pending.open();  // the page is loaded when this is closed
+const waiting = setInterval(() => {
+    if (globalThis.page?.state().steps === 100) { console.log("100 steps"); clearInterval(waiting); pending.close(); }
+}, 20);
+</script></body>"""
+
+
+@pytest.mark.parametrize("name", ["figure_eight", "kinks", "robot"])
+def test_a_page_runs_in_firefox_without_a_message(pages, tmp_path, name):
+    text = pages[name].read_text(encoding="utf-8").replace("</body>", LOADED_WHEN_RUN)
+    (tmp_path / "page.html").write_text(text, encoding="utf-8")
+    picture, messages = seen_by_firefox(tmp_path / "page.html", address="#.n=100")
+    assert len(picture) > 10_000
+    assert messages == ['console.log: "100 steps"']
 
 
 def test_a_link_reproduces_the_bits_after_reversal_and_a_change_of_parameters(view, pages):

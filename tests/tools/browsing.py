@@ -1,13 +1,19 @@
-"""Tests of pages in a headless Chromium: open a file in the size of a phone or a desk, and inspect its layout."""
+"""Tests of pages in a headless Chromium: open a file in the size of a phone or a desk, and inspect its layout.
+Firefox shows a page once: its picture and what it writes to the console.
+"""
 
 import importlib.util
+import os
+import re
 import shutil
+import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
+from programs import needs
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 WIDTHS = {"phone": 390, "desk": 1200}
@@ -100,3 +106,19 @@ def assert_nothing_sticks_out(view: Any) -> None:
     assert view.evaluate(STICKING_OUT, view.width) == []
     assert view.evaluate("document.documentElement.scrollWidth") <= view.width
     assert view.evaluate("innerWidth") == view.width
+
+
+def seen_by_firefox(page: Path, height: int = 900, address: str = "") -> tuple[bytes, list[str]]:
+    """The picture of a page in a Firefox of its own profile, and the messages of the page's scripts and policies."""
+    needs("firefox")
+    picture, profile = page.with_suffix(".png"), page.parent / "firefox"
+    profile.mkdir(exist_ok=True)
+    prints = ("devtools.console.stdout.content", "browser.dom.window.dump.enabled")
+    (profile / "user.js").write_text("".join(f'user_pref("{name}", true);\n' for name in prints), encoding="utf-8")
+    options = ["--headless", "--profile", str(profile), f"--window-size=1200,{height}"]
+    command = ["firefox", *options, "--screenshot", str(picture), page.as_uri() + address]
+    environment = {**os.environ, "HOME": str(profile)}
+    shown = subprocess.run(command, check=True, capture_output=True, text=True, timeout=240, env=environment)
+    # Others are of Firefox itself, which also ends scripts when it quits.
+    own = r"^(?:console\.\w+: (?!services|Remote).*|JavaScript \w+: file:(?!.*terminated by timeout).*)$"
+    return picture.read_bytes(), re.findall(own, shown.stdout + shown.stderr, re.MULTILINE)
