@@ -250,9 +250,8 @@ def _arrays_of(system: MechanicalSystem) -> tuple[str, ...]:
 
 
 def _solver_of(program: Program) -> str:
-    if program.splitting:
-        return "explicit"
-    return "rattle" if program.rattle else "fixed-point" if program.fixed_point else "newton"
+    kinds = {"explicit": program.splitting, "rattle": program.rattle, "fixed-point": program.fixed_point}
+    return next((name for name, part in kinds.items() if part), "newton")
 
 
 class Sources:

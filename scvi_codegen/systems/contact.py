@@ -152,15 +152,15 @@ def slips_of(item: Any) -> tuple[Any, ...]:
     return item.slip if isinstance(item.slip, tuple) else (item.slip,)
 
 
+def _number_or_text(value: Any) -> float | str:
+    return value if isinstance(value, int | float) else str(value)
+
+
 def _table(item: Any) -> dict[str, Any]:
     """Return the table of a contact: its formulas as text, and its numbers."""
     values = {name: getattr(item, name) for name in item.__dataclass_fields__}
     plain = {
-        name: [*map(str, value)]
-        if isinstance(value, tuple)
-        else value
-        if isinstance(value, int | float)
-        else str(value)
+        name: [*map(str, value)] if isinstance(value, tuple) else _number_or_text(value)
         for name, value in values.items()
         if value is not None
     }

@@ -299,7 +299,7 @@ def _twice_integrated(points: Vector, ends: Vector) -> Matrix:
 
 def _with_common_roots(kernel: Kernel) -> Kernel:
     """Return the kernel with inverse roots x^(-k/2) as powers of x^(-1/2), which is computed once for each x."""
-    temporaries, results = (tuple(map(_powers_of_root, each)) for each in (kernel.temporaries, kernel.results))
+    temporaries, results = (tuple(map(_powers_of_root, parts)) for parts in (kernel.temporaries, kernel.results))
     return replace(kernel, temporaries=temporaries, results=results)
 
 

@@ -158,8 +158,8 @@ def correction_of(system: MechanicalSystem, fixed_point: FixedPointIteration) ->
         kernels = system_kernel(twin, "value_lanes", values, u=arguments, purpose=purpose), *integrands
     elif fixed_point.name != "separable":
         return None
-    found = point_derivatives_of(system, fixed_point)
-    return replace(found, in_pairs=kernels) if found else None
+    derivatives = point_derivatives_of(system, fixed_point)
+    return replace(derivatives, in_pairs=kernels) if derivatives else None
 
 
 def _iterated(

@@ -157,7 +157,7 @@ def layout_of(stages: StageSystem, dimension: int) -> UnknownLayout:
     sizes = [None, *sorted({size for size in (*blocks, *rows) if size is not None})]
     numbers = [dimension if size is None else size for size in sizes]
     columns, lines = (
-        {size: tuple(k for k, each in enumerate(items) if each == size) for size in sizes} for items in (blocks, rows)
+        {size: tuple(k for k, own in enumerate(items) if own == size) for size in sizes} for items in (blocks, rows)
     )
     if len({len(places) for group in (columns, lines) for places in group.values()}) > 1:
         counts = ", ".join(
@@ -350,10 +350,11 @@ def _check_symmetry(group: StageGroup, entries: Mapping[tuple[int, int], sympy.E
         symbols = sorted(pair[0].free_symbols | pair[1].free_symbols, key=str)
         terms = [term for entry in pair for term in sympy.Add.make_args(entry)]
         try:
-            one, other, *sizes = Tape([*pair, *terms], symbols)([mp.mpf(k + 3) / (k + 5) for k in range(len(symbols))])
+            arguments = [mp.mpf(k + 3) / (k + 5) for k in range(len(symbols))]
+            derivative, mirrored, *sizes = Tape([*pair, *terms], symbols)(arguments)
         except ArithmeticError:
             continue
-        if abs(one - other) > LARGEST_DIFFERENCE * sum(map(abs, sizes)):  # the terms may cancel
+        if abs(derivative - mirrored) > LARGEST_DIFFERENCE * sum(map(abs, sizes)):  # the terms may cancel
             u = group.arguments
             raise MethodError(
                 f"the results of the stage group '{group.name}' are not the gradient of its scalar: the "

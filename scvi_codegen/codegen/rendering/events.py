@@ -127,9 +127,9 @@ class EventFormulas:
         self.p = [sympy.Dummy() if symbol(name) in taken else symbol(name) for name in interface.momenta]
         self.multipliers = [symbol(name) for name in multiplier_names(interface) if symbol(name) not in taken]
         self.functions = [self._read(event.function, f"event function '{event.function}'") for event in self.events]
-        found = [*zip(self.events, self.functions, strict=True)]
-        sides = {u: symbol(event.mode) for event, u in found if isinstance(event, Kink)}
-        for k, (event, function) in enumerate(found):
+        pairs = [*zip(self.events, self.functions, strict=True)]
+        sides = {u: symbol(event.mode) for event, u in pairs if isinstance(event, Kink)}
+        for k, (event, function) in enumerate(pairs):
             if isinstance(event, Transition):  # with coefficients of the mode of a step
                 steps = parts_of_type(unit_step, function)
                 self.functions[k] = function.xreplace(steps_on_sides(steps, sides))

@@ -85,7 +85,9 @@ class _Macros:
             condition = f"{'!' * (word == 'ifndef')}defined({condition})"
         operator, decides = (" || ", True) if " || " in condition else (" && ", False)
         terms = [self._term(term) for term in condition.split(operator)]
-        return decides if decides in terms else None if None in terms else not decides
+        if decides in terms:
+            return decides
+        return None if None in terms else not decides
 
     def _term(self, term: str) -> bool | None:
         """Return whether a condition on one macro holds; ``None`` if unknown."""

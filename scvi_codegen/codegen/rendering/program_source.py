@@ -655,7 +655,8 @@ def _context(
     kernels = program.kernels if kernels is None else kernels
     fallback, scalars = fallback or ("own" if program.newton else "none"), _scalar_kernels(program, control, kernels)
     growth = control.growth if control else None
-    lanes = beside.lane_kernels if beside else growth.kernels if growth else ()
+    of_growth = growth.kernels if growth else ()
+    lanes = beside.lane_kernels if beside else of_growth
     return {
         "program": program,
         "target": target,

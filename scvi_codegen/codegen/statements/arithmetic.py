@@ -50,9 +50,9 @@ def combine(operator: str, left: Value, right: Value) -> Value:
         return Value(text, 1, uniform, precedence)
     prefix = "dd" if uniform else "ddl"
     if operator == "*" and left.words != right.words:
-        two, one = (left, right) if left.words == 2 else (right, left)
-        factor = f"lanes_of({one.text})" if one.uniform and not uniform else one.text
-        return Value(f"{prefix}_scale({two.widened(uniform).text}, {factor})", 2, uniform)
+        pair, number = (left, right) if left.words == 2 else (right, left)
+        factor = f"lanes_of({number.text})" if number.uniform and not uniform else number.text
+        return Value(f"{prefix}_scale({pair.widened(uniform).text}, {factor})", 2, uniform)
     operands = f"{left.widened(uniform).text}, {right.widened(uniform).text}"
     return Value(f"{prefix}_{NAMES[operator]}({operands})", 2, uniform)
 

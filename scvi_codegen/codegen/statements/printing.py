@@ -93,7 +93,8 @@ class Layout:
     @property
     def number(self) -> str:
         """Type of a value of the trajectory."""
-        return "number" if self.words == 1 else ("ddl" if self.lanes else "dd")
+        pair = "ddl" if self.lanes else "dd"
+        return "number" if self.words == 1 else pair
 
     def type_of(self, quantity: Quantity) -> str:
         """Return the type of a value."""

@@ -278,7 +278,8 @@ class Observation:
 
     def __init__(self, run: Memory, saver: Saver) -> None:
         self.run, self.saver = run, saver
-        self.search = search_of(run.stepper, None if run.ended else run._watch) if run.stepper.searched else None
+        watch = None if run.ended else run._watch
+        self.search = search_of(run.stepper, watch) if run.stepper.searched else None
         run._watch = self.search and self.search.watch
         plan = run.plan
         self.end = plan.t_end if isinstance(plan, Until) else None

@@ -90,7 +90,7 @@ def start_of_ensemble(
     values = stepper._states.parameters_of_each(parameters, len(positions))
     if stepper.interface.constraints:
         if stepper.interface.words == 1:
-            positions, momenta = (np.ascontiguousarray(each) for each in (positions, momenta))
+            positions, momenta = map(np.ascontiguousarray, (positions, momenta))
         if stepper.interface.contacts:
             for k, start in enumerate(zip(positions.copy(), momenta.copy(), values, strict=True)):
                 positions[k], momenta[k] = in_first_modes(stepper, *start[:2], t, start[2])

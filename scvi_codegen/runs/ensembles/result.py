@@ -136,7 +136,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
         divided = changes or (modes is not None and len(modes.t) > 0)  # fixed steps, at changes that are not states
         for number, (good, parameters) in enumerate(parts):
             rows = np.insert(good, 0, good[0] - 1) if number else good  # the state at a breakpoint belongs to both
-            q, p = (self.stepper.named(each[rows, j].copy()) for each in (self.q, self.p))
+            q, p = (self.stepper.named(states[rows, j].copy()) for states in (self.q, self.p))
             pieces.append(
                 trajectory(
                     t=times[rows],
@@ -172,7 +172,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
         steps = f"{self.steps.min()} to {self.steps.max()}" if len(self) else "0"
         size = "adaptive size" if self.h is None else f"size {self.h:g}"
         facts = (
-            ("trajectories", plain(f"{len(self)}: {', '.join(f'{each} {word}' for word, each in counts.items())}")),
+            ("trajectories", plain(f"{len(self)}: {', '.join(f'{count} {word}' for word, count in counts.items())}")),
             ("steps", plain(f"{steps} of {size}")),
             ("states", plain(f"{len(self.t)} of each; q and p of shape {self.q.shape}")),
             ("coordinates", listed(interface.coordinates)),
@@ -238,13 +238,13 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
     def momentum_errors(self) -> Array:
         """Return (n, k, c) changes of the momentum maps since the first state, relative to their largest term."""
 
-        def bounds(wanted: NDArray[np.bool_]) -> Array:
-            found = np.zeros(wanted.shape)
+        def bounds(small: NDArray[np.bool_]) -> Array:
+            terms = np.zeros(small.shape)
             for j, good, parameters in self._with_modes():
-                if wanted[j].any():
+                if small[j].any():
                     states = self.q[good, j], self.p[good, j], self.times[good, j]
-                    found[j] = np.maximum(found[j], self.stepper._momentum_bounds(*states, parameters))
-            return found
+                    terms[j] = np.maximum(terms[j], self.stepper._momentum_bounds(*states, parameters))
+            return terms
 
         return relative_changes(*self._momentum_maps(), bounds)
 
@@ -294,17 +294,17 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
             StateError: if the suffix is unknown, or the format has no units.
             MissingLibraryError: if h5netcdf or zarr is not installed (extra ``data``).
         """
-        suffix, known = Path(path).suffix.lower(), checked_units(units)
+        suffix, units_of = Path(path).suffix.lower(), checked_units(units)
         self._check_common_times()
         check_keeps_words(self.stepper.interface.words, path)
         if suffix in LABELLED:
             check_format(path)
-            write_whole(path, lambda new: LABELLED[suffix].write(self._labelled(known), new))
+            write_whole(path, lambda new: LABELLED[suffix].write(self._labelled(units_of), new))
             return
         write = {".npz": self._write_npz, ".csv": self._write_csv}.get(suffix)
         if write is None:
             raise StateError(f"cannot save an ensemble as {str(path)!r}: use {FORMATS}")
-        if known:
+        if units_of:
             raise StateError(f"{suffix} files cannot store units: use {', '.join(LABELLED)}, or omit units")
         write_atomically(path, write)
 
@@ -328,10 +328,10 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
 
     def _labelled(self, units: Mapping[str, str]) -> Labelled:
         """Return the arrays with named dimensions."""
-        interface, each = self.stepper.interface, ("t", "trajectory")
-        time = {"t": ("t",)} if self.t.ndim == 1 else {"time": each}
-        dimensions: dict[str, tuple[str, ...]] = {**time, "coordinate": ("coordinate",), "energy": each}
-        dimensions |= dict.fromkeys(("q", "p", "velocity"), (*each, "coordinate"))
+        interface, of_states = self.stepper.interface, ("t", "trajectory")
+        time = {"t": ("t",)} if self.t.ndim == 1 else {"time": of_states}
+        dimensions: dict[str, tuple[str, ...]] = {**time, "coordinate": ("coordinate",), "energy": of_states}
+        dimensions |= dict.fromkeys(("q", "p", "velocity"), (*of_states, "coordinate"))
         dimensions |= {"status": ("trajectory",), "steps": ("trajectory",)}
         whole: dict[str, NDArray[Any]] = {
             "coordinate": np.array(interface.coordinates),
@@ -342,12 +342,12 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
             dimensions |= {"parameter": ("parameter",), "parameters": ("trajectory", "parameter")}
             whole |= {"parameter": np.array(interface.parameters), "parameters": self.parameters}
         if interface.map_names:
-            dimensions |= {"symmetry": ("symmetry",), "momentum_map": (*each, "symmetry")}
+            dimensions |= {"symmetry": ("symmetry",), "momentum_map": (*of_states, "symmetry")}
             whole["symmetry"] = np.array(interface.map_names)
         attitudes = named_quantities(interface)
         if attitudes:
             dimensions |= {axis: (axis,) for axis in AXES} | {
-                item.name: (*each, *item.dimensions) for item in attitudes
+                item.name: (*of_states, *item.dimensions) for item in attitudes
             }
             whole |= AXES
         states = {"t": self.t, "time": self.t, "q": self.q, "p": self.p}

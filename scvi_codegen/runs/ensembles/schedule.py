@@ -72,7 +72,8 @@ class CommonSteps:
         self.steps = ends[-1]
         empty_array((self.steps // save_every + 1,))  # rejects numbers of states beyond any memory
         multiples = np.arange(0, self.steps + 1, save_every)
-        self.numbers = multiples if t_end is None else np.union1d(multiples, ends if inputs else ends[-1:])
+        at_ends = ends if inputs else ends[-1:]
+        self.numbers = multiples if t_end is None else np.union1d(multiples, at_ends)
         last = self.segments[-1]
         if words > 1 and t_end is not None and last.end is None and last.steps > 0:  # h is a double: ends at t_end
             start = time_after_steps(last.start, last.h, last.steps - 1)

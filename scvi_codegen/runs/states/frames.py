@@ -22,12 +22,12 @@ def frame_at(interface: Interface, name: str, q: Array, velocity: Array) -> Fram
     places = {own: (link, *map(np.array, place)) for link in links for own, *place in link.frames}
     if name not in places:
         raise StateError(f"there is no frame '{name}' that moves{closest(name, places)} Known: {', '.join(places)}")
-    columns: Any = {x: k for k, x in enumerate(interface.coordinates)} | {each.name: each.columns for each in members}
+    columns: Any = {x: k for k, x in enumerate(interface.coordinates)} | {ball.name: ball.columns for ball in members}
     single = interface.dimension - 4 * len(members)
     along = np.zeros((*q.shape[:-1], single + 3 * len(members) + 1, q.shape[-1]))
     along[..., range(single), range(single)] = 1.0
-    for row, each in zip(range(single, along.shape[-2], 3), members, strict=False):
-        along[..., row : row + 3, each.columns] = velocities_of_body(q[..., np.newaxis, each.columns], np.eye(3))
+    for row, ball in zip(range(single, along.shape[-2], 3), members, strict=False):
+        along[..., row : row + 3, ball.columns] = velocities_of_body(q[..., np.newaxis, ball.columns], np.eye(3))
     along[..., -1, :] = velocity
     moved, turned = _in_world(links, places[name], q[..., np.newaxis, :] + 1j * COMPLEX_STEP * along, columns)
     turns = turned.imag @ np.swapaxes(turned.real, -1, -2) / COMPLEX_STEP

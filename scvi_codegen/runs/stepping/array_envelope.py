@@ -52,7 +52,7 @@ def _has_modes(layout: ArrayLayout) -> bool:
     for term in layout.couplings:
         if any(access.sums or any(place.minus for place in access.places) for _, access in term.slots):
             has_terms, moving = True, [(slot, x.array.name) for slot, x in term.slots if x.array.name in names]
-            pairs = ((a, b) for a, one in moving for b, other in moving if one < other)
+            pairs = ((a, b) for a, array in moving for b, other in moving if array < other)
             if any(term.formula.diff(a, b) != 0 for a, b in pairs):
                 return False
     return has_terms and not layout.tables

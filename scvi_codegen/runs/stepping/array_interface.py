@@ -169,10 +169,10 @@ def sizes_of(arrays: Sequence[tuple[Array, tuple[int, ...]]], names: Sequence[st
     lengths: dict[str, tuple[int, Array]] = {}
     for array, shape in arrays:
         for axis, length in zip(array.axes, shape, strict=True):
-            known, other = lengths.setdefault(axis.name, (length, array)) if axis.name else (axis.number, array)
-            if known != length:
+            before, other = lengths.setdefault(axis.name, (length, array)) if axis.name else (axis.number, array)
+            if before != length:
                 raise StateError(
-                    f"{axis} must be the same in all arrays: it is {length} in {array}, {known} in {other}"
+                    f"{axis} must be the same in all arrays: it is {length} in {array}, {before} in {other}"
                 )
     for name in names:
         if name not in lengths:

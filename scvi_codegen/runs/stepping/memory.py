@@ -252,7 +252,8 @@ class Memory:
             raise StateError(f"invalid saved run: its state is not finite, h = {memory.h:g}")
         count = len(stepper.searched)
         searched = {**dict.fromkeys(EVENT_NUMBERS, (0, count)), "undefined": (-count, count)}
-        numbers = [*((memory, *each) for each in RANGES.items()), *((run._watch, *each) for each in searched.items())]
+        owned = (memory, RANGES), (run._watch, searched)
+        numbers = [(owner, *allowed) for owner, ranges in owned for allowed in ranges.items()]
         for owner, name, (least, most) in numbers:
             if not least <= (value := getattr(owner, name, least)) <= most:
                 raise StateError(f"invalid saved run: {name} is {value}, not a whole number from {least} to {most}")

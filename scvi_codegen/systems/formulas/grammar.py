@@ -367,8 +367,8 @@ class Parser:
         if self.tokens[self.position][:2] == ("operator", "("):
             if name in KINKED:
                 self.refuse(f"'{name}' is a name of this system, not the function {name}(..): rename it", column)
-            known = f"{closest(_FUNCTIONS_ELSEWHERE.get(name, name), FUNCTIONS)} Known: {', '.join(FUNCTIONS)}"
-            self.refuse(f"'{name}' is not a function of the grammar{known}", column)
+            names = f"{closest(_FUNCTIONS_ELSEWHERE.get(name, name), FUNCTIONS)} Known: {', '.join(FUNCTIONS)}"
+            self.refuse(f"'{name}' is not a function of the grammar{names}", column)
         value = self.symbols.get(name, CONSTANTS.get(name))
         if value is None:
             names = ", ".join([*self.symbols, *CONSTANTS])

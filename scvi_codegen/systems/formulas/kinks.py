@@ -104,8 +104,8 @@ def switching_function(u: Expr) -> tuple[Expr, int]:
 
 def steps_on_sides(steps: Iterable[Expr], modes: Mapping[Expr, Expr]) -> dict[Expr, Expr]:
     """Return unit_step(u + mode) of the steps unit_step(u) whose switching functions have a mode, on one side of u."""
-    found = [(step, *switching_function(step.args[0])) for step in steps]
-    return {step: unit_step(step.args[0] + sign * modes[u]) for step, u, sign in found if u in modes}
+    functions = [(step, *switching_function(step.args[0])) for step in steps]
+    return {step: unit_step(step.args[0] + sign * modes[u]) for step, u, sign in functions if u in modes}
 
 
 def wrap(x: Expr, length: Expr) -> Expr:

@@ -202,9 +202,11 @@ class _Search:
         return bool(self.motion.verifying)
 
 
-def _equal(one: Array | None, other: Array | None) -> bool:
+def _equal(space: Array | None, other: Array | None) -> bool:
     """Return whether null spaces are equal up to rounding; those that are unknown are not."""
-    return one is not None and other is not None and one.shape == other.shape and np.allclose(one, other, 1e-6, ZERO)
+    if space is None or other is None or space.shape != other.shape:
+        return False
+    return np.allclose(space, other, 1e-6, ZERO)
 
 
 def _null_space(matrix: Array, sizes: Array) -> Array:

@@ -326,8 +326,9 @@ def summing_action(
         return None
     own = fixed_point.own_tables
     if name == "separable":
-        found = separable_iteration(StepProblem(system, shape), velocities=True)
-        own = (*own, *(table for table in found.own_tables if table.name == "VELOCITY")) if found else own
+        with_velocities = separable_iteration(StepProblem(system, shape), velocities=True)
+        tables = with_velocities.own_tables if with_velocities else ()
+        own = (*own, *(table for table in tables if table.name == "VELOCITY"))
     kernel = system_kernel(system, "integrand_lanes", (scalar,), u=arguments, purpose="L at all points.")
     return replace(fixed_point, own_tables=own, kernels=(*fixed_point.kernels, kernel))
 

@@ -189,7 +189,8 @@ class _Statements:
 
     def _product(self, weight: Number, power: int, factor: str, *, first: bool = False) -> str:
         """Return the product of weight, h^power and factor from the left; h before the weight if it is ``first``."""
-        scale = [] if power == 0 else ["h" if power == 1 else f"({power_of_h(power)})"]
+        powers = {0: [], 1: ["h"]}
+        scale = powers.get(power, [f"({power_of_h(power)})"])
         numbers = [] if weight == 1 else [self._signed(weight)]
         return " * ".join([*scale, *numbers, factor] if first else [*numbers, *scale, factor])
 
@@ -202,8 +203,8 @@ class _Statements:
         text = ""
         for coefficient, factor in terms:
             if coefficient:
-                sign = ("-" if coefficient < 0 else "") if not text else (" - " if coefficient < 0 else " + ")
-                text += sign + self._times(abs(coefficient), factor)
+                minus, plus = (" - ", " + ") if text else ("-", "")
+                text += (minus if coefficient < 0 else plus) + self._times(abs(coefficient), factor)
         return text or "0"
 
     def _times(self, coefficient: Number, factor: str) -> str:
@@ -272,9 +273,9 @@ def _text(kernel: Kernel, target: Target, lanes: Lanes | None, printed: Printed,
         for part in (cut if len(cut) > 1 else ())
     ]
     texts += [
-        text for each in kernel.sums for text in (_text(each.kernel, target, lanes, printed), *_tables(each, target))
+        text for loop in kernel.sums for text in (_text(loop.kernel, target, lanes, printed), *_tables(loop, target))
     ]
-    statements = [*printed(kernel), *(line for each in kernel.sums for line in _Rows(each, real, parameter).lines())]
+    statements = [*printed(kernel), *(line for loop in kernel.sums for line in _Rows(loop, real, parameter).lines())]
     last = ["derivative"] if len(kernel.results) > kernel.values or partials else []
     names = ["u", "t", "parameters", "value", *last]
     unused = ", ".join(f"(void){name}" for name in names if name != "value" and not kernel.uses(name))
@@ -290,20 +291,20 @@ def lane_mass_text(kernel: Kernel, fixed_point: FixedPointIteration | None, lane
     return kernel_text(kernel, target) if lanes.are_points else lane_kernel_text(kernel, fixed_point, lanes)
 
 
-def _tables(each: RolledKernel, target: Target) -> Iterator[str]:
+def _tables(loop: RolledKernel, target: Target) -> Iterator[str]:
     """Yield the constant tables of a loop, and the constants of its rows."""
-    for name, rows in each.tables:
+    for name, rows in loop.tables:
         lines = [list(map(str, row)) for row in rows]
-        yield table(f"static const int {_named(each, name)}[{len(rows)}][{len(rows[0])}]", lines)
-    for name, column in each.columns:
+        yield table(f"static const int {_named(loop, name)}[{len(rows)}][{len(rows[0])}]", lines)
+    for name, column in loop.columns:
         numbers = [target.number(entry.value) for entry in column if isinstance(entry, Constant)]
         places = [str(entry.index) for entry in column if isinstance(entry, Load)]
         kind = target.scalar if numbers else "int"
-        yield table(f"static const {kind} {_named(each, name)}[{len(column)}]", numbers or places)
+        yield table(f"static const {kind} {_named(loop, name)}[{len(column)}]", numbers or places)
 
 
-def _named(each: RolledKernel, name: str) -> str:
-    return f"{each.kernel.name}_{name}".upper()
+def _named(loop: RolledKernel, name: str) -> str:
+    return f"{loop.kernel.name}_{name}".upper()
 
 
 class _Rows(Nest):

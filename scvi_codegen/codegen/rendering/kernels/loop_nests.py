@@ -38,8 +38,12 @@ def count_text(loops: Sequence[Loop]) -> str:
 
 def size_text(size: Size) -> str:
     """Return a size in C."""
-    number = f"{size.number:+d}"
-    return f"size_{size.name}{f' {number[0]} {number[1:]}' if size.number else ''}" if size.name else str(size.number)
+    return f"size_{size.name}{_added(size.number)}" if size.name else str(size.number)
+
+
+def _added(number: int) -> str:
+    """Return a whole number that is added in C, or nothing for 0."""
+    return f" {number:+d}".replace("+", "+ ").replace("-", "- ") if number else ""
 
 
 def sizes_text(layout: Layout, text: str) -> Iterator[str]:
@@ -171,7 +175,8 @@ class Nest:
     def read(self, k: int, slot: Access) -> str:
         """Return the assignment of an argument: an entry of the state, or of a direction."""
         along = k >= len(self.rolled.reads) - self.rolled.along
-        source = ("image_along" if along else "image") if slot.sums else DIRECTION if along else self.source
+        state, direction = ("image", "image_along") if slot.sums else (self.source, DIRECTION)
+        source = direction if along else state
         return f"u[{k}] = {source}[{self.place_in(slot, self.place_of(slot))}];"
 
     def constant(self, k: int, access: Access) -> str:
@@ -382,7 +387,7 @@ class Nest:
         name, offset = f"index_{place.index}", place.base.number
         loop = self.loops[place.index]
         if not offset or not loop.periodic:
-            return name + (f" {'+' if offset > 0 else '-'} {abs(offset)}" if offset else "")
+            return name + _added(offset)
         if loop is self.rolled.loops[-1]:
             return f"{name} + {_shift(place.index, offset)}"
         return f"wrapped_index({name} + {offset}, {size_text(loop.end)})".replace("+ -", "- ")

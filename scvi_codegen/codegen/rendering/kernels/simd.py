@@ -324,18 +324,19 @@ def _vector_function(name: str) -> str:
 def _tables(fixed_point: FixedPointIteration, meaning: Lanes, *, changes: bool) -> Iterator[str]:
     one_each = fixed_point.in_groups and not meaning.are_points
     points = len(fixed_point.guess.abscissae) if one_each else 0
-    for each in (*fixed_point.tables, *(fixed_point.derivatives_tables if changes else ())):
-        yield lane_table(each.name, each.numbers, points, groups=fixed_point.in_groups)
-        if each.in_two_parts:
-            low = tuple(tuple(map(DOUBLE.rest, x)) if each.is_matrix else DOUBLE.rest(x) for x in each.numbers)
-            yield lane_table(f"{each.name}_LOW", low, points, groups=fixed_point.in_groups)
+    for numbers in (*fixed_point.tables, *(fixed_point.derivatives_tables if changes else ())):
+        yield lane_table(numbers.name, numbers.numbers, points, groups=fixed_point.in_groups)
+        if numbers.in_two_parts:
+            low = tuple(tuple(map(DOUBLE.rest, x)) if numbers.is_matrix else DOUBLE.rest(x) for x in numbers.numbers)
+            yield lane_table(f"{numbers.name}_LOW", low, points, groups=fixed_point.in_groups)
 
 
 def lane_table(name: str, numbers: tuple[Number, ...] | NumberTable, points: int = 0, *, groups: bool = True) -> str:
     """Return a table over points: one number for each of ``points``; if 0, vectors, those of a matrix by columns."""
     kind, is_matrix = "double" if points else "lanes", isinstance(numbers[0], tuple)
     if not is_matrix:
-        size = f"[{points}]" if points else "[GROUPS]" if groups else ""
+        of_lanes = "[GROUPS]" if groups else ""
+        size = f"[{points}]" if points else of_lanes
         return table(f"static const {kind} {name}{size}", [print_number(x) for x in numbers[: points or None]])
     rows = [row[:points] for row in numbers[:points]] if points else [*zip(*numbers, strict=True)]
     size = f"[{points}][{points}]" if points else "[POINTS * GROUPS]"
@@ -357,7 +358,7 @@ def _predictor_tables(predictor: AdaptivePredictor) -> Iterator[str]:
     for name, tables in (("INSIDE", predictor.inside), ("ALONE", predictor.alone)):
         yield table(f"static const lanes PREDICTOR_{name}[{len(tables)}]{size}", list(map(_columns, tables)))
     for name, lines in (("LAST", predictor.last), ("BEFORE", predictor.before)):
-        rows = [[f"{{{', '.join(_columns(each))}}}" for each in line] for line in lines]
+        rows = [[f"{{{', '.join(_columns(numbers))}}}" for numbers in line] for line in lines]
         yield table(f"static const lanes PREDICTOR_{name}[{changes}][{changes}]{size}", rows)
 
 

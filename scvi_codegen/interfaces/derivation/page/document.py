@@ -277,8 +277,10 @@ def statements_section(texts: Mapping[str, str]) -> Section:
         "The C of a step is generated from these statements, for all coordinates i, constraints k and nonzero "
         "derivatives e of constraints; A @ x[i] is a sum over the points of a step."
     )
-    listed = (each for title, text in texts.items() for each in (Paragraph(f"{title.capitalize()}:"), Listing(text)))
-    return Section(name="statements", title="Statements", contents=(paragraph, *listed))
+    contents: list[Content] = [paragraph]
+    for title, text in texts.items():
+        contents += Paragraph(f"{title.capitalize()}:"), Listing(text)
+    return Section(name="statements", title="Statements", contents=tuple(contents))
 
 
 COUNTS = re.compile(r" Operations: .*$")
