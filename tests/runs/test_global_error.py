@@ -493,3 +493,18 @@ def test_global_errors_of_linear_systems_are_scale_invariant(power):
     one, other = (stepper.integrate([size], [0.0], t_end=3.0, error=1e-8) for size in (1.0, 2.0**power))
     assert other.confirmation.confirmed
     assert other.global_error == pytest.approx(one.global_error, rel=0.5)
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("precision", ["double", "double-double"])
+def test_a_rod_that_hardly_swings_is_confirmed_in_few_steps(precision):
+    """Its height, 1 - a^2/2, loses the digits that the constraint gives back."""
+    rod = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - g*y", g=9.81, constraints=["x**2 + y**2 - 1"])
+    angle = sc.compile_stepper(lagrange("angle", "u", "u_dot**2/2 + g*cos(u)", g=9.81), "svi:6")
+    stepper = sc.compile_stepper(rod, "svi:4", precision=precision)
+    for swing in (1.0, 1e-3, 1e-5, 1e-7):
+        run = stepper.integrate([math.sin(swing), -math.cos(swing)], velocity=[0.0, 0.0], t_end=3.0, error=1e-8)
+        assert run.confirmation.confirmed
+        assert run.steps < 200
+        u = angle.integrate([swing], [0.0], t_end=3.0, tolerance=1e-14).q[-1, 0]
+        assert abs(float(run.q[-1, 0]) - math.sin(u)) < 1e-8 * swing

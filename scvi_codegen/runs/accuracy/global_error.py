@@ -29,6 +29,7 @@ from scvi_codegen.common.errors import AccuracyWarning, StateError, StepFailedEr
 from scvi_codegen.runs.accuracy.narrow_forces import differences_in_pieces, longest_piece
 from scvi_codegen.runs.accuracy.size import Motion, first_of_groups, momenta_of_velocities, relative, roundoff
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
+from scvi_codegen.runs.stepping.projection import determined_coordinates
 from scvi_codegen.runs.stepping.step_plan import Adaptive, absolute_tolerances
 
 Array = NDArray[np.float64]
@@ -95,7 +96,8 @@ class GlobalError:
         h: step of tau of a run in transformed time, else ``None``.
         t: (n,) times at which the runs were compared: at most 512 of the saved states, where the motion is fast.
         differences: (n,) the largest difference of a position relative to the range of that coordinate over the run, or
-            of a momentum relative to its own or that of its velocity (:mod:`scvi_codegen.runs.accuracy.size`).
+            of a momentum relative to its own or that of its velocity (:mod:`scvi_codegen.runs.accuracy.size`); not of
+            coordinates that constraints determine from others at that time.
         safety: factor of the estimate: 3; where rounding may dominate the error, 12 for two comparisons, 4 for three.
         estimate: this factor times the largest difference, at least ten roundings and the tolerance; meaningless above
             about 0.1, where runs are uncorrelated.
@@ -375,6 +377,7 @@ class Runs:
         size = longest_piece(run, self.motion.end - self.start) * FINER_PIECES**self.examinations
         self.examinations += 1
         apart = np.array([differences_in_pieces(compared, size) for compared in (run, *further)]).max(axis=0)
+        apart[np.isfinite(apart) & ~samples.independent.any(axis=0)] = 0.0
         differences = relative(apart, samples.sizes(len(samples.t), apart)).max()
         if differences <= max(PART_OF_ERROR * self.requested, ROUNDINGS * samples.epsilon):
             return False
@@ -513,7 +516,9 @@ class _Samples:
             states the one where positions or momenta change fastest relative to their sizes, as an error in time has
             the largest effect there.
         kinetic: (k, m) momenta of velocities.
-        errors: (2, k, m) largest differences from other runs, at least the rounding errors of the states.
+        independent: (k, m) whether constraints do not determine a coordinate, and its momentum, from others.
+        errors: (2, k, m) largest differences from other runs, at least the rounding errors of the states; 0 of
+            coordinates that constraints determine.
         steps_of_run: (n,) initial time, and times of all saved states.
         end: last time.
     """
@@ -545,7 +550,10 @@ class _Samples:
             rows = [k for k in np.arange(len(t))[rows] if t[k] not in changed]
         self.t, self.states = t[rows], [vectors[rows] for vectors in states]
         self.epsilon, self.firsts = roundoff(interface.words), first_of_groups(interface, m)
-        self.errors = self.epsilon * np.abs(np.array([np.asarray(vectors) for vectors in self.states]))
+        self.independent = np.ones(self.states[0].shape, bool)
+        for row, t_row, q in zip(self.independent, self.t, self.states[0], strict=True):
+            row[determined_coordinates(trajectory.stepper, np.asarray(q), float(t_row), trajectory.parameters)] = False
+        self.errors = self.epsilon * self.independent * np.abs(np.array([np.asarray(x) for x in self.states]))
         self.motion: Motion | None = None
         q, p = self.states
         self.kinetic = momenta_of_velocities(trajectory.stepper, self.t, q, p, trajectory.parameters)
@@ -563,6 +571,7 @@ class _Samples:
             if some.any():
                 states = other._states_at(self.t[some])
                 differences[:, some] = [abs(x - y[some]) for x, y in zip(states, self.states, strict=True)]
+        differences[:, some] *= self.independent[some]
         np.maximum(self.errors, differences, out=self.errors)
         self.motion = Motion(np.asarray(other.t), other.q, other.p, self.firsts, self.epsilon, self.absolute)
         return bool(np.isfinite(differences).all())

@@ -224,6 +224,30 @@ def _at_unit_velocities(stepper: Integrator, q: Array, t: float, parameters: Par
     return positions, stepper.momentum(positions, unit, t, parameters)
 
 
+def determined_coordinates(stepper: Integrator, q: Array, t: float, parameters: Parameters) -> NDArray[np.intp]:
+    """Return the indices of coordinates that the constraints of positions determine from the others.
+
+    They are those of the largest ``G_ki q_i``, by QR with column pivoting: differences of the others between two states
+    fix theirs, without the rounding errors of large positions, as of the height of a pendulum that hardly swings.
+    """
+    if not stepper.constraints or stepper.dimension > MOST_DENSE:
+        return np.empty(0, np.intp)
+    from scipy.linalg import qr  # imported on use: the core does without SciPy
+
+    try:
+        positions, momenta = _at_unit_velocities(stepper, q, t, parameters)
+        g, rates = constraint_values(stepper, positions, momenta, t, parameters)
+    except StateError:  # velocities have no momenta
+        return np.empty(0, np.intp)
+    weights = ((rates[1:] - rates[0]).T * q)[(g == g[0]).all(axis=0)]  # g of a constraint of velocities is its rate
+    largest = np.abs(weights).max(axis=1)
+    used = np.isfinite(largest) & (largest > 0.0)
+    if not used.any():
+        return np.empty(0, np.intp)
+    (triangle, order) = qr(weights[used] / largest[used, np.newaxis], mode="r", pivoting=True)
+    return np.asarray(order[: np.count_nonzero(np.abs(np.diagonal(triangle)) > DEPENDENT)])
+
+
 def roots_of_masses(stepper: Integrator, q: Array, t: float, parameters: Parameters) -> Array:
     """Return (m,) roots of the masses M_ii = dp_i/dv_i: p_i / sqrt(M_ii) have one unit, the root of that of energies.
 
