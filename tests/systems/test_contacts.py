@@ -668,3 +668,17 @@ def test_stribeck_friction_of_the_size_of_a_slip() -> None:
     assert runs[0].q[-1] == pytest.approx(runs[1].q[-1], abs=1e-11)
     assert [t for t, _ in runs[0].contact_modes] == pytest.approx([t for t, _ in runs[1].contact_modes], abs=1e-11)
     assert runs[1].contact_modes[1] == (pytest.approx(4, abs=1e-14), ("slip",))
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("steps", [{"h": 0.05}, {}])
+def test_a_step_that_fails_names_the_modes_of_contacts(steps: dict[str, float]) -> None:
+    sole = sc.contact("z", slip=["x_dot", "y_dot"], friction=0.5, name="sole")
+    stepper = sc.compile_stepper(
+        sc.LagrangianSystem.from_text("puck", ["x", "y", "z"], "(x_dot**2 + y_dot**2 + z_dot**2)/2 - 9.81*z"),
+        "svi:2",
+        contacts=[sole],
+    )
+    options = sc.SolverOptions(max_iterations=2)
+    with pytest.raises(sc.StepFailedError, match=r"at t = 0 .*Modes of contacts: contact 1 \(sole\): slip"):
+        stepper.integrate([0, 0, 0], velocity=[0.3, 1.5, 0.0], t_end=1.0, options=options, **steps)

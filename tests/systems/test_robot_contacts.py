@@ -141,14 +141,15 @@ STOOL = f"""<mujoco><worldbody><geom type="plane" size="5 5 .1" friction=".8"/>
 
 @pytest.mark.filterwarnings("ignore:a transition has several motions")
 @pytest.mark.rotated
-def test_a_free_body_falls_on_four_feet_and_rests(tmp_path):
+@pytest.mark.parametrize(("steps", "seeds"), [({"h": 0.005}, range(6)), ({"tolerance": 1e-8}, (1, 2, 4))])
+def test_a_free_body_falls_on_four_feet_and_rests(steps, seeds, tmp_path):
     (tmp_path / "stool.xml").write_text(STOOL)
     stepper = sc.compile_stepper(sc.LagrangianSystem.from_mjcf(tmp_path / "stool.xml", contacts="planes"), "svi:2")
-    for seed in range(6):
+    for seed in seeds:
         spin = np.random.default_rng(seed).normal(size=3) / 2
         velocity = {"x_seat": 0.3, "y_seat": 0.1 * seed, "z_seat": 0.0, "omega_seat": spin}
         start = {"x_seat": 0, "y_seat": 0, "z_seat": 0.3, "R_seat": [1, 0, 0, 0]}
-        run = stepper.integrate(start, velocity=velocity, h=0.005, t_end=2.0)
+        run = stepper.integrate(start, velocity=velocity, t_end=2.0, **steps)
         feet = [run.q[:, 2] + run.rotation()[:, 2] @ [x, y, -0.1] - 0.03 for x in (-0.25, 0.25) for y in (-0.15, 0.15)]
         with pytest.warns(sc.EventWarning, match="not unique"):
             normal, *slips = np.moveaxis(run.contact_forces(), -1, 0)

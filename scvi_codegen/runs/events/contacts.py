@@ -45,6 +45,15 @@ def refusal_of(stepper: Integrator, watch: Any, t: float) -> ContactError | None
     return ContactError(message.format(t=t, k=named, value=watch.behind))
 
 
+def modes_in_failure(stepper: Integrator, watch: Any) -> str:
+    """Return a sentence on the closed contacts in which a step failed, empty without any."""
+    contacts = stepper.interface.contacts
+    named = dict(zip(stepper.modes, list(watch.mode), strict=False)) if contacts and watch.begun else {}
+    names = enumerate(mode_names(contacts, named) if named else ())
+    closed = [f"contact {k + 1} ({contacts[k].title}): {name}" for k, name in names if name != "open"]
+    return f". Modes of contacts: {', '.join(closed)}" if closed else ""
+
+
 def check_forward(run: Any) -> None:
     """Raise :class:`ContactError` for a run backward in time with contacts: what slid before it stuck is unknown."""
     backward = run.h < 0.0 if run.h is not None else run.plan.t_end < run.t

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native.options import step_failure
 from scvi_codegen.common.errors import EventError, EventWarning, warn
-from scvi_codegen.runs.events.contacts import check_forward, refusal_of, warn_of_choices
+from scvi_codegen.runs.events.contacts import check_forward, modes_in_failure, refusal_of, warn_of_choices
 from scvi_codegen.runs.results.saved_states import Array, ModeHistory, SavedStates
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.step_plan import Fixed
@@ -180,7 +180,8 @@ class CrossingSearch:
                 texts = {"function": " and ".join(titles[:3]), "changed": changed}
                 t = self.watch.end if name == "chatters" else report.t
                 return EventError(message.format(**texts, t=t, g=behind))
-        return step_failure(status, report, step=step, h=h, failures=self.binding.failures)
+        remark = modes_in_failure(self.stepper, self.watch)
+        return step_failure(status, report, step=step, h=h, remark=remark, failures=self.binding.failures)
 
     def warn_of_accumulation(self) -> None:
         """Issue a :class:`EventWarning` if the run ended where crossings accumulate, and for choices of contacts."""

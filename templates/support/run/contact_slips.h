@@ -10,6 +10,8 @@ enum {
 #define CONTACT_GROWS 0.2 /* .. to that from its beginning .. */
 #define CONTACT_RELAXES 2.0 /* .. and to the relaxation of its direction, for which iterations on stages converge .. */
 #define CONTACT_SHORT 3e-4 /* .. once that is longer than this part of a step */
+#define CONTACT_PACE 0x1p-6 /* least size of an adaptive step for this, relative to the largest so far */
+#define CONTACT_UNSOLVED 0x1p-30 /* relative to that: smaller steps with unsolved parts are not divided further */
 #define CONTACT_TURN 0.866 /* cosine of an angle after which a direction is renewed */
 
 #ifdef CONTACTS_IN_SPACE

@@ -370,6 +370,9 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
   int halvings = 0;
 #endif
   step->whole = step->h = length;
+#ifdef CONTACTS_IN_SPACE
+  step->whole = adaptive ? fmax(length, step->watch->pace) : length;
+#endif
   copy_state(left.q, left.p, before->q, before->p);
   copy_state(right.q, right.p, run->q, run->p);
   status = evaluate_functions(step, &left, values_at(step, 0));
@@ -648,6 +651,9 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
   const event_watch initial = *watch;
   const stored_states to = {states, number, t, q, p, length, iterations};
   int status = OK;
+#ifdef CONTACTS_IN_SPACE
+  real unsolved = INFINITY; /* largest size of an adaptive step after one whose parts were not solved */
+#endif
   memset(report, 0, sizeof *report);
   *filled = 0;
   while (report->steps < steps && !watch->ended && (t_end - run->t) - run->t_low != 0.0) {
@@ -705,7 +711,8 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
     step_control shorter;
     if (control) {
       shorter = *control;
-      shorter.max_step = fmin(shorter.max_step, longest);
+      shorter.max_step = fmin(shorter.max_step, fmin(longest, unsolved));
+      unsolved = INFINITY;
       limited = &shorter;
     }
 #endif
@@ -713,6 +720,8 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
       status = take_step(run, t_end, limited, &step, &size, &count);
     else if (status == OK)
       status = NOT_CONVERGED;
+    if (status == OK && control)
+      watch->pace = fmax(watch->pace, CONTACT_PACE * size);
     if (is_unsolved(status) && !control && leave_slips(&step)) {
       copy_run(run, &before);
       status = take_step(run, t_end, limited, &step, &size, &count);
@@ -724,14 +733,23 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
     if (status == OK)
       status = change_in_step(&before, run, &step, control != NULL, size, count, &to);
     if (status != OK) {
+      int again = 0;
+#ifdef CONTACTS_IN_SPACE /* whose slow slips the iteration on stages may not solve */
+      unsolved = 0.5 * size;
+      again = control && is_unsolved(status) && !watch->refusal && !watch->accumulated && !watch->through &&
+          unsolved > CONTACT_UNSOLVED * watch->pace;
+#endif
       copy_run(run, &before);
       report->stored = kept;
-      if (status == EVENT_NO_ROOM) {
+      if (status == EVENT_NO_ROOM || again) {
         for (long long i = *filled - 1; i >= crossed; i--)
           if (found[i].acted)
             watch->history[FUNCTION_OF(found + i)] = found[i].before;
         *watch = watched;
         *filled = crossed;
+        status = OK;
+        if (again)
+          continue;
         return OK;
       }
       *filled = crossed;
