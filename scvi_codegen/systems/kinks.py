@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 MOST_KINKS = 256
 """Largest number of switching functions that every step is searched for."""
-FORMULAS = ("lagrangian", "hamiltonian", "forces")
+FORMULAS = ("lagrangian", "hamiltonian", "forces", "constraints")
 """Fields of systems with the formulas of their motion."""
 
 

@@ -5,7 +5,7 @@
 | L jumps at u(q, t) = 0: refraction, reflection; at times p is continuous | test_jumps; here |
 | powers that are not whole: order min(2s, k) at fixed steps, 1 < k < 2 refused | here; test_kinks; refusals |
 | fixed steps across located kinks are not symplectic, formulas are; derivatives across kinks | here; test_kinks |
-| constraints have no corners | refusals, test_continuity, test_tables |
+| constraints have no corners; their kinks keep the order | refusals, test_continuity, test_tables; here |
 | kinks in velocities: in forces only; masses with kinks | refusals, test_kinks (drag); here |
 | two surfaces at once, starts on a surface | test_jumps (corners), test_contacts (joint at its limit); here |
 | forces that point to a surface: sliding named, relays accumulate | test_kinks (sliding); here |
@@ -66,6 +66,25 @@ def test_fixed_steps_at_a_power_that_is_not_whole_have_its_order() -> None:
     stepper, counts = made(text, method="svi:4"), 2 ** np.arange(5, 9.1, 0.25)
     errors = [abs(stepper.integrate([1.0], [-1.0], h=3.0 / n, t_end=3.0).q[-1, 0] - run.q[-1, 0]) for n in counts]
     assert -np.polyfit(np.log(counts), np.log(errors), 1)[0] == pytest.approx(2.5, abs=0.7)
+
+
+@pytest.mark.parametrize(("power", "bound"), [("2", 2e-9), ("5/2", 5e-8), ("7/3", 5e-8)])
+def test_constraints_with_kinks_keep_the_order_or_that_of_their_power(power: str, bound: float) -> None:
+    """A bead that slides from a level wire onto y = x^k, against DOP853 for x from x = 0 on."""
+    bead = made("(x_dot**2 + y_dot**2)/2 - y", "x y", "svi:4", constraints=[f"y - positive_part(x)**({power})"])
+    k = eval(power)  # noqa: S307
+
+    def rates(_: float, state: Any) -> list[float]:
+        x, v = np.maximum(state[0], 0.0), state[1]
+        slope, bend = k * x ** (k - 1), k * (k - 1) * x ** (k - 2)
+        return [v, -slope * (1 + bend * v**2) / (1 + slope**2)]
+
+    true = solve_ivp(rates, (0.973, 2), [0, 1], "DOP853", rtol=1e-13, atol=1e-15).y[0, -1]
+    for plan, error in (({}, 1e-12), ({"h": 0.05}, bound)):
+        run = bead.integrate([-0.973, 0], [1, 0], t_end=2.0, **plan)
+        assert (abs(run.q[-1, 0] - true) < error, len(run.switches[0])) == (True, 1)
+    with pytest.raises(sc.SystemDefinitionError, match="constraint .* has no bounded slope where x = 0"):
+        lagrange("bead", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["y - positive_part(x)**(7/4)"])
 
 
 def test_only_formulas_as_they_are_are_symplectic_across_a_kink() -> None:

@@ -44,6 +44,8 @@ OPERATIONS = {
 
 
 LARGEST_UNROLLED_POWER = 64
+VANISHING = sympy.Rational(1, 2**120)
+"""Added to bases of roots that vanish on a side of a kink, so that the rounding error of a root of 0 is 0, not 0/0."""
 
 
 DEEPEST_EXPRESSION = 24
@@ -264,8 +266,13 @@ class _Graph:
         self._read.update(zip(slots, operands, strict=True))
         for slot, operand in zip(slots, operands, strict=True):
             error, rate = errors[operand], value.diff(slot)
+            if operation in ("sqrt", "pow") and any("copysign" in content for content in self._below(operand)):
+                rate = rate.subs(slot, slot + VANISHING)
             if error is not None and rate != 0:
                 yield error if abs(rate) == 1 else self.node(("*", (self._absolute(self.read(rate)), error)))
+
+    def _below(self, k: int) -> list[tuple[str, tuple[int, ...]]]:
+        return [content for j in _order(self, [k]) if isinstance(content := self.nodes[j], tuple)]
 
     def _absolute(self, k: int) -> int:
         content = self.nodes[k]

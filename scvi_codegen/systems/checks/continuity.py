@@ -81,14 +81,17 @@ def jumps_of(
 
 
 def corner_in(formula: Expr, subject: str, moving: Iterable[Symbol], constants: Mapping[Symbol, float]) -> str | None:
-    """Return why a constraint has a corner or a jump, or ``None``."""
+    """Return why a constraint has a corner or a jump, or infinite second derivatives at a kink; ``None`` if neither."""
     if table := table_with_corners(formula):
         return (
             f"{subject} contains {table}, a table whose slope jumps, so that the velocity would jump: give it a degree "
             'of 2 or more and outside="refuse" or "linear"'
         )
-    corner = next(jumps_of(without_tables(formula), moving, constants, first_derivatives=True), None)
-    return corner_message(subject, *corner) if corner else None
+    formula = without_tables(formula)
+    if corner := next(jumps_of(formula, moving, constants, first_derivatives=True), None):
+        return corner_message(subject, *corner)
+    slope = unbounded_slope_of(formula, moving, constants)
+    return slope_message(subject, *slope) if slope else None
 
 
 def unbounded_slope_of(
@@ -238,7 +241,7 @@ def slope_message(subject: str, surface: Expr, term: Expr) -> str:
     return (
         f"the force of {subject} has no bounded slope where {shortened(surface)} = 0: there the second derivatives of "
         f"its term {shortened(term)} are infinite, and motions are not unique. Use powers of abs(..) and "
-        "positive_part(..) that are 1, or 2 and more"
+        "positive_part(..) that are 2 or more (outside of constraints also 1)"
     )
 
 
