@@ -46,7 +46,8 @@ BEHIND = (
 
 JAMMED = (
     "the changes of the state by {function} do not end in the step from t = {t:.17g}: a point is jammed in a corner "
-    "that closes, constraints leave no motion away from it, or the new state crosses zero again. Check then= and where="
+    "that closes, constraints leave no motion away from it, the new state crosses zero again, or impacts are too many "
+    "for a step (a low bounce with a restitution near 1: reduce h, or end the run). Check then= and where="
 )
 
 

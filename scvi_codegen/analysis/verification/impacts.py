@@ -272,10 +272,11 @@ class RunInModes:
         return np.array([(self.values(x + DIFFERENCE * move, parameters) - now) / DIFFERENCE for move in moves]).T
 
     def relative(self, x: Numbers, parameters: Array) -> Array:
-        """Return the values relative to the sum of their terms: derivatives by x times x and its change in a step."""
+        """Return the values relative to their terms: derivatives by x times x, its change in a step, and in the run."""
         q, p = np.split(x[:-1], 2)
         rates = np.array([*np.concatenate(self.motion(parameters).rates(q, p, x[-1])), 1])
-        terms = np.abs(self.derivatives(x, parameters)) @ (np.abs(x) + np.abs(rates * self.run.h))
+        moved = np.ptp(np.hstack([self.run.q, self.run.p]), axis=0) * abs(self.run.h) / np.ptp(self.run.t)
+        terms = np.abs(self.derivatives(x, parameters)) @ (np.abs(x) + np.abs(rates * self.run.h) + np.append(moved, 0))
         return (self.values(x, parameters) / np.where(terms == 0, 1, terms)).astype(float)
 
     @cached_property

@@ -266,13 +266,10 @@ class _Graph:
         self._read.update(zip(slots, operands, strict=True))
         for slot, operand in zip(slots, operands, strict=True):
             error, rate = errors[operand], value.diff(slot)
-            if operation in ("sqrt", "pow") and any("copysign" in content for content in self._below(operand)):
+            if operation in ("sqrt", "pow") and any("copysign" in str(self.nodes[k]) for k in _order(self, [operand])):
                 rate = rate.subs(slot, slot + VANISHING)
             if error is not None and rate != 0:
                 yield error if abs(rate) == 1 else self.node(("*", (self._absolute(self.read(rate)), error)))
-
-    def _below(self, k: int) -> list[tuple[str, tuple[int, ...]]]:
-        return [content for j in _order(self, [k]) if isinstance(content := self.nodes[j], tuple)]
 
     def _absolute(self, k: int) -> int:
         content = self.nodes[k]

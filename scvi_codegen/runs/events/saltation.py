@@ -15,9 +15,10 @@ R and g, which contains multipliers, are differentiated by differences.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,8 @@ from numpy.typing import NDArray
 from scvi_codegen.codegen.native.options import REASONS
 from scvi_codegen.codegen.rendering.source import Interface
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.runs.events.contact_changes import change_at, kept_direction, slip_of
+from scvi_codegen.runs.events.contact_changes import Rows, change_at, kept_direction, slip_of
+from scvi_codegen.runs.results.dense_output import states_at
 from scvi_codegen.runs.results.recomputation import changes_by_events, steps_after
 from scvi_codegen.runs.results.saved_states import parameters_on_sides
 from scvi_codegen.runs.states.times import WHOLE
@@ -42,7 +44,11 @@ if TYPE_CHECKING:
 GRAZING = 2.0**-20
 """Smallest rate of an event function relative to its gradient and the flow; below it rounding dominates 1/rate."""
 GRAZING_IMPACT = 2.0**-36
-"""The same of a contact that closes: impacts of a body that comes to rest are slow."""
+"""The same of a contact that closes under a load: impacts of a body that comes to rest are slow."""
+TOUCH = GRAZING**2
+"""Part of values beside it below which a minimum of abs(g) grazes: g = rate s + s^2/2 has the least value -rate^2/2."""
+SAMPLES, RISES = 17, 4.0
+"""Samples between which a minimum is sought, and least ratio of those beside it: 9 at a graze."""
 SMALL_STEP = 2.0**-15
 """Fraction of a step from which the rate of the flow at a last state is computed."""
 DIFFERENCE = 2.0**-10
@@ -90,6 +96,7 @@ def jumps_within(
     """
     stepper, slides = states.stepper, _directions(states.stepper)
     changes, jumps = (_turns(states, numbers) if slides else {}) | _changes(states, numbers), {}
+    _check_grazes(states, numbers, states.t[[*changes]])
     for k, row in enumerate(numbers.tolist()):
         if row in changes and k:
             jumps[k] = _jump(states, starts, k, row, *changes[row], all_inputs=all_inputs)
@@ -102,6 +109,63 @@ def jumps_within(
         matrix[:, [len(state) + column for column in stepper.mode_columns]] = 0.0
         jumps[0] = Jump(matrix, state)
     return jumps
+
+
+def _check_grazes(states: SavedStates, numbers: NDArray[np.intp], changed: Array) -> None:
+    """Raise :class:`StateError` if a function whose crossings change the state or its rate touches 0 without crossing.
+
+    Derivatives are infinite on the side where it crosses. Zeros of time alone and events with ``where`` are left out.
+    """
+    stepper, first, last = states.stepper, max(numbers[0] - 1, 0), min(numbers[-1] + 2, len(states))
+    own = [event for event in stepper.events for _ in stepper._events_of_entries(event)]
+    events = [*own, *stepper.searched[len(stepper.events) :]]
+
+    def values(t: Array, q: Array, p: Array) -> Array:
+        at = zip(q, p, t.tolist(), strict=True)
+        return np.array([_event_values(stepper, *state, parameters_on_sides(states, state[-1])) for state in at])
+
+    t = states.t[first:last]
+    if not isinstance(states.plan, FixedSteps):  # adaptive steps may be as long as the motion from zero to zero
+        t = np.interp(np.arange(3 * len(t) - 2) / 3.0, np.arange(len(t)), t)
+    g = values(t, *states_at(states, t))
+    size = np.abs(g)
+    least = (size[1:-1] <= np.minimum(size[:-2], size[2:])) & (g[:-2] * g[2:] > 0.0)
+    for row, k in np.argwhere(least).tolist():
+        event, ends, scale = events[k], t[row : row + 3 : 2], size[row : row + 3, k].max()
+        closes = not isinstance(event, Transition) or event.kind == "closes"
+        if np.isin(t[row : row + 3], changed).any() or event.where or not (event.changes_state and closes):
+            continue
+        near = np.array([math.inf, scale])
+        while near.min() > TOUCH * scale and near[[0, -1]].min() >= RISES * near.min() * (len(near) > 2):
+            times = np.linspace(ends[0], ends[1], SAMPLES)
+            near = np.abs(values(times, *states_at(states, times))[:, k])
+            beside = np.clip(near.argmin(), 2, SAMPLES - 3) + np.array([-2, 2])
+            ends, near = times[beside], near[beside[0] : beside[1] + 1]
+        place = Place(states, float(ends.mean()), parameters_on_sides(states, float(ends.mean())), False)
+        if near.min() <= TOUCH * scale and _jumps_at(place, event, k):
+            raise _graze(event, place.t)
+
+
+def _jumps_at(here: Place, event: Event, k: int) -> bool:
+    """Return whether a zero of function k would change the state or its rate at a place, and depends on the state."""
+    states, stepper, name = here.states, here.states.stepper, getattr(event, "mode", None)
+    (q,), (p,) = states_at(states, np.array([here.t]))
+    moved = _event_values(stepper, 2.0 * q + 1.0, 2.0 * p + 1.0, here.t, here.parameters)[k]
+    if name is None or event.is_wall or moved == _event_values(stepper, q, p, here.t, here.parameters)[k]:
+        return name is None or event.is_wall
+    other, h = here.parameters.copy(), SMALL_STEP**2 * abs(states.h)
+    other[stepper.interface.parameters.index(name)] *= -1.0
+    by_size = np.eye(stepper._input_size)[-1:]
+    sides = (here.parameters, other)
+    rates = [stepper._products(q, p, h, here.t, side, states.options, by_size)[0, : 2 * len(q)] for side in sides]
+    return bool(np.linalg.norm(rates[1] - rates[0]) > GRAZING * np.linalg.norm(rates[0]))
+
+
+def _graze(event: Event, t: float) -> StateError:
+    return StateError(
+        f"the event {event.title} is tangent to the run at t = {t:.17g}: derivatives do not exist at a grazing "
+        "crossing, on whose two sides they differ. Change the initial state or a parameter, or end the run before"
+    )
 
 
 def _end_of_part(states: SavedStates, starts: Starts, k: int, row: int) -> Jump:
@@ -262,28 +326,32 @@ def _crossing(
     size, values = len(arrival), None
     if isinstance(event, Transition):
         values = _at_transition(here, event, ends, new_parameters)
-    elif isinstance(event, Kink):
-        values = _at_kink(here, event, ends[0])
     states, t = here.states, here.t
     if values is None:
-        values = _derivatives(states.stepper.known.interface, event)(ends[0], t, here.parameters)
+        formulas = _derivatives(states.stepper.known.interface, event)
+        values = formulas(ends[0], t, here.parameters) if formulas else _at_kink_of_velocities(here, event, ends[0])
     rate = values.gradient[:size] @ arrival + values.gradient[-1]
     steepest, least = np.linalg.norm(values.gradient[:size]) * np.linalg.norm(arrival), GRAZING
-    if isinstance(event, Transition):  # whose gradients by momenta, of multipliers, have another size
+    if isinstance(event, Transition) and not _rises(here, event, ends[0]):
+        # gradients by momenta, of multipliers, have another size
         typical = np.abs(np.diff(np.hstack([states.q, states.p]), axis=0)).mean(axis=0) / np.diff(states.t).mean()
         steepest = np.abs(values.gradient[:size]) @ np.maximum(np.abs(arrival), typical)
         least = GRAZING_IMPACT if event.kind == "closes" else GRAZING
     if not abs(rate) > least * (steepest + abs(values.gradient[-1])):
-        raise StateError(
-            f"the event {event.title} is tangent to the run at t = {t:.17g}: derivatives do not exist at a "
-            "grazing crossing"
-        )
+        raise _graze(event, t)
     return values, float(rate)
 
 
+def _rises(here: Place, event: Transition, state: Array) -> bool:
+    """Return whether a contact closes that would open without forces, of a motion that passes by."""
+    stepper = here.states.stepper
+    normal = stepper.interface.contacts[event.contact].normal
+    return event.kind == "closes" and bool(Rows.at(stepper, state, here.t, here.parameters).second[normal] > 0.0)
+
+
 @lru_cache(maxsize=64)
-def _derivatives(interface: Interface, event: Event) -> Callable[[Array, float, Array], Values]:
-    """Return a function of (q, p), t and parameters that computes the derivatives of an event."""
+def _derivatives(interface: Interface, event: Event) -> Callable[[Array, float, Array], Values] | None:
+    """Return a function of (q, p), t and parameters, derivatives of an event; ``None`` for kinks of velocities."""
     import sympy  # here: slow to import, with the modules that use it
 
     from scvi_codegen.codegen.rendering.events import EventFormulas
@@ -295,6 +363,8 @@ def _derivatives(interface: Interface, event: Event) -> Callable[[Array, float, 
     variables = (*z, *formulas.parameters, time)
     new = dict(zip(indices, values, strict=True))
     others = {*formulas.v, *formulas.multipliers}
+    if isinstance(event, Kink) and formulas.functions[0].free_symbols & others:
+        return None
     if any(index >= len(z) for index in indices) or any(
         formula.free_symbols & others for formula in (*formulas.functions, *values)
     ):
@@ -316,57 +386,46 @@ def _derivatives(interface: Interface, event: Event) -> Callable[[Array, float, 
     return evaluate
 
 
-@lru_cache(maxsize=64)
-def _function_of_velocities(interface: Interface, kink: Kink) -> Callable[..., Any] | None:
-    """Return the function of a kink by (q, p, v), parameters and t; ``None`` if it contains no velocities."""
-    import sympy  # here: slow to import, with the modules that use it
-
-    from scvi_codegen.codegen.rendering.events import EventFormulas
-    from scvi_codegen.systems.formulas.symbols import TIME, symbol
-
-    formulas = EventFormulas(interface, (kink,))
-    (function,) = formulas.functions
-    if function.free_symbols.isdisjoint(formulas.v):
-        return None
-    variables = (*formulas.q, *formulas.p, *formulas.v, *formulas.parameters, symbol(TIME))
-    made: Callable[..., Any] = sympy.lambdify((variables,), [function], cse=True)
-    return made
-
-
 def _at_transition(here: Place, event: Transition, ends: tuple[Array, Array], new_parameters: Array) -> Values:
     """Return the derivatives of a transition of a contact, by differences of sixth order."""
-    stepper, binding = here.states.stepper, here.states.stepper.binding
+    stepper = here.states.stepper
     if event.kind == "turns":
         slip, (q, p) = slip_of(stepper, event.contact), np.split(ends[0], 2)
         gradient = slip(q, p, here.t, here.parameters) @ _differences(slip, here, q, p)
         return Values(gradient, np.eye(len(ends[0]), len(gradient)), ends[0])
-    own = sum(len(stepper._events_of_entries(other)) for other in stepper.events)
-    number = own + stepper.searched.index(event) - len(stepper.events)
+    number = _number(stepper, event)
     change = change_at(stepper, event, *ends, here.t, (here.parameters, new_parameters))
 
     def mapped(q: Array, p: Array, t: float, parameters: Array) -> Array:
         """Return the function of the transition, and the state after it."""
-        values = np.zeros(own + len(stepper.searched) - len(stepper.events))
-        blocks = [binding.pointer(np.ascontiguousarray(part)) for part in (q, p, parameters)]
-        if status := binding.function("event_values")(t, *blocks, binding.pointer(values), binding.workspace()):
-            raise StateError(f"the transition {event.title} at t = {t:.17g} is undefined: {REASONS[status]}")
+        values = _event_values(stepper, q, p, t, parameters)
         return np.append(values[number], change(q, p, t, parameters))
 
     by = _differences(mapped, here, *np.split(ends[0], 2))
     return Values(by[0], by[1:], ends[1])
 
 
-def _at_kink(here: Place, kink: Kink, before: Array) -> Values | None:
-    """Return the derivatives of a kink of velocities, by differences of sixth order; ``None`` for other kinks."""
+def _event_values(stepper: Integrator, q: Array, p: Array, t: float, parameters: Array) -> Array:
+    """Return the functions of all entries of events, then of transitions and kinks."""
+    binding, count = stepper.binding, sum(len(stepper._events_of_entries(own)) - 1 for own in stepper.events)
+    values = np.zeros(count + len(stepper.searched))
+    blocks = [binding.pointer(np.ascontiguousarray(part)) for part in (q, p, parameters)]
+    if status := binding.function("event_values")(t, *blocks, binding.pointer(values), binding.workspace()):
+        raise StateError(f"the functions of events at t = {t:.17g} are undefined: {REASONS[status]}")
+    return values
+
+
+def _number(stepper: Integrator, event: Event) -> int:
+    """Return the index of a transition or kink among all functions."""
+    entries = sum(len(stepper._events_of_entries(own)) - 1 for own in stepper.events)
+    return entries + stepper.searched.index(event)
+
+
+def _at_kink_of_velocities(here: Place, kink: Event, before: Array) -> Values:
+    """Return the derivatives of a kink of velocities, by differences of sixth order."""
     stepper = here.states.stepper
-    function = _function_of_velocities(stepper.known.interface, kink)
-    if function is None:
-        return None
-
-    def value(q: Array, p: Array, t: float, parameters: Array) -> Array:
-        return np.array(function([*q, *p, *stepper.velocity(q, p, t, parameters), *parameters, t]), dtype=float)
-
-    (gradient,) = _differences(value, here, *np.split(before, 2))
+    number = _number(stepper, kink)
+    (gradient,) = _differences(lambda *x: _event_values(stepper, *x)[[number]], here, *np.split(before, 2))
     return Values(gradient, np.eye(len(before), len(gradient)), before)
 
 
