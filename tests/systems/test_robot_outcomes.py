@@ -46,6 +46,7 @@ ROWS: dict[str, tuple[dict[str, str], str | None]] = {
     "replicate": ({"b": B + '<replicate count="3" euler="0 0 1"><geom size=".1" pos="1 0 0"/></replicate>'}, EQUAL),
     "attach": ({"rest": '<worldbody><attach body="a" prefix="p"/></worldbody>'}, EQUAL),
     "medium": (FLUID, EQUAL),
+    "medium, equal moments": (FLUID | {"a": A + '<geom size=".05" euler="1 0 0" mass="0"/>'}, EQUAL),
     "tendon through sites": ({"rest": PATH.format('<site site="s"/>')}, EQUAL),
     "gears": ({"rest": '<actuator><motor joint="x" gear="-20" armature=".01" damping=".1"/></actuator>'}, EQUAL),
     "servo": ({"rest": SERVO}, EQUAL),
@@ -69,7 +70,19 @@ ROWS: dict[str, tuple[dict[str, str], str | None]] = {
     "wind": ({"option": 'wind="1 0 0"'}, "wind='1 0 0', which changes the motion and is not read: remove it"),
     "pulley": ({"rest": PATH.format('<pulley divisor="2"/>')}, "which is read through sites only, without wrapping"),
     "wrapping": ({"rest": PATH.format('<geom geom="ga"/>')}, "which is read through sites only, without wrapping"),
-    "springdamper": ({"a": A.format('springdamper="1 1"')}, "springdamper='1 1', which changes the motion"),
+    "springdamper": (
+        {
+            "compiler": 'settotalmass="3"',
+            "a": '<joint name="x" type="free" springdamper="1 .5"/>',
+            "b": B.format('springdamper=".5 .7" armature=".3" ref=".2" stiffness="1 2" damping="1 2"'),
+            "rest": '<actuator><motor joint="y" gear="2" armature=".1" damping=".2"/></actuator>',
+        },
+        EQUAL,
+    ),
+    "springdamper and rotor of a tendon": (
+        {"a": A.format('springdamper="1 1"'), "rest": PATH.format("").replace("stiffness", "armature")},
+        "has armature, which is not read with the springdamper of 'x'",
+    ),
     "muscle": ({"rest": MUSCLE}, "<muscle> 'muscle' in <body> 'b' is not read as an actuator|general, motor, position"),
     "composite": (
         {"b": B + "<composite/>"},

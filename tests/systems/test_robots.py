@@ -186,11 +186,7 @@ MUJOCO_CHANGES = {
         '<actuator><motor tendon="t" armature="1"/></actuator></mujoco>',
         "which is read of actuators of hinges and slides only",
     ),
-    "spring and damper": (
-        'axis="0 1 0" ref="15"',
-        'axis="0 1 0" springdamper="1 1"',
-        "springdamper='1 1', which changes",
-    ),
+    "spring and damper": ('axis="0 1 0" ref="15"', 'axis="0 1 0" springyield="1"', "springyield='1', which changes"),
     "class twice": ("</default>", '</default><default class="limb"/>', "second of the class 'limb'"),
     "places": ('fromto="', 'pos="0 0 1" fromto="', "has pos and fromto"),
     "place": ('size="0.1 0.2 0.3"', "", "figure.xml:16: <geom> 'geom' in <body> 'torso' has no attribute 'size'"),

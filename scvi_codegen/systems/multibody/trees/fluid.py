@@ -11,7 +11,7 @@ from sympy import Abs, Expr, Matrix, sqrt
 
 from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.multibody.trees.energies import TINY, exact_number, exact_vector
-from scvi_codegen.systems.multibody.trees.tree import Vector
+from scvi_codegen.systems.multibody.trees.tree import Vector, about
 
 
 def box(edges: Vector, rho: float, beta: float, w: Matrix, v: Matrix) -> list[Expr]:
@@ -52,3 +52,16 @@ def ellipsoid(r: Vector, coefficients: Vector, rho: float, beta: float, w: Matri
     force += number(kutta * rho) * area * top / (speed * bottom) * normal.cross(v).cross(v)
     turning = number(np.pi * beta * d**3) + number(rho) * sqrt(drag.dot(drag) + TINY)
     return [*(pull.cross(v) + spin.cross(w) - turning * w), *force]
+
+
+def principal_axes(matrix: Vector) -> Vector:
+    """Return principal axes by Jacobi's rotations from the axes of a matrix, as MuJoCo does, also for equal moments."""
+    turn = np.eye(3)
+    while True:
+        inner = turn.T @ matrix @ turn
+        k = max(range(3), key=lambda axis: abs(inner[axis - 2, axis - 1]))
+        off, apart = inner[k - 2, k - 1], inner[k - 2, k - 2] - inner[k - 1, k - 1]
+        angle = np.arctan2(2 * off * np.copysign(1, apart), abs(apart)) / 2
+        if not (abs(off) > 1e-12 and 1 - np.cos(angle) > 1e-12):
+            return turn
+        turn = turn @ about(np.eye(3)[k], angle)

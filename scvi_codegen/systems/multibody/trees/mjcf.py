@@ -23,12 +23,12 @@ from scvi_codegen.systems.multibody.trees.actuators import Actuator, Range, actu
 from scvi_codegen.systems.multibody.trees.closures import Closure, Coupling, at_reference
 from scvi_codegen.systems.multibody.trees.contacts import Touch
 from scvi_codegen.systems.multibody.trees.document import Element, Unread, checked_limits, root_of
-from scvi_codegen.systems.multibody.trees.fluid import box, ellipsoid
+from scvi_codegen.systems.multibody.trees.fluid import box, ellipsoid, principal_axes
 from scvi_codegen.systems.multibody.trees.geoms import Geom, Pair
 from scvi_codegen.systems.multibody.trees.macros import Macros
 from scvi_codegen.systems.multibody.trees.meshes import inertia_of
 from scvi_codegen.systems.multibody.trees.schema import MJCF, TURN
-from scvi_codegen.systems.multibody.trees.tendons import Tendon
+from scvi_codegen.systems.multibody.trees.tendons import Tendon, mean_inverses
 from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about, named
 
 Sizes = Vector
@@ -71,8 +71,9 @@ PARTS = {"limits": "limits", "friction": "dry friction"}
 SLIDING = 3
 """Dimension of contacts with sliding friction; of higher ones friction opposes rotations, too."""
 ORIENTATIONS = TURN.split()
-NO_MASS = 1e-15
-"""Bodies with less mass are without forces of a medium, and boxes have no smaller sums of moments of inertia."""
+NO_MASS, LIGHT = 1e-15, 1e-14
+"""Bodies with less mass are without forces of a medium, and boxes have no smaller sums of moments of inertia; geoms
+with less than the second have no axes."""
 ACTED, GAINS = ("joint", "jointinparent", "tendon"), {"kp", "kv", "gainprm", "biasprm"}
 AXES = dict(zip("xyz", np.eye(3), strict=True))
 Defaults = dict[str, dict[str, str]]
@@ -93,7 +94,7 @@ def links_of_mjcf(path: str | PathLike[str], parts: Collection[str] = ()) -> tup
     acting = [*model.actuators(tendons := [*model.tendons()])]
     others = [*model.closures()], tendons, [*model.touches()], acting, dict(model.keyframes([x[1] for x in acting]))
     model.unread.warn(root.file)
-    return root.node.get("model") or Path(path).stem, model.scaled(), model.gravity, *others
+    return root.node.get("model") or Path(path).stem, model.completed(), model.gravity, *others
 
 
 def _document(path: Path, around: tuple[Path, ...] = ()) -> Element:
@@ -130,6 +131,7 @@ class _MujocoModel:
         self.meshes: dict[ElementTree.Element, Inertia] = {}
         self.labels = set[str | None]()
         self.joints = dict[str, Element]()
+        self.responses = dict[str, Vector]()
         self.carriers, self.parents = {-1: -1}, dict[int, int]()
         """Of each body, by its link: the moving body that it is fixed to, and the one that this is connected with."""
         self.geoms: list[Geom] = []
@@ -174,6 +176,8 @@ class _MujocoModel:
             low, *high = map(float, tendon.vector("springlength", (-1,), (1, 2)))
             slack = None if low == -1 else (low, high[0] if high else low)
             pull = self.bounds(tendon, "actuatorfrc")
+            if armature and self.responses:
+                tendon.refuse(f"has armature, which is not read with the springdamper of '{min(self.responses)}'")
             yield Tendon(factors, points, stiffness, damping, armature, slack, tendon.name, pull)
 
     def read(self, world: Element) -> None:
@@ -226,7 +230,7 @@ class _MujocoModel:
         carried = Joint(name=name, kind="fixed", pose=pose @ Pose(-anchor))
         fixed = self.carriers[place] < 0 and not self.root.settings.has("settotalmass")  # to the world
         lift = body.number("gravcomp", 0) * (not {"spring", "damper"} <= self.disabled)
-        inertia = Inertia() if fixed else self.bounded(body, self.inertia(body))
+        inertia = Inertia() if fixed else self.bounded(body, sum((part for part, _ in self.inertias(body)), Inertia()))
         lifted = lift * inertia.mass, lift * inertia.mass * inertia.center
         self.links.append(Link(name, parent, carried, replace(inertia, lift=lifted, drag=self.drag(body, inertia))))
         return place
@@ -297,8 +301,7 @@ class _MujocoModel:
                     actuator.refuse("has armature or damping, which is read of actuators of hinges and slides only")
                 joint = self.links[place].joint
                 factor = actuator.vector("gear", (1,), range(1, 7))[0] ** 2
-                added = (factor * b for b in damping)
-                total = tuple(map(sum, zip_longest(joint.damping, added, fillvalue=0.0)))
+                total = _added(joint.damping, [factor * b for b in damping])
                 joint = replace(joint, damping=total, armature=joint.armature + factor * armature)
                 self.links[place] = replace(self.links[place], joint=joint)
 
@@ -438,13 +441,16 @@ class _MujocoModel:
         if joint.choice("actuatorgravcomp", "false", "true") == "true":
             self.compensating.append(joint)
         limits, friction = self.read_limits(joint, "joints", name)
+        stiffness, damping = (self.coefficients(joint, key) for key in ("stiffness", "damping"))
+        if (response := joint.vector("springdamper", (0, 0), (2,))).min() > 0:
+            self.responses[name], damping = response, (0.0, *damping[1:])
         return Joint(
             name=name,
             kind=kind,
             pose=pose,
             axis=frame.rotation @ joint.unit("axis", (0, 0, 1)) if kind in SINGLE else np.zeros(3),
-            damping=self.coefficients(joint, "damping"),
-            stiffness=self.coefficients(joint, "stiffness"),
+            damping=damping,
+            stiffness=stiffness,
             rest=rest * turn,
             armature=joint.number("armature", 0, 0),
             zero=zero * turn if kind in SINGLE else 0.0,
@@ -460,20 +466,18 @@ class _MujocoModel:
         disabled = {"stiffness": "spring", "damping": "damper"}[key] in self.disabled
         return () if disabled else tuple(map(float, values))
 
-    def inertia(self, body: Element) -> Inertia:
-        """Return the inertia of a body, by its inertial or, as ``inertiafromgeom`` says, by its geoms."""
+    def inertias(self, body: Element) -> list[tuple[Inertia, Vector]]:
+        """Return the inertial of a body or, as ``inertiafromgeom`` says, its geoms: inertias and rotations."""
         rule = body.settings.choice("inertiafromgeom", "auto", "true", "false")
         inertials = [*self.contents(body, "inertial")]
         if len(inertials) > 1:
             inertials[1][0].refuse("is the second of its body: one is allowed")
-        if rule == "false" or (rule == "auto" and inertials):
-            return self.inertial(inertials[0][0]).seen_from(inertials[0][1]) if inertials else Inertia()
-        total = Inertia()
-        low, high = body.settings.vector("inertiagrouprange", (0, 5), (2,))
-        for geom, frame in self.contents(body, "geom"):
-            if low <= geom.number("group", 0) <= high:
-                total += self.geom(geom).seen_from(frame)
-        return total
+        of: Callable[[Element], Inertia] = self.inertial
+        parts = inertials
+        if rule == "true" or (rule == "auto" and not inertials):
+            low, high = body.settings.vector("inertiagrouprange", (0, 5), (2,))
+            of, parts = self.geom, [x for x in self.contents(body, "geom") if low <= x[0].number("group", 0) <= high]
+        return [(of(part).seen_from(frame), (frame @ self.pose(part)).rotation) for part, frame in parts]
 
     @staticmethod
     def bounded(body: Element, inertia: Inertia) -> Inertia:
@@ -535,24 +539,23 @@ class _MujocoModel:
         """Return the drag of the ellipsoids of a body in a medium; without any, of the box of its mass and inertia."""
         if not any(self.medium) or inertia.mass < NO_MASS:
             return ()
-        parts = [(part, frame @ self.pose(part)) for part, frame in self.contents(body, "geom", "inertial")]
         ellipsoids: list[tuple[Pose, Any]] = []
-        for geom, pose in parts:
+        for geom, frame in self.contents(body, "geom"):
             if geom.choice("fluidshape", "none", "ellipsoid") == "ellipsoid":
                 if (shape := geom.text("type", "sphere")) not in SHAPES or geom.has("mesh"):
                     geom.refuse(f"is a {shape} with fluidshape='ellipsoid', which is read of {', '.join(SHAPES)}")
                 size = self.size(geom, shape)
                 r = size[[0, 0, -1] if len(size) < 3 else [0, 1, 2]] + (shape == "capsule") * size[0] * AXES["z"]
                 coefficients = geom.vector("fluidcoef", (0.5, 0.25, 1.5, 1, 1), (5,))
-                ellipsoids.append((pose, partial(ellipsoid, r, coefficients, *self.medium)))
+                ellipsoids.append((frame @ self.pose(geom), partial(ellipsoid, r, coefficients, *self.medium)))
         if ellipsoids:
             return tuple(ellipsoids)
-        turns = [*(pose.rotation for _, pose in parts), np.eye(3), np.linalg.eigh(inertia.matrix)[1]]
-        inner = [turn.T @ inertia.matrix @ turn for turn in turns]  # of equal moments, the axes are those of a geom
-        off = [np.abs(matrix - np.diag(np.diag(matrix))).max() < 1e-9 * np.abs(matrix).max() for matrix in inner]
-        moments = np.diag(inner[k := (*off[:-1], True).index(True)])
+        heavy = [turn for part, turn in self.inertias(body) if part.mass > LIGHT]
+        turn = heavy[0] if len(heavy) == 1 else np.eye(3)
+        turn = turn @ principal_axes(turn.T @ inertia.matrix @ turn)
+        moments = np.diag(turn.T @ inertia.matrix @ turn)
         b = np.sqrt(6 * np.maximum(moments.sum() - 2 * moments, NO_MASS) / inertia.mass)
-        return ((Pose(inertia.center, turns[k]), partial(box, b, *self.medium)),)
+        return ((Pose(inertia.center, turn), partial(box, b, *self.medium)),)
 
     @staticmethod
     def pose(element: Element) -> Pose:
@@ -601,13 +604,30 @@ class _MujocoModel:
             return np.column_stack([x, np.cross(z, x), z])
         return _shortest_turn(element.unit("zaxis")) if kind else np.eye(3)
 
-    def scaled(self) -> list[Link]:
-        """Return the links, with inertias scaled to ``settotalmass``."""
-        total = self.root.settings.number("settotalmass", -1)
-        masses = sum(link.inertia.mass for link in self.links)
-        if total <= 0 or masses == 0:
-            return self.links
-        return [replace(link, inertia=link.inertia.scaled(total / masses)) for link in self.links]
+    def completed(self) -> list[Link]:
+        """Return the links, with inertias scaled to ``settotalmass``, and with the springs of ``springdamper``.
+
+        With the time constant t, the damping ratio z, and the mean m of the diagonal of M^-1 in the reference
+        configuration over the rates of a joint, the stiffness is 1/(m t^2 z^2) and the damping 2/(m t).
+        """
+        total, links = self.root.settings.number("settotalmass", -1), self.links
+        masses = sum(link.inertia.mass for link in links)
+        if total > 0 and masses:
+            links = [replace(link, inertia=link.inertia.scaled(total / masses)) for link in links]
+        on = [flag not in self.disabled for flag in ("spring", "damper")]
+        for k, m in mean_inverses(links, self.responses):
+            joint, (t, z) = links[k].joint, self.responses[links[k].joint.label]
+            stiffness, damping = (
+                (on[0] / (m * t**2 * z**2), *joint.stiffness[1:]),
+                _added(joint.damping, [2 * on[1] / (m * t)]),
+            )
+            links[k] = replace(links[k], joint=replace(joint, stiffness=stiffness, damping=damping))
+        return links
+
+
+def _added(first: Sequence[float], second: Sequence[float]) -> tuple[float, ...]:
+    """Return the sum of coefficients by power."""
+    return tuple(a + b for a, b in zip_longest(first, second, fillvalue=0.0))
 
 
 def _unit(element: Element) -> float:

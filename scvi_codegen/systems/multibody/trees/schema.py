@@ -101,9 +101,10 @@ MJCF = {
     "attach": Kind("model body frame prefix"),
     "inertial": Kind(f"pos {TURN} mass diaginertia fullinertia"),
     "joint": Kind(
-        "name class type pos axis ref stiffness springref damping armature frictionloss limited range actuatorgravcomp",
+        "name class type pos axis ref stiffness springref damping springdamper armature frictionloss limited range "
+        "actuatorgravcomp",
         f"{SENSELESS} actuatorfrcrange actuatorfrclimited",
-        {"springdamper": "0", "springyield": "0"},
+        {"springyield": "0"},
         defaults="joint",
     ),
     "freejoint": Kind("name", "align group"),

@@ -1,17 +1,25 @@
 """Tendons: springs, dampers and rotors on linear combinations of coordinates or on paths through points of links."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+import numpy as np
 from sympy import Abs, Add, Expr, Matrix, S, sqrt
 
 from scvi_codegen.systems.formulas.expressions import derivative_along, evaluate, gradient
 from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.formulas.kinks import positive_part
-from scvi_codegen.systems.formulas.symbols import DOT, symbol
+from scvi_codegen.systems.formulas.symbols import DOT, default_momenta, symbol
 from scvi_codegen.systems.multibody.trees.closures import frames_in_common
-from scvi_codegen.systems.multibody.trees.energies import exact_number, integral, position_of, rotation_of
+from scvi_codegen.systems.multibody.trees.energies import (
+    Tree,
+    dual_energy,
+    exact_number,
+    integral,
+    position_of,
+    rotation_of,
+)
 from scvi_codegen.systems.multibody.trees.tree import SINGLE, Link, Pose
 from scvi_codegen.systems.rotations.points import torque_of
 
@@ -73,9 +81,27 @@ def rate_of(links: Sequence[Link], length: Expr) -> Expr:
 
 def _relaxed(links: Sequence[Link], length: Expr) -> float:
     """Return the length where the springs of joints are relaxed."""
-    values: dict[Expr, float] = {}
+    return _evaluated(links, length, {symbol(link.joint.name): link.joint.rest for link in links})
+
+
+def mean_inverses(links: Sequence[Link], labels: Collection[str]) -> Iterator[tuple[int, float]]:
+    """Yield links, and the means of the diagonal of M^-1 over the rates of their joints, of these labels.
+
+    They are those at the pose of the file. An entry is twice the energy T(q, p) of a momentum of 1.
+    """
+    energy = dual_energy(Tree(links, np.zeros(3))) if labels else S.Zero
+    values = {symbol(link.joint.name): link.joint.zero for link in links}
+    for k, joint in enumerate(link.joint for link in links if energy != 0):
+        names = [joint.name] if joint.kind in SINGLE else position_of(joint) if joint.kind == "free" else []
+        momenta = [*map(symbol, default_momenta(names)), *(() if joint.kind in SINGLE else rotation_of(joint).rates)]
+        if joint.kind != "fixed" and joint.label in labels:
+            yield k, 2 * sum(_evaluated(links, energy, values | {p: 1.0}) for p in momenta) / len(momenta)
+
+
+def _evaluated(links: Sequence[Link], expression: Expr, values: dict[Expr, float]) -> float:
+    """Return the value of an expression at the pose of the file of rotations and free bodies; other symbols are 0."""
     for joint in (link.joint for link in links):
         turn = joint.pose.rotation.flat if joint.kind == "free" else Pose().rotation.flat
-        values |= {symbol(joint.name): joint.rest} | dict(zip(rotation_of(joint).entries, turn, strict=True))
+        values = values | dict(zip(rotation_of(joint).entries, turn, strict=True))
         values |= zip(map(symbol, position_of(joint)), joint.pose.position, strict=True)
-    return float(evaluate(length, {each: float(values[each]) for each in length.free_symbols}))
+    return float(evaluate(expression, {each: float(values.get(each, 0)) for each in expression.free_symbols}))
