@@ -130,7 +130,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         tables: Mapping[str, ArrayLike] | None = None,
         threads: int | None = None,
         action: bool = False,
-        seed: int | None = None,
+        seed: int = 0,
         metropolis: bool = False,
     ) -> Trajectory:
         """Integrate ``steps`` steps of h, or to t_end, and save every ``save_every``-th state and the initial one.
@@ -205,13 +205,12 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         if type(save_every) is not int or save_every != 1:
             save_every = checked_count(save_every, "save_every", least=1)
         stepper = self if events is None and not action else self._for_run(events, action=action)
-        interface = self.interface
+        interface, noise = self.interface, Noise.checked(stepper, seed, metropolis, inputs=inputs)
         if not (inputs is None and t_eval is None and observe is None and tables is None and threads is None):
             self._check_not_of_run(tables, threads)
             stride = None if save_every == 1 else save_every
             check_together(inputs=inputs, t_eval=t_eval, observe=observe, save_every=stride, error=error)
             if inputs is not None:
-                noise = Noise.checked(stepper, seed, metropolis, inputs=inputs)
                 end = partial(final_time, t, h, steps, t_end)
                 inputs = checked_inputs(interface, with_sequences(interface.inputs, inputs, seed, t=t, h=h, end=end))
         if interface.rotations or interface.variables:
@@ -246,7 +245,6 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             times = None if t_eval is None else stepper._output_times(t_eval, t, plan, count)
             output = Output(save_every, times, observe, progress)
         initial = tuple.__new__(InitialData, (q, p, velocity, t, parameters, options))  # without a call of Python
-        noise = Noise.checked(stepper, seed, metropolis) if inputs is None else noise
         return stepper._integrated(initial, plan, count, output, segments, check_growth, noise)
 
     def _integrated(
@@ -333,7 +331,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         options: SolverOptions | None = None,
         tables: Mapping[str, ArrayLike] | None = None,
         threads: int | None = None,
-        seed: int | None = None,
+        seed: int = 0,
         metropolis: bool = False,
     ) -> Run:
         """Return a run from (q, p), or q and a velocity, at t, with fixed steps h or adaptive steps to t_end.
@@ -462,7 +460,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         device: str | None = None,
         action: bool = False,
         observe: str | None = None,
-        seed: int | None = None,
+        seed: int = 0,
         metropolis: bool = False,
     ) -> EnsembleTrajectory:
         """Run k trajectories on all cores, with common fixed steps (SIMD lanes) or with adaptive steps for each.

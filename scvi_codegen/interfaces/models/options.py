@@ -228,7 +228,7 @@ class RunOptions:
         common=False,
     )
     action: bool = run_option("run", SWITCH, "", "Sum the action along the run.", default=False, common=False)
-    seed: int | None = run_option("run", COUNT, "N", "Key of the noise of a heat bath [0].", common=False)
+    seed: int = run_option("run", COUNT, "N", "Key of the noise of a heat bath [0].", default=0, common=False)
     metropolis: bool = run_option(
         "run", SWITCH, "", "Accept or reject each step in a heat bath.", default=False, common=False
     )

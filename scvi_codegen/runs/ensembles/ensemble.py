@@ -119,7 +119,7 @@ class EnsembleSettings:
     error: float | None = None
     device: str | None = None
     observe: str | None = None
-    seed: int | None = None
+    seed: int = 0
     metropolis: bool = False
     trajectory: int = 0
 
@@ -283,6 +283,6 @@ class Ensemble:
             self.settings, parameters=self.parameters[part], inputs=inputs_of_slice(self.inputs, part) or None
         )
         in_bath = self.stepper.interface.temperature is not None
-        seed = settings.seed if in_bath else None  # the inputs are values
+        seed = settings.seed if in_bath else 0  # the inputs are values
         settings = replace(settings, seed=seed, trajectory=self.noise.trajectory + part.start)
         return settings if self.fixed is not None else replace(settings, t_end=self.ends[part])

@@ -80,7 +80,7 @@ def normal_numbers(seed: int, trajectory: Any, step: Any, purpose: int, index: i
 def with_sequences(
     names: Sequence[str],
     inputs: Mapping[str, Any],
-    seed: int | None,
+    seed: int,
     trajectory: Any = 0,
     *,
     t: Any,
@@ -99,8 +99,9 @@ def with_sequences(
                     f"the input '{name}' is {noise}, which requires fixed steps: give h and steps or t_end"
                 )
             steps = np.arange(1 + int(steps_within(abs(float(end()) - float(t)) or abs(h), h)))
-            key = checked_count(0 if seed is None else seed, "seed", least=0)
-            normals = normal_numbers(key, trajectory, steps, COLOURED_INPUT, names.index(name)).real
+            normals = normal_numbers(
+                checked_count(seed, "seed", least=0), trajectory, steps, COLOURED_INPUT, names.index(name)
+            ).real
             times, values = times_after(float(t), h, steps)[0], noise.values(h, normals.T).T
             if h < 0:  # the value of each step at the earlier end
                 times, values = times[::-1], np.roll(values[..., ::-1], -1, axis=-1)
@@ -117,26 +118,21 @@ class Noise(NamedTuple):
 
     @classmethod
     def checked(
-        cls,
-        stepper: Any,
-        seed: int | None,
-        metropolis: bool,
-        trajectory: int = 0,
-        inputs: Mapping[str, Any] | None = None,
+        cls, stepper: Any, seed: int, metropolis: bool, trajectory: int = 0, inputs: Mapping[str, Any] | None = None
     ) -> Noise:
         """Return the stream of these arguments of a run; raise an error for those that the stepper excludes."""
-        if seed is None and not metropolis and not trajectory:
+        if type(seed) is int and seed == 0 and not metropolis and not trajectory:
             return DEFAULT_NOISE
         interface = stepper.interface
         coloured = any(isinstance(value, ColouredNoise) for value in (inputs or {}).values())
-        if interface.temperature is None and ((seed is not None and not coloured) or metropolis):
-            raise StateError(f"{'metropolis' if seed is None else 'seed'}= {NO_BATH} '{interface.system}'")
+        if interface.temperature is None and ((seed != 0 and not coloured) or metropolis):
+            raise StateError(f"{'metropolis' if metropolis else 'seed'}= {NO_BATH} '{interface.system}'")
         if metropolis and (interface.changes_energy != BATH_ENERGY or "symmetric" not in interface.notes):
             raise MethodError(
                 f"metropolis=True is not available for '{interface.title}' ({', '.join(interface.notes)}; "
                 f"{interface.changes_energy}): it requires a symmetric method and no forces, inputs and time; omit it"
             )
-        return cls(checked_count(0 if seed is None else seed, "seed", least=0), trajectory, metropolis)
+        return cls(checked_count(seed, "seed", least=0), trajectory, metropolis)
 
     def store(self, memory: Any) -> None:
         """Set the stream of a run that starts, in C."""
