@@ -11,6 +11,7 @@ from samples import QUICK_FLAGS
 from scipy.linalg import expm, solve_discrete_lyapunov
 
 import scvi_codegen as sc
+from scvi_codegen.codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.runs.stepping.noise import normal_numbers
 
 MASS = np.array([[1, 0.5, 0], [0.5, 2, 0], [0, 0, 1]])
@@ -144,6 +145,49 @@ def test_lanes_have_the_bits_of_single_runs_and_return_to_the_state_before_a_fai
     assert (others.q[1:20] != runs.q[1:20, ::-1]).any(axis=(0, 2)).sum() == 12
 
 
+STIFF = {**WELL, "lagrangian": "x_dot**2/2*(1 + x**2) - 50*x**4"}
+PLAIN = {"parameters": {"kT": 1, "g": 1}, "temperature": "kT"}
+SLIDER = PLAIN | {  # of a pendulum, with a singular R
+    "coordinates": ["x", "a"],
+    "lagrangian": "x_dot**2 + a_dot**2/2 + x_dot*a_dot*cos(a) + cos(a) - x**2/2",
+    "dissipation": "g*a_dot**2/2",
+}
+ROD = PLAIN | {
+    "coordinates": ["x", "y"],
+    "lagrangian": "(x_dot**2 + 2*y_dot**2)/2 - y",
+    "constraints": ["x**2 + y**2 = 1"],
+    "damping": "g",
+}
+LAGRANGIAN_OF_BODY = "(omega_1**2 + 2*omega_2**2 + 5*omega_3**2/2)/2 + 2*R_33"
+DIPOLE = PLAIN | {"rotations": {"R": "omega"}, "lagrangian": LAGRANGIAN_OF_BODY, "damping": "g"}
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize(
+    ("method", "arguments", "h"),
+    [
+        *[("svi:1", WELL, 0.3), ("svi:3", CHAIN_OF_TWO | {"temperature": "kT"}, 0.2), ("svi:1", STIFF, 0.6)],
+        *[("svi:1", SLIDER, 0.3), ("svi:2", ROD, 0.1), ("svi:1", DIPOLE, 0.2)],
+    ],
+)
+def test_implicit_steps_in_lanes_have_the_bits_of_single_runs(method, arguments, h):
+    """Separable, coupled, constrained and rotating; steps that fail leave the lanes and are repeated in halves."""
+    system, settings = sc.LagrangianSystem.from_text("body", **arguments), {"h": h, "steps": 60, "seed": 3}
+    stepper = sc.compile_stepper(system, method, flags=PORTABLE_FLAGS)
+    assert stepper.ensemble is not None
+    q = np.random.default_rng(1).normal(size=(9, stepper.dimension))
+    if arguments in (ROD, DIPOLE):
+        q /= np.linalg.norm(q, axis=1)[:, np.newaxis]
+    runs = [stepper.integrate_ensemble(states, 0 * q, **settings, threads=2) for states in (q, q[::-1])]
+    for states, ensemble in zip((q, q[::-1]), runs, strict=True):
+        single = stepper.integrate(states[0], 0 * q[0], **settings)  # stream 0
+        assert np.array_equal(ensemble.q[:, 0], single.q)
+        assert np.array_equal(ensemble.p[:, 0], single.p)
+    assert np.array_equal(runs[0].q[:, 4], runs[1].q[:, 4])  # with other neighbours
+    assert (runs[0].status == "ok").all()
+    assert runs[0].fallback_steps.any() or arguments is not STIFF
+
+
 @pytest.mark.second
 def test_zero_temperature_is_plain_damping_and_heat_balances_the_energy():
     well = compiled("composition:4", "well", **WELL)
@@ -267,8 +311,7 @@ def test_additive_noise_heats_at_its_rate():
 @pytest.mark.second
 def test_failed_steps_are_repeated_in_halves():
     """Without friction, runs have the bits of single steps that a recursion halves where they fail."""
-    stiff = {**WELL, "lagrangian": "x_dot**2/2*(1 + x**2) - 50*x**4"}
-    stepper, levels = compiled("svi:1", "stiff", **stiff), set()
+    stepper, levels = compiled("svi:1", "stiff", **STIFF), set()
 
     def halved(q, p, h, level=0):
         levels.add(level)

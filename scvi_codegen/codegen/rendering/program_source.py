@@ -541,8 +541,8 @@ def render_ensemble(
 ) -> Source | None:
     """Return source that integrates many trajectories at once, one per lane, by fixed-point iteration or explicitly.
 
-    ``None`` for other steps, for rigid bodies turned in closed form, for implicit steps in a heat bath, and with
-    integrals: with a time transformation, trajectories have no common times.
+    ``None`` for other steps, for rigid bodies turned in closed form, for large heat baths, and with integrals: with a
+    time transformation, trajectories have no common times.
 
     Args:
         program: the program.
@@ -552,7 +552,7 @@ def render_ensemble(
     """
     fixed_point, split, headers = program.fixed_point, program.splitting, dict[str, str]()
     bath = program.bath
-    if program.quantities.integrals or (bath and not (split and bath.sizes["BATH_FACTORS"] <= LARGEST_BATH_IN_LANES)):
+    if program.quantities.integrals or (bath and bath.sizes["BATH_FACTORS"] > LARGEST_BATH_IN_LANES):
         return None
     if split is not None and not split.bodies:
         kernels, points, source = split.kernels, 1, splitting_source(split, observed)
@@ -567,6 +567,7 @@ def render_ensemble(
         return None
     prefix, by_masses = f"{program.prefix}_ensemble", bool(program.rattle and program.rattle.lower_masses)
     velocities = by_masses or (fixed_point is not None and fixed_point.kept is StoredValues.VELOCITIES)
+    between = bath and bath.kernel, program.quantities.legendre, program.quantities.inverse_legendre
     context = {
         "program": program,
         "points": points,
@@ -575,9 +576,10 @@ def render_ensemble(
         "counts": counts,
         "tangents": tangents,
         "cut": is_divided((*kernels, *((observed,) if observed else ()))),
-        "needs_velocities": velocities,
+        "needs_velocities": velocities and not bath,
+        "line_velocities": velocities and bath,
         "hot": "static",
-        "inverse_roots": inverse_roots([bath.kernel]) if bath else (),
+        "inverse_roots": inverse_roots([*filter(None, between)]) if bath else (),
         "fixed_point": source,
         "own_headers": headers,
         "scratch": scratch_size(program),

@@ -140,6 +140,10 @@ static inline lanes points_total(lanes *x)
   return x[0];
 }
 
+/* Weight of a point in sums of changes: in single runs further lanes, of at least two, repeat the last point. */
+#define CHANGES_OF(n) ((n) < S - 1 ? 1.0 : S > 1 ? 1.0 + POINTS_THERE - S \
+                                                 : 2.0)
+
 /* Value at the first point. */
 static inline number at_first(const lanes *x)
 {
@@ -177,6 +181,8 @@ static inline number total_of(lanes *sums)
 /* Arguments and report of a batched step. Requires: the header, NAME, STATUS. */
 enum {
   OK = STATUS(OK),
+  NOT_CONVERGED = STATUS(FAILED),
+  SINGULAR = STATUS(FAILED),
   NOT_FINITE = STATUS(FAILED)
 };
 

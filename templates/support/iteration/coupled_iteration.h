@@ -144,7 +144,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
     for (int n = 0; n < GROUPS; n++)
       for (int i = 0; i < M; i++) {
         const lanes moved = r[n][i] * inverse_size[i];
-        *sum_at(change, n) += moved * moved;
+        *sum_at(change, n) += CHANGES_OF(n) * (moved * moved);
       }
     take_change(&now, total_of(change), options, k, report);
     if (is_stagnant(&now, options, k))

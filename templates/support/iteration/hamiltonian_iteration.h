@@ -184,7 +184,7 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
       for (int i = 0; i < M; i++) {
         const lanes correction = value[n][i] - z[n][i], moved = correction * velocity_size[i];
         const lanes pushed = (u[n][M + i] - before[n][i]) * momentum_size[i];
-        *sum_at(change, n) += moved * moved + pushed * pushed;
+        *sum_at(change, n) += CHANGES_OF(n) * (moved * moved + pushed * pushed);
         z[n][i] = value[n][i];
         value[n][i] = correction;
       }

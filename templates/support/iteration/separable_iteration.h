@@ -192,13 +192,13 @@ PASS end_increments increments_of(const step_points *w, long long i)
 
 /* Adds the square of a change. For many coordinates with names the sum of the rounding errors would stay above the
  * tolerance: there it is the largest. A NaN is detected later, by the increments. */
-static inline lanes with_change(lanes change, lanes moved)
+static inline lanes with_change(lanes change, lanes moved, double weight)
 {
 #ifndef ARRAYS
   if (M > FEW)
     return larger_lanes(change, moved * moved);
 #endif
-  return change + moved * moved;
+  return change + weight * (moved * moved);
 }
 
 /* Updates the points of a range of coordinates from the forces; returns the sum of the squared relative changes. */
@@ -212,7 +212,7 @@ PASS lanes improve_points(const step_points *w, section here)
       lanes *X = &w->X[g * OF_EACH * EXTENT(w->n) + i];
       const lanes curved = unit * SUM_OF_FORCES(PRODUCT, w, g, i);
       const lanes x = STRAIGHT_LINE(w, g, i, of) + curved;
-      change = with_change(change, (x - *X) * w->inverse_size[i]);
+      change = with_change(change, (x - *X) * w->inverse_size[i], CHANGES_OF(g));
       *X = x;
     }
   }
@@ -321,7 +321,7 @@ static lanes improve_velocities(const step_points *w, section here)
     for (long long i = here.first; i < here.end; i++) {
       const lanes kick = step->carry_p[i] + step->h * SUM_OF_FORCES(VELOCITY, w, g, i);
       const lanes v = w->data->inverse_mass[i] * (step->p0[i] + kick);
-      change = with_change(change, step->h * (v - V[i]) * w->inverse_size[i]);
+      change = with_change(change, step->h * (v - V[i]) * w->inverse_size[i], CHANGES_OF(g));
       V[i] = v;
     }
   }
@@ -507,7 +507,7 @@ static number correct_points(const step_points *w)
   solve_linear_part(&w->data->linear, d[0]);
   for (int i = 0; i < M; i++)
     for (int g = 0; g < GROUPS; g++) {
-      change = with_change(change, d[g][i] * w->inverse_size[i]);
+      change = with_change(change, d[g][i] * w->inverse_size[i], CHANGES_OF(g));
       w->X[g * M + i] += d[g][i];
     }
   return total_change(change);
@@ -558,6 +558,9 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
 #ifndef POINTS
   coordinates stored[S];
 #endif
+#endif
+#ifdef HEAT_BATH
+  w.former = NULL; /* a remainder prevents drifts of the energy, which a bath exchanges */
 #endif
   remainder_weights remainder;
   number stiffness = number_of(0.0);

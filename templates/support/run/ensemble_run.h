@@ -252,7 +252,7 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
 #endif
     step.t = block->t;
 #ifdef HEAT_BATH
-    enter_step(&bath, block, k, &now);
+    enter_step(&bath, block, k, &now, memory[0][0]);
 #endif
 #ifdef DOUBLE_DOUBLE
     step.t_low = block->t_low, step.h_low = block->h_low;
@@ -260,6 +260,7 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
 #ifdef EXPLICIT_STEPS
     fixed_point(&step, &data, past, &block->guess, dq, dp, options ? options : &standard, &report);
 #else
+    const long long predicted = block->guess;
     memcpy(stored_results.active, block->active, sizeof stored_results.active);
     stored_results.repeated = 0;
     do {
@@ -267,7 +268,7 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
 #ifdef MIXED_POINTS
       refine_increments(&step, block->active, dq, dp);
 #endif
-    } while (memcmp(stored_results.active, block->active, sizeof stored_results.active) != 0 && block->step > 0 &&
+    } while (memcmp(stored_results.active, block->active, sizeof stored_results.active) != 0 && predicted &&
         repeats_failed(&stored_results, past, &block->guess, dq, dp, block->active));
 #endif
     drop_infinite(&now, dq, dp, block->active);
