@@ -198,13 +198,69 @@ def test_family_of_a_motion_that_drifts():
     assert run.q[-1, 0] - run.q[0, 0] == pytest.approx(family[-1].period * np.mean(x**2), rel=1e-8)
 
 
-def test_families_with_constraints_are_refused():
-    rod = sc.LagrangianSystem.from_text(
-        "rod", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 - 1"]
+ROD = sc.LagrangianSystem.from_text(
+    "rod",
+    ["x", "y"],
+    "m*(x_dot**2 + y_dot**2)/2 - m*g*y",
+    constraints=["x**2 + y**2 = l**2"],
+    parameters={"m": 1.3, "g": 1.0, "l": 1.0},
+)
+
+
+@pytest.mark.rotated
+def test_families_of_a_rod_are_elliptic_integrals():
+    """The period of a pendulum is 4 K((E/(m g l) + 1)/2) sqrt(l/g), also while the length of the rod varies."""
+    rod = sc.compile_stepper(ROD, "svi:6")
+    rest = sc.equilibrium(rod, [0.3, -0.9])
+    assert [*rest.q, *rest.frequencies] == pytest.approx([0, -1, 1], abs=1e-13)
+    start = sc.periodic_orbit(rod, [0.6, -0.8], [0.0, 0.0], period=6.4, fixed=["x"])
+    assert start.monodromy.shape == (2, 2)
+    at = {"step": 0.4, "count": 6}
+    families = [
+        sc.family(rod, rest, amplitude=0.1, **at),
+        sc.family(rod, start, parameter="l", fixed=["x"], **at),
+        sc.family(rod, start, parameter="l", energy=start.energy, **at),
+    ]
+    for orbit in (orbit for family in families for orbit in family):
+        m, g, length = orbit.parameters
+        expected = 4 * ellipk((orbit.energy / (m * g * length) + 1) / 2) * np.sqrt(length / g)
+        assert orbit.period == pytest.approx(expected, rel=1e-11)
+        assert np.hypot(*orbit.q) == pytest.approx(length, rel=1e-15)
+        assert abs(orbit.stability_indices - 1) < 1e-10
+    assert [orbit.q[0] for orbit in families[1]] == pytest.approx([0.6] * 6, abs=1e-15)
+    assert families[2].energies == pytest.approx([start.energy] * 6, rel=1e-14)
+
+
+@pytest.mark.rotated
+def test_orbits_of_rods_are_those_of_angles():
+    """A double pendulum in Cartesian coordinates, and in the angles of its rods."""
+    rods = sc.LagrangianSystem.from_text(
+        "rods",
+        ["x", "y", "u", "v"],
+        "(x_dot**2 + y_dot**2 + u_dot**2 + v_dot**2)/2 - y - v",
+        constraints=["x**2 + y**2 = 1", "(u - x)**2 + (v - y)**2 = 1"],
     )
-    stepper = sc.compile_stepper(rod, "svi:2")
-    with pytest.raises(sc.MethodError, match="use coordinates without constraints"):
-        sc.equilibrium(stepper, [0.0, -1.0])
+    angles = sc.LagrangianSystem.from_text(
+        "angles", ["a", "b"], "(2*a_dot**2 + b_dot**2)/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)"
+    )
+    rods, angles = sc.compile_stepper(rods, "svi:6"), sc.compile_stepper(angles, "svi:6")
+    expected = sc.periodic_orbit(angles, [0.5, 0.66], [0.0, 0.0], period=8.3, energy=-2.5)
+    (a, b), (a_dot, b_dot) = expected.q, angles.velocity(expected.q, expected.p)
+    first, second = np.array([[np.sin(a), -np.cos(a)], [np.sin(b), -np.cos(b)]])
+    rates = a_dot * np.array([np.cos(a), np.sin(a)]), b_dot * np.array([np.cos(b), np.sin(b)])
+    at = {"velocity": [*rates[0], *(rates[0] + rates[1])], "period": 8.3, "energy": -2.5}
+    orbit = sc.periodic_orbit(rods, [*first, *(first + second)], **at)
+    assert orbit.period == pytest.approx(expected.period, rel=1e-11)
+    assert orbit.stability_indices == pytest.approx(expected.stability_indices, abs=1e-9)
+    assert orbit.symplectic_error < 1e-13
+
+
+def test_families_with_nonholonomic_constraints_are_refused():
+    blade = sc.LagrangianSystem.from_text(
+        "blade", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - y", constraints=["x_dot = x*y_dot"]
+    )
+    with pytest.raises(sc.MethodError, match="with nonholonomic constraints"):
+        sc.equilibrium(sc.compile_stepper(blade, "svi:2"), [0.0, -1.0])
 
 
 @pytest.mark.second

@@ -93,6 +93,9 @@ SITUATIONS = {
         lagrangian="q_dot**2/2 - k*q**2/2", parameters={"k": 1.0}, events=sc.Event("q - 0.25", then={"k": "2"})
     ),
     "with constraints": lambda: stepper_of(**LOBATTO, constraints=["q - r = 0"]),
+    "with nonholonomic constraints": lambda: stepper_of(
+        coordinates=["q", "r"], lagrangian="(q_dot**2 + r_dot**2)/2", constraints=["q_dot = q*r_dot"]
+    ),
     "with contacts": lambda: sc.compile_stepper(
         sc.LagrangianSystem.from_text("body", ["q"], "q_dot**2/2 - q"), "svi:2", contacts=[sc.contact("q + 1")]
     ),

@@ -43,6 +43,7 @@ from scvi_codegen.analysis.orbits.solver import (
     ClosingEquations,
     OrbitSearch,
     PeriodicOrbit,
+    block_diagonal,
 )
 from scvi_codegen.analysis.orbits.step_sequence import StepSequence
 from scvi_codegen.common.errors import EventError, OrbitError, StepFailedError
@@ -120,6 +121,7 @@ class _Linearised:
     units: Array
     jacobian: Array
     defects: Array
+    into: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +131,7 @@ class FamilyPoint:
     Attributes:
         y: (2m + 1,) state and period, or (2m + 2,) with the parameter.
         orbit: the orbit.
+        into: (2m + 1, r) or (2m + 2, r) changes of y by those of the reduced unknowns.
         units: (r,) sizes of the reduced unknowns, to which the following vectors refer.
         jacobian: (n, r) of the closing equations and the fixed entries.
         same: (r, k) orthonormal directions to the same orbit, from another start or shifted by a symmetry.
@@ -145,6 +148,7 @@ class FamilyPoint:
 
     y: Array
     orbit: PeriodicOrbit
+    into: Array
     units: Array
     jacobian: Array
     same: Array
@@ -157,6 +161,11 @@ class FamilyPoint:
     step: float
     largest: float
     of_both: bool = False
+
+    @property
+    def along(self) -> Array:
+        """(2m + 1,) or (2m + 2,) change of y along the unit tangent."""
+        return np.asarray(self.into @ (self.tangent * self.units))
 
     @property
     def slope(self) -> float:
@@ -272,12 +281,12 @@ class Continuation:
         step, failure = point.step, ""
         while step >= SMALLEST_STEP * self.step:
             try:
-                prediction = self._moved(point.y, step * point.tangent * point.units)
+                prediction = self._moved(point.y, step * point.along)
                 following = self.corrected(prediction, prediction - point.y, point)
             except (ArithmeticError, EventError, OrbitError, StepFailedError, np.linalg.LinAlgError) as error:
                 step, failure = step / 2.0, str(error)
                 continue
-            turned = following.tangent * following.units / point.units
+            turned = self._onto(point.y) @ following.along / point.units
             if not point.of_both and turned @ point.tangent < math.cos(LARGEST_TURN) * np.linalg.norm(turned):
                 step, failure = step / 2.0, "its tangent turns by more than 30 degrees"
                 continue
@@ -299,7 +308,7 @@ class Continuation:
 
     def change_along(self, point: FamilyPoint) -> Array:
         """Return the change of the unknowns along the tangent of a point."""
-        return self._moved(point.y, point.tangent * point.units) - point.y
+        return self._moved(point.y, point.along) - point.y
 
     def end_at(self, first: FamilyPoint, before: FamilyPoint, after: FamilyPoint) -> str:
         """Return why a family ends at an orbit, or ``""``: it shrinks to a point, or passes its first orbit."""
@@ -321,7 +330,7 @@ class Continuation:
 
     def _away(self, point: FamilyPoint, y: Array) -> Array:
         """Return the change from a point to other unknowns, in units of the motion."""
-        return self._reduced(self.search, point.y, self._difference(y, point.y)) / point.units
+        return np.asarray(self._onto(point.y) @ self._difference(y, point.y) / point.units)
 
     def _difference(self, y: Array, other: Array) -> Array:
         """Return y minus other unknowns, with the lengths, signs and phases of rotations of the latter."""
@@ -390,13 +399,12 @@ class Continuation:
             both = doubled.corrected(y, None, point)
         kept = _smallest(both.jacobian, both.same.shape[1] + 2)
         others = _without(_without(kept, both.same), both.tangent[:, np.newaxis])
-        inward = self.search.reduction.inward(*np.split(y[:size], 2)) * both.units[: self.search.reduction.size]
         # Where a period doubles and where a symmetry breaks, period and parameter are stationary along the branch.
         tail, tangent = slice(self.search.reduction.size, None), both.tangent
         branch = others[:, 0]
         if (size_of_tail := tangent[tail] @ tangent[tail]) > FLAT:
             branch = branch - tangent * (branch[tail] @ tangent[tail]) / size_of_tail
-        start = inward @ branch[: self.search.reduction.size]
+        start = (both.into @ (branch * both.units))[:size]
         branch *= (-1.0 if backward else 1.0) * np.sign(start[np.abs(start).argmax()]) / np.linalg.norm(branch)
         return doubled, replace(both, tangent=branch, step=self.step * FIRST, of_both=True)
 
@@ -419,19 +427,19 @@ class Continuation:
                 break
         if self.parameter is not None and search.reversor and search.irreversibility(y[:end]) > REVERSED:
             raise OrbitError("the reversor= is no symmetry at another value of parameter=: omit it")
-        inward = search.reduction.inward(*np.split(y[: end - 1], 2))
-        gradient = search.integral_gradients(y[: end - 1], search.t, linear.closing.sizes)[0] @ inward
+        gradient = search.integral_gradients(y[: end - 1], search.t, linear.closing.sizes)[0]
+        gradient = gradient @ linear.closing.motion.inward
         same, conserved = self._same_orbit(search, linear, y[: end - 1])
         tangents = _without(_smallest(linear.jacobian, same.shape[1] + 1, BRANCHES), same)
         tangent = tangents[:, 0]
-        along = None if normal is None else self._reduced(search, y, normal)
-        along = along if former is None else former.tangent * former.units
+        along = normal if former is None else former.along
         if along is not None:  # the family's, where another one crosses it
-            tangent = tangents @ (tangents.T @ (along / linear.units))
+            tangent = tangents @ (tangents.T @ (self._onto(y) @ along / linear.units))
             tangent /= np.linalg.norm(tangent)
         return FamilyPoint(
             y=y,
             orbit=orbit,
+            into=linear.into,
             units=linear.units,
             jacobian=linear.jacobian,
             same=same,
@@ -444,11 +452,6 @@ class Continuation:
             step=self.step * FIRST if former is None else former.step,
             largest=max(linear.units[0], 0.0 if former is None else former.largest),
         )
-
-    def with_steps(self, steps: StepSequence | None) -> Continuation:
-        """Return the continuation of orbits with the steps of a whole one."""
-        whole = replace(self.search.of_reversor(None), sequence=steps)
-        return replace(self, search=whole.of_reversor(self.search.reversor))
 
     def _search_at(self, y: Array, tolerance: float) -> OrbitSearch:
         """Return the closing equations next to some unknowns, with the steps of a run there."""
@@ -466,7 +469,8 @@ class Continuation:
             return search
         parameters = search.parameters.copy()
         parameters[self.parameter] = y[-1]
-        return replace(search, parameters=parameters, varied=self.parameter)
+        reduction = search.reduction.at(search.t, parameters)
+        return replace(search, parameters=parameters, varied=self.parameter, reduction=reduction)
 
     def _in_segments(self, search: OrbitSearch, y: Array, former: FamilyPoint | None) -> Array:
         """Return unknowns with the starts of more segments where tangent vectors grow along the orbit."""
@@ -487,38 +491,31 @@ class Continuation:
             jacobian, defects = linear.jacobian, linear.defects
             if normal is not None:
                 own = np.append(linear.units[: search.reduction.size], linear.units[-tail:])
-                row = self._reduced(search, prediction, normal) / (own if former is None else former.units) ** 2
-                row /= np.linalg.norm(row * own)
+                onto = self._onto(prediction)
+                row = onto @ normal / (own if former is None else former.units) ** 2
+                row = row / np.linalg.norm(row * own) @ onto
                 away = self._difference(np.append(y[:size], y[-tail:]), prediction)
-                defects = np.append(defects, row @ self._reduced(search, prediction, away))
-                row, columns = row * own, np.zeros(len(linear.units))
-                columns[: search.reduction.size], columns[-tail:] = row[:-tail], row[-tail:]
-                jacobian = np.vstack([jacobian, columns])
+                columns = row[:size] @ linear.into[:size] + row[size:] @ linear.into[-tail:]
+                defects = np.append(defects, row @ away)
+                jacobian = np.vstack([jacobian, columns * linear.units])
             change = np.linalg.pinv(jacobian, NULL_SINGULAR_VALUE) @ defects
             length = float(np.linalg.norm(change))
             if length <= SETTLED or (length <= STAGNANT and length > last / 2.0):
                 return np.append(y[:size], y[-tail:]), count
             if not length < CONTRACTION * last:
                 break
-            y, last = self._moved(y, -change * linear.units), length
+            y, last = self._moved(y, -linear.into @ (change * linear.units)), length
         raise OrbitError(f"the correction of an orbit of the period {prediction[size]:.6g} does not converge")
 
-    def _reduced(self, search: OrbitSearch, y: Array, change: Array) -> Array:
-        """Return a change of the unknowns in the reduced tangent space."""
-        size = 2 * search.stepper.dimension
-        outward = search.reduction.outward(*np.split(y[:size], 2))
-        return np.concatenate([outward @ change[:size], change[size:]])
+    def _onto(self, y: Array) -> Array:
+        """Return the matrix from changes of start, period and parameter to those in the reduced tangent space."""
+        search, size = self._with_parameter(self.search, y), 2 * self.search.stepper.dimension
+        return block_diagonal([search.reduction.outward(*np.split(y[:size], 2)), np.eye(len(y) - size)])
 
     def _moved(self, y: Array, change: Array) -> Array:
-        """Return unknowns after a change in the reduced tangent space, of the starts of one or more segments."""
-        tail, reduction = 1 + (self.parameter is not None), self.search.reduction
-        starts = y[:-tail].reshape(-1, 2, self.search.stepper.dimension)
-        changes = change[:-tail].reshape(len(starts), reduction.size)
-        moved = [
-            reduction.normalised(*(start + (reduction.inward(*start) @ by).reshape(2, -1)))
-            for start, by in zip(starts, changes, strict=True)
-        ]
-        return np.append(np.ravel(moved), y[-tail:] + change[-tail:])
+        """Return unknowns after a change, of the starts of one or more segments."""
+        search, end = self._with_parameter(self.search, y + change), len(y) - (self.parameter is not None)
+        return np.append(search.moved(y[:end], change[:end]), (y + change)[end:])
 
     def _linearised(self, search: OrbitSearch, y: Array) -> _Linearised:
         """Return the closing equations at some unknowns, and their Jacobian by the reduced unknowns, in units."""
@@ -526,25 +523,23 @@ class Continuation:
         states, period = y[:-tail], y[len(y) - tail]
         closing = search.closing_equations(np.append(states, period))
         rows = search.row_units(closing)
-        starts = states.reshape(-1, 2, search.stepper.dimension)
-        inward = _block_diagonal([search.reduction.inward(*start) for start in starts])
-        units = np.append(np.tile(search.reduced_sizes(closing.sizes), len(starts)), period / (2.0 * math.pi))
-        columns, defects = [closing.partials[:, :-1] @ inward, closing.partials[:, -1:]], closing.defects
-        into = _block_diagonal([inward, np.eye(tail)])
+        sizes, count = search.reduced_sizes(closing.sizes), len(closing.segments)
+        units = np.append(np.tile(sizes, count), period / (2.0 * math.pi))
+        columns, defects, into = closing.partials, closing.defects, closing.into
         if self.parameter is not None:
-            units = np.append(units, self.parameter_unit)
-            columns.append(self._by_parameter(search, closing, starts[0])[:, np.newaxis])
-        jacobian = np.hstack(columns) * units / rows[:, np.newaxis]
-        fixed = search.fixed_rows(len(states) + 1) @ into[: len(states) + 1] * units
-        jacobian = np.vstack([jacobian, fixed / np.abs(fixed).max(axis=1, keepdims=True)]) if len(fixed) else jacobian
-        defects = np.append(defects / rows, np.zeros(len(fixed)))
+            units, into = np.append(units, self.parameter_unit), block_diagonal([into, np.eye(1)])
+            into[: len(states), -1] = np.concatenate([segment.shift for segment in closing.segments])
+            columns = np.column_stack([columns, self._by_parameter(search, closing, states)])
+        jacobian = columns * units / rows[:, np.newaxis]
+        fixed = search.fixed_changes(into[: len(states) + 1], units)
+        jacobian, defects = np.vstack([jacobian, fixed]), np.append(defects / rows, np.zeros(len(fixed)))
         if self.period_of is not None:
             value, slope = self._period(search)
             row = np.zeros(len(units))
             row[-2:] = 1.0, -slope * units[-1] / units[-2]
             jacobian = np.vstack([jacobian, row])
             defects = np.append(defects, (period - value) / units[-2])
-        return _Linearised(closing, units, jacobian, defects)
+        return _Linearised(closing, units, jacobian, defects, into)
 
     def _period(self, search: OrbitSearch) -> tuple[float, float]:
         """Return the prescribed period and its derivative by the parameter that varies."""
@@ -554,23 +549,25 @@ class Continuation:
             return search.period, 0.0
         return self.period_of(values), self.period_of.derivative(names[self.parameter])(values)
 
-    def _by_parameter(self, search: OrbitSearch, closing: ClosingEquations, start: Array) -> Array:
+    def _by_parameter(self, search: OrbitSearch, closing: ClosingEquations, states: Array) -> Array:
         """Return the derivatives of the closing equations by the parameter."""
         assert self.parameter is not None
-        column = [search.leaving(segment) @ segment.by_parameter for segment in closing.segments]
+        starts = np.roll(states.reshape(len(closing.segments), -1), -1, axis=0)
+        column = [search.leaving(*at) @ at[0].by_parameter for at in zip(closing.segments, starts, strict=True)]
         column[-1][np.flatnonzero(search.drifts)] = 0.0
         column[-1] = closing.returning @ column[-1]
         if search.energy is not None:
-            column.append(np.array([self._energy_by_parameter(search, start, self.parameter)]))
+            at = search, starts[-1], closing.segments[0].shift, self.parameter
+            column.append(np.array([self._energy_by_parameter(*at)]))
         return np.concatenate(column)
 
-    def _energy_by_parameter(self, search: OrbitSearch, start: Array, parameter: int) -> float:
-        """Return the derivative of the energy of a state by a parameter, by central differences."""
+    def _energy_by_parameter(self, search: OrbitSearch, start: Array, shift: Array, parameter: int) -> float:
+        """Return the derivative of the energy of a state, with its shift, by a parameter, by central differences."""
         width = DIFFERENCE_INCREMENT * self.parameter_unit
         changed = np.repeat(search.parameters[np.newaxis], 2, axis=0)
         changed[:, parameter] += -width, width
-        q, p = start
-        less, more = (float(search.stepper.energy(q, p, search.t, values)) for values in changed)
+        q, p = np.split(start + width * np.outer([-1.0, 1.0], shift), 2, axis=1)
+        less, more = (float(search.stepper.energy(q[k], p[k], search.t, values)) for k, values in enumerate(changed))
         return (more - less) / (2.0 * width)
 
     def _with_unit(self, z: Array) -> Continuation:
@@ -579,7 +576,7 @@ class Continuation:
         y = np.append(z, self.search.parameters[self.parameter])
         search = replace(self._search_at(y, TOLERANCES[0] * self.bound), energy=None)
         closing = search.closing_equations(z)
-        column = self._by_parameter(search, closing, z[:-1].reshape(2, -1)) / search.row_units(closing)
+        column = self._by_parameter(search, closing, z[:-1]) / search.row_units(closing)
         effect = float(np.linalg.norm(column))
         if self.period_of is not None:
             effect += abs(self._period(search)[1]) * 2.0 * math.pi / float(z[-1])
@@ -614,7 +611,7 @@ class Continuation:
         gradients = kept[:, strengths < 0.5]
         fields = np.vstack([gradients[size // 2 :], -gradients[: size // 2]])
         if not closing.motion.by_time.any():
-            flow = search.leaving(closing.motion) @ closing.motion.by_period / units[:size]
+            flow = search.leaving(closing.motion, start) @ closing.motion.by_period / units[:size]
             fields = np.column_stack([flow / np.linalg.norm(flow), fields])
         fields = np.vstack([fields, np.zeros((len(units) - size, fields.shape[1]))])
         fields = _range(np.column_stack([fields, np.eye(len(units))[:, np.flatnonzero(search.drifts)]]))
@@ -630,15 +627,6 @@ def _states_along(orbit: PeriodicOrbit, t: float, state: Array, duration: float)
             *np.split(state, 2), t_end=t + duration, max_step=duration / PHASES, check_growth=False, **at
         )
     return np.asarray(run.t), np.hstack([run.q, run.p])
-
-
-def _block_diagonal(blocks: Sequence[Array]) -> Array:
-    """Return the matrix of blocks along the diagonal."""
-    rows, columns = np.cumsum([[0, 0], *(block.shape for block in blocks)], axis=0).T
-    matrix = np.zeros((rows[-1], columns[-1]))
-    for block, row, column in zip(blocks, rows, columns, strict=False):
-        matrix[row : row + len(block), column : column + block.shape[1]] = block
-    return matrix
 
 
 def _range(vectors: Array) -> Array:

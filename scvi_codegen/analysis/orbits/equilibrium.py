@@ -22,6 +22,7 @@ from scvi_codegen.runs.accuracy.size import RESOLVED, roundoff
 from scvi_codegen.runs.states.reduction import Reduction
 from scvi_codegen.runs.states.validation import Array, Parameters, check_step_given
 from scvi_codegen.runs.stepper import STEPPER, Stepper
+from scvi_codegen.runs.stepping.constraint_manifold import reduction_of
 from scvi_codegen.runs.stepping.features import require
 
 LEAST_CHANGE = 0.1
@@ -106,7 +107,8 @@ def equilibrium(stepper: Stepper, q: ArrayLike, *, t: float = 0.0, parameters: P
     positions, _, velocity = stepper._states.start(q, None, rest)
     momenta = stepper._initial_momenta(positions, None, velocity, t, values)
     state = np.concatenate(stepper._states.pair(positions, momenta))
-    reduction = Reduction(stepper.interface)
+    reduction = reduction_of(stepper, t, values)
+    state = np.ravel(reduction.normalised(*np.split(state, 2)))
     motion = _Motion(stepper, reduction, t, values)
     motion = motion.of_short_steps(state)
     factors, begun, largest = np.full(reduction.size, math.inf), 0.0, 0.0

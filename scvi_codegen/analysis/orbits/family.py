@@ -243,9 +243,11 @@ class Family:
         )
         points = arrays["points"]
         try:
-            steps = [orbits[0].sequence, orbits[-1].sequence, *[search.of_reversor(None).sequence] * (len(points) - 2)]
+            whole = search.of_reversor(None)
+            steps = [orbits[0].sequence, orbits[-1].sequence, *[whole.sequence] * (len(points) - 2)]
+            searches = [replace(whole, sequence=own).of_reversor(search.reversor) for own in steps]
             first, last, *others = (
-                continuation.with_steps(own).corrected(*point) for own, point in zip(steps, points, strict=True)
+                replace(continuation, search=own).corrected(*point) for own, point in zip(searches, points, strict=True)
             )
             same = np.abs(first.y - points[0, 0]).max() <= SAME_ORBIT * np.abs(first.y).max()
         except OrbitError:
@@ -350,6 +352,7 @@ def family(
     if reversor is not None:
         state = np.concatenate([start.q, start.p])
         search, first = search.symmetric(reversor, state, lambda own: _state_at(start, mode, amplitude, own))
+    first = search.moved(first, 0.0 * first)
     continuation = Continuation(
         search=search,
         parameter=None if parameter is None else stepper.parameters.index(parameter),

@@ -19,7 +19,7 @@ the end x has the defect (x - R x)/2; see :mod:`~scvi_codegen.analysis.orbits.re
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -53,7 +53,9 @@ from scvi_codegen.runs.states.reduction import Reduction
 from scvi_codegen.runs.states.times import steps_within
 from scvi_codegen.runs.states.validation import Array, Parameters, check_inputs_given
 from scvi_codegen.runs.stepper import STEPPER, Stepper
+from scvi_codegen.runs.stepping.constraint_manifold import reduction_of
 from scvi_codegen.runs.stepping.features import require
+from scvi_codegen.runs.stepping.projection import consistent
 from scvi_codegen.runs.stepping.step_plan import ErrorControl, Fixed
 from scvi_codegen.runs.trajectory import Trajectory
 
@@ -80,7 +82,8 @@ class PeriodicOrbit:
         steps: number of steps per period.
         sequence: ends of the steps relative to the period.
         monodromy: (2m, 2m) derivative of the end with respect to the start; of systems with rotations in canonical
-            coordinates of the reduced space, with 6 rows for a rotation, 4 for a direction and 2 for a spin.
+            coordinates of the reduced space, with 6 rows for a rotation, 4 for a direction and 2 for a spin, and of the
+            constraint manifold, with 2 rows fewer for each holonomic constraint.
         residual: largest entry of the end minus the start, of the computed map; of symmetric orbits (x - R x)/2 of the
             state x after half a period.
         error: discretisation error of the orbit: the distance to the orbit of a run with 2.6 times as many steps, which
@@ -213,6 +216,8 @@ FREEDOM = 3.0
 FAR = 1.5
 """Factor between the periods, and part of the distance of the guess from the middle of the orbit, beyond which an
 orbit is not the guessed one."""
+RESTORATIONS = 4
+"""Newton iterations, of quadratic convergence, that restore fixed entries after a state is normalised."""
 REVERSED = 1e-9
 """Largest distance of a step from one that a reversor reverses, relative to the motion."""
 OTHER = 1.0 / 3.0
@@ -280,7 +285,7 @@ def periodic_orbit(
     Raises:
         OrbitError: if the iteration does not converge, converges to an equilibrium or to another energy, or if the
             system is not periodic in time with this period.
-        MethodError: if time is transformed, the stepper has constraints, an energy is prescribed with
+        MethodError: if time is transformed, the stepper has nonholonomic constraints, an energy is prescribed with
             forces, or the period of a time-dependent system is free.
         StateError: if a shape, name or number is invalid, an input is not set, or ``reversor`` is no symmetry.
         StepFailedError: if a step from the initial guess fails.
@@ -301,6 +306,8 @@ def periodic_orbit(
     t, values = checked_number(t, "the time t"), stepper._parameters(parameters)
     momenta = stepper._initial_momenta(q, p, velocity, t, values)
     start = np.concatenate(stepper._states.pair(q, momenta))
+    if len(stepper.interface.constraints) > stepper.interface.masked:
+        start = np.concatenate(consistent(stepper, q, momenta, t, values))
     search = OrbitSearch.at(
         stepper,
         start[: stepper.dimension],
@@ -348,6 +355,8 @@ def gains_of(stepper: Stepper, gain: ArrayLike | Sequence[float | None] | None) 
     entries: Any = np.zeros(stepper.dimension) if gain is None else gain
     drifts = np.array([entry is None for entry in np.atleast_1d(np.asarray(entries, dtype=object))])
     if drifts.any():
+        if len(stepper.interface.constraints) > stepper.interface.masked:
+            raise StateError("a gain of None requires a system without constraints: give its number")
         entries = [0.0 if entry is None else entry for entry in entries]
     return {"gain": stepper._states.vector(entries, "gain"), "drifts": drifts}
 
@@ -404,7 +413,7 @@ class OrbitSearch:
         at_rest = np.zeros_like(q)
         with suppress(StateError):  # undefined of most Hamiltonians
             at_rest = stepper.momentum(q, at_rest, t, parameters)
-        reduction = Reduction(stepper.interface)
+        reduction = reduction_of(stepper, t, parameters)
         own: dict[str, Any] = {"at_rest": at_rest, "reduction": reduction, "max_step": max_step}
         return cls(stepper=stepper, t=t, parameters=parameters, **own | rest)
 
@@ -438,8 +447,8 @@ class OrbitSearch:
     ) -> tuple[OrbitSearch, Array]:
         """Return the search of symmetric orbits, and the guess z by the reversor, in its fixed set, near a state."""
         stepper = self.stepper
-        if stepper.divides_steps or stepper.interface.rotations or self.drifts.any():
-            raise StateError("reversor= requires a system without events, kinks, rotations and unknown gains: omit it")
+        if stepper.divides_steps or self.reduction.size < 2 * stepper.dimension or self.drifts.any():
+            raise StateError("reversor= excludes events, kinks, rotations, constraints and unknown gains: omit it")
         if self.sequence is not None and len(self.sequence) % 2:
             raise StateError(f"reversor= requires an even number of steps, not {len(self.sequence)}")
         texts = reversor.split(",") if isinstance(reversor, str) else reversor
@@ -609,7 +618,8 @@ class OrbitSearch:
             k = np.arange(len(path))
             share = np.minimum(k / middle, (count - k) / len(later))
             path += np.outer(np.where(k <= middle, 0.5, -0.5) * share**2, later[-1] - earlier[middle - 1])
-        return np.append(path[self.bounds(segments)[:-1]], guess[-1])
+        nodes = np.append(path[self.bounds(segments)[:-1]], guess[-1])
+        return self.moved(nodes, 0.0 * nodes)
 
     def _halves(self, start: Array, period: float) -> tuple[Array, Array, Array]:
         """Return the states forward and backward from a start, the latter a period later, and the monodromy matrix."""
@@ -618,14 +628,13 @@ class OrbitSearch:
         if self.reversor is not None:
             forward = self._segment(start, steps, 0, count, period)
             return forward.states, forward.states[-1:], self.reversor.monodromy(forward.monodromy)
-        inward = self.reduction.inward(*np.split(start, 2))
         if self.stepper.divides_steps:  # derivatives through events require runs forward in time
             forward = self._segment(start, steps, 0, count, period)
-            later, monodromy = self._states_before(start, period), self.leaving(forward) @ forward.monodromy @ inward
+            later, monodromy = self._states_before(start, period), self.leaving(forward, start) @ forward.monodromy
         else:
             forward = self._segment(start, steps, 0, half, period)
             backward = self._segment(start, steps.reversed, 0, count - half, -period)
-            forth, back = (self.leaving(part) @ part.monodromy @ inward for part in (forward, backward))
+            forth, back = (self.leaving(part, backward.states[-1]) @ part.monodromy for part in (forward, backward))
             later, monodromy = backward.states, np.asarray(np.linalg.solve(back.T, forth.T).T)  # forth back^-1
         return forward.states, later + np.append(self.gain, np.zeros(len(self.gain))), monodromy
 
@@ -675,27 +684,45 @@ class OrbitSearch:
         natural monotonicity test), which is independent of the unstable direction that dominates the residuals.
         """
         inverse, units = self._inverse(equations), self._units(equations)
-        change = inverse @ equations.defects
+        change, into = inverse @ equations.defects, equations.into
         rows, size = self.row_units(equations), float(np.linalg.norm(change / units))
         residual = float(np.linalg.norm(equations.defects / rows))
         if size <= SETTLED * math.sqrt(len(z)):
             return None
         for shortened in 0.5 ** np.arange(MOST_HALVINGS):
-            trial = z - shortened * change
-            if not self.period / FREEDOM <= trial[-1] <= self.period * FREEDOM:
+            if not self.period / FREEDOM <= z[-1] - shortened * change[-1] <= self.period * FREEDOM:
                 continue
-            states = trial[:-1].reshape(-1, 2, self.stepper.dimension)
-            trial[:-1] = np.ravel([self.reduction.normalised(*state) for state in states])
             with suppress(EventError, StepFailedError):
+                trial = self.moved(z, -shortened * into @ change)
                 at = self.closing_equations(trial)
                 less = np.linalg.norm(inverse @ at.defects / units) < (1.0 - shortened / 4.0) * size
                 if less and np.linalg.norm(at.defects / rows) < MOST_INCREASE * residual:
                     return trial, at
         return None
 
+    def moved(self, z: Array, change: Array) -> Array:
+        """Return unknowns after a change, normalised and on the constraints, with the fixed entries."""
+        moved, rows = z + change, self.fixed_rows(len(z))
+        for _ in range(RESTORATIONS):
+            moved[:-1] = np.ravel([space.normalised(*state) for space, state in self._nodes(moved)])
+            away = rows @ (z + change - moved)
+            if not away.any():
+                break
+            into = block_diagonal([*(space.inward(*state) for space, state in self._nodes(moved)), np.eye(1)])
+            moved += into @ np.linalg.lstsq(rows @ into, away, rcond=NULL_SINGULAR_VALUE)[0]
+        return moved
+
+    def _nodes(self, z: Array) -> Iterator[tuple[Reduction, Array]]:
+        """Yield the tangent spaces at the starts of segments, and (2, m) positions and momenta there."""
+        starts = z[:-1].reshape(-1, 2, self.stepper.dimension)
+        ends = self.steps.ends[self.bounds(len(starts))[:-1]] if len(starts) > 1 else [0.0]
+        for start, end in zip(starts, ends, strict=True):
+            yield self.reduction.at(self.t + float(z[-1] * end), self.parameters), start
+
     def _units(self, equations: ClosingEquations) -> Array:
         """Return the sizes of the unknowns: of the motion for each start of a segment, and the time of one radian."""
-        return np.append(np.tile(equations.sizes, len(equations.segments)), self.period / (2.0 * math.pi))
+        sizes = self.reduced_sizes(equations.sizes)
+        return np.append(np.tile(sizes, len(equations.segments)), self.period / (2.0 * math.pi))
 
     def row_units(self, equations: ClosingEquations) -> Array:
         """Return the sizes of the equations, of that of the energy the change by the size of the motion."""
@@ -707,11 +734,16 @@ class OrbitSearch:
     def _inverse(self, equations: ClosingEquations) -> Array:
         """Return the pseudoinverse of the Jacobian in units of the motion; fixed unknowns do not change."""
         units, rows = self._units(equations), self.row_units(equations)
-        fixed = self.fixed_rows(len(units))
+        fixed = self.fixed_changes(equations.into, units)
         free = np.linalg.svd(fixed)[2][np.linalg.matrix_rank(fixed) :].T
         scaled = equations.partials * units / rows[:, np.newaxis] @ free
         inverse: Array = free @ np.linalg.pinv(scaled, NULL_SINGULAR_VALUE)
         return units[:, np.newaxis] * inverse / rows
+
+    def fixed_changes(self, into: Array, units: Array) -> Array:
+        """Return (n, r) changes of fixed entries by the reduced unknowns in units, each relative to the largest one."""
+        fixed = self.fixed_rows(len(into)) @ into * units
+        return np.asarray(fixed / np.fmax(np.abs(fixed).max(axis=1, initial=0.0), LEAST_SIZE)[:, np.newaxis])
 
     def fixed_rows(self, count: int) -> Array:
         """Return (n, count) rows of fixed entries of z, and of changes across the fixed set of the reversor."""
@@ -737,8 +769,7 @@ class OrbitSearch:
 
     def closing_equations(self, z: Array) -> ClosingEquations:
         """Integrate one period and return the residuals with their derivatives; ``z`` has the start of each segment."""
-        size = 2 * self.stepper.dimension
-        starts = z[:-1].reshape(-1, size)
+        size, starts = self.reduction.size, z[:-1].reshape(-1, 2 * self.stepper.dimension)
         count = len(starts)
         bounds = self.bounds(count)
         segments = [
@@ -746,20 +777,19 @@ class OrbitSearch:
             for start, first, last in zip(starts, bounds[:-1], bounds[1:], strict=True)
         ]
         sizes = self.sizes_of(self._whole(np.vstack([starts, *(segment.states for segment in segments)])))
-        rows = np.zeros((count, self.reduction.size, count * size + 1))
+        rows = np.zeros((count, size, count * size + 1))
         defects = np.zeros(rows.shape[:2])
         for k, segment in enumerate(segments):
             after = (k + 1) % count
-            leaving, outward = self.leaving(segment), self.reduction.outward(*np.split(starts[after], 2))
-            closes = after == 0
-            defects[k] = self._defect(segment.states[-1], starts[after], closes=closes)
+            leaving, closes = self.leaving(segment, starts[after]), after == 0
+            defects[k] = self._defect(segment, starts[after], closes=closes)
             rows[k, :, k * size : (k + 1) * size] = leaving @ segment.monodromy
             if not closes or self.reversor is None:
-                rows[k, :, after * size : (after + 1) * size] -= outward
+                rows[k, :, after * size : (after + 1) * size] -= np.eye(size)
             rows[k, :, -1] = leaving @ segment.by_period
         rows[-1, np.flatnonzero(self.drifts)] = 0.0
         error, relative_error = float(np.abs(defects).max()), float(np.abs(defects / self.reduced_sizes(sizes)).max())
-        monodromy = leaving @ segments[-1].monodromy @ self.reduction.inward(*np.split(starts[-1], 2))
+        monodromy = leaving @ segments[-1].monodromy
         if self.reversor is None:
             returning = self.independent_equations(starts, segments, sizes)
         else:
@@ -768,10 +798,10 @@ class OrbitSearch:
         partials, residuals = rows.reshape(defects.size, -1), defects.ravel()
         if self.energy is not None:
             first = starts[0]
-            energy = self.stepper.energy(first[: size // 2], first[size // 2 :], self.t, self.parameters)
+            energy = self._integrals(first[np.newaxis], np.array([self.t]))[0, 0]
             residuals = np.append(residuals, energy - self.energy)
-            row = np.zeros(len(z))
-            row[:size] = self.integral_gradients(first, self.t, sizes)[0]
+            row = np.zeros(count * size + 1)
+            row[:size] = self.integral_gradients(first, self.t, sizes)[0] @ segments[0].inward
             partials = np.vstack([partials, row])
         return ClosingEquations(segments, monodromy, error, relative_error, sizes, residuals, partials, returning)
 
@@ -779,12 +809,13 @@ class OrbitSearch:
         """Return states along a period by those that were computed."""
         return states if self.reversor is None else np.concatenate([states, self.reversor(states)])
 
-    def _defect(self, end: Array, start: Array, *, closes: bool) -> Array:
+    def _defect(self, segment: _Segment, start: Array, *, closes: bool) -> Array:
         """Return the end of a segment minus the start that follows, of the last one after the period."""
+        end = segment.states[-1]
         returned = self._returned(end, start) if closes else end
         if closes and self.reversor is not None:
             return np.asarray((end - self.reversor(returned)) / 2.0)
-        outward = self.reduction.outward(*np.split(start, 2))
+        outward = self.reduction.at(segment.end_time, self.parameters).outward(*np.split(start, 2))
         return np.asarray(outward @ (self.reduction.aligned(returned, start) - start))
 
     def _returned(self, end: Array, start: Array) -> Array:
@@ -792,17 +823,20 @@ class OrbitSearch:
         q, p = np.split(end, 2)
         return np.concatenate([np.where(self.drifts, start[: len(q)], q - self.gain), p])
 
-    def leaving(self, segment: _Segment) -> Array:
-        """Return the matrix from changes of (q, p) at the end of a segment to the reduced tangent space."""
-        return self.reduction.outward(*np.split(segment.states[-1], 2))
+    def leaving(self, segment: _Segment, start: Array) -> Array:
+        """Return the matrix from changes of (q, p) at the end of a segment to the reduced space of a state near it."""
+        return self.reduction.at(segment.end_time, self.parameters).outward_beside(segment.states[-1], start)
 
     def _segment(self, start: Array, steps: StepSequence, first: int, last: int, period: float) -> _Segment:
         """Integrate from the start of step ``first`` of a sequence to the start of step ``last``."""
-        size, ends, widths = len(start), steps.ends[first : last + 1], steps.widths[first:last]
+        size, ends, widths = self.reduction.size, steps.ends[first : last + 1], steps.widths[first:last]
+        space = self.reduction.at(self.t + period * float(ends[0]), self.parameters)
+        inward, shift = space.inward(*np.split(start, 2)), np.zeros(len(start))
         tangents = np.zeros((size + 2 + (self.varied is not None), self.stepper._input_size))
-        tangents[:size, :size] = np.eye(size)
+        tangents[:size, : len(start)] = inward.T
         if self.varied is not None:
-            tangents[-1, size + self.varied] = 1.0
+            tangents[-1, len(start) + self.varied] = 1.0
+            shift = tangents[-1, : len(start)] = space.shift(start, self.varied)
         tangents[size, -2] = ends[0]
         tangents[size + 1, -2] = 1.0
         variations = np.zeros((last - first, len(tangents)))
@@ -814,6 +848,8 @@ class OrbitSearch:
             states=states[1:],
             start_time=self.t + period * float(ends[0]),
             end_time=self.t + period * float(ends[-1]),
+            inward=inward,
+            shift=shift,
             monodromy=partials[:, :size],
             by_period=partials[:, size],
             by_time=partials[:, size + 1],
@@ -829,9 +865,10 @@ class OrbitSearch:
             states = tangents_along(self.stepper, start, *at)[0]
         except (EventError, StepFailedError):
             return math.inf
-        defects = equations.returning @ self._defect(states[-1], start, closes=True)
+        finer = replace(equations.segments[-1], states=states[1:])
+        defects = equations.returning @ self._defect(finer, start, closes=True)
         change = self._inverse(equations) @ np.append(defects, np.zeros(len(equations.defects) - len(defects)))
-        q, p = (float(np.abs(part).max()) for part in np.split(change[:-1], 2))
+        q, p = (float(np.abs(part).max()) for part in np.split((equations.into @ change)[:-1], 2))
         return max(float(abs(change[-1])) / period, self._size_of(self._whole(states)).error(q, p))
 
     def independent_equations(self, starts: Array, segments: Sequence[_Segment], sizes: Array) -> Array:
@@ -842,16 +879,14 @@ class OrbitSearch:
         """
         conserved_masks, units = [], self.reduced_sizes(sizes)
         accepted = CONSERVED if self.stepper.interface.conserves_energy else SAME  # weak damping is no conservation
-        inward = [self.reduction.inward(*np.split(start, 2)) for start in starts]
         times = [segment.start_time for segment in segments]
         gradients = [self.integral_gradients(*at, sizes) for at in zip(starts, times, strict=True)]
-        begins = [gradient @ own * units for gradient, own in zip(gradients, inward, strict=True)]
-        for start, segment, begin, own in zip(starts, segments, begins, inward, strict=True):
+        begins = [gradient @ part.inward * units for gradient, part in zip(gradients, segments, strict=True)]
+        for start, segment, begin in zip(starts, segments, begins, strict=True):
             last = segment.states[-1]
-            end = self.integral_gradients(last, segment.end_time, sizes) @ self.reduction.inward(*np.split(last, 2))
-            end *= units
-            monodromy = self.leaving(segment) @ segment.monodromy @ own
-            monodromy = monodromy / units[:, np.newaxis] * units
+            space = self.reduction.at(segment.end_time, self.parameters)
+            end = self.integral_gradients(last, segment.end_time, sizes) @ space.inward(*np.split(last, 2)) * units
+            monodromy = self.leaving(segment, last) @ segment.monodromy / units[:, np.newaxis] * units
             largest = np.linalg.norm(end, axis=1) * np.linalg.norm(monodromy, 2)
             conserved_masks.append(np.linalg.norm(end @ monodromy - begin, axis=1) <= accepted * largest)
             if self.stepper.divides_steps:
@@ -947,6 +982,8 @@ class _Segment:
     Attributes:
         states: (n, 2m) states after each step.
         start_time, end_time: times of its ends.
+        inward: (2m, r) changes of the start by those in the reduced tangent space.
+        shift: (2m,) change of the start by the parameter that varies, of constraints that contain it.
         monodromy, by_period, by_time, by_parameter: derivatives of the end; by time 0 for autonomous systems, and by
             the parameter that varies, if one does.
     """
@@ -954,6 +991,8 @@ class _Segment:
     states: Array
     start_time: float
     end_time: float
+    inward: Array
+    shift: Array
     monodromy: Array
     by_period: Array
     by_time: Array
@@ -969,8 +1008,9 @@ class ClosingEquations:
         monodromy: derivative of the end of the last segment by its start, without gauge directions.
         error, relative_error: largest entry of the ends minus the starts that follow, itself and relative to sizes.
         sizes: (2m,) sizes of the motion.
-        defects: (r,) residuals.
-        partials: (r, 2m segments + 1) Jacobian of the residuals with respect to the starts of segments and the period.
+        defects: (n,) residuals.
+        partials: (n, r segments + 1) Jacobian of the residuals with respect to changes of the starts of segments in the
+            reduced tangent space, and the period.
         returning: (size, size) projection of the closing equations onto those that conserved quantities do not imply;
             of symmetric orbits onto changes that the reversor reverses.
     """
@@ -989,3 +1029,17 @@ class ClosingEquations:
         """The trajectory of a period in one segment."""
         (motion,) = self.segments
         return motion
+
+    @property
+    def into(self) -> Array:
+        """(2m segments + 1, r segments + 1) changes of the unknowns by those in the reduced tangent space."""
+        return block_diagonal([*(segment.inward for segment in self.segments), np.eye(1)])
+
+
+def block_diagonal(blocks: Sequence[Array]) -> Array:
+    """Return the matrix of blocks along the diagonal."""
+    rows, columns = np.cumsum([[0, 0], *(block.shape for block in blocks)], axis=0).T
+    matrix = np.zeros((rows[-1], columns[-1]))
+    for block, row, column in zip(blocks, rows, columns, strict=False):
+        matrix[row : row + len(block), column : column + block.shape[1]] = block
+    return matrix

@@ -73,6 +73,18 @@ class Reduction:
         of_b = np.concatenate([-by_p[..., :half, :], by_q[..., :half, :]], axis=-1)
         return np.concatenate([of_a, of_b], axis=-2)
 
+    def at(self, t: float, parameters: Array) -> "Reduction":
+        """Return the maps at a time: these, which do not depend on it."""
+        return self
+
+    def outward_beside(self, state: Array, other: Array) -> Array:
+        """Return ``outward`` at a state near another one, whose coordinates they share."""
+        return self.outward(*np.split(state, 2))
+
+    def shift(self, state: Array, parameter: int) -> Array:
+        """Return the change (2m,) of a state by a parameter, which is none."""
+        return np.zeros(2 * self.dimension)
+
     def aligned(self, state: Array, like: Array) -> Array:
         """Return a state (2m,) with the lengths, signs and phases nearest to those of another."""
         m, state = self.dimension, state.copy()

@@ -65,6 +65,11 @@ PROPERTIES: dict[str, Callable[[Any], bool]] = {
     "with constraints": lambda stepper: bool(
         len(stepper.interface.constraints) > stepper.interface.masked or stepper.interface.layout.constraints
     ),
+    "with nonholonomic constraints": lambda stepper: any(
+        name in formula
+        for name in ("_dot", *(f"{rate}_" for text in stepper.interface.rotations for rate in text.split()[2:]))
+        for formula in stepper.interface.constraints
+    ),
     "with constraints of arrays": lambda stepper: bool(stepper.interface.layout.constraints),
     "with constraints of arrays by a composition": lambda stepper: bool(
         stepper.interface.layout.constraints and stepper.interface.method.startswith("composition")
@@ -162,7 +167,8 @@ FEATURES = {
             "use runs and ensembles with h, or with t_end and a tolerance, without it",
         ),
         ("with constraints", "device observe_ensemble", "use coordinates without constraints, or omit it"),
-        ("with constraints", "periodic_orbit fit", "use coordinates without constraints, such as the angles of rods"),
+        ("with constraints", "fit", "use coordinates without constraints, such as the angles of rods"),
+        ("with nonholonomic constraints", "periodic_orbit", "use coordinates without constraints, or integrate"),
         ("with constraints of arrays", "threads", "omit threads; the step uses one"),
         (
             "with constraints of arrays by a composition",
@@ -171,7 +177,7 @@ FEATURES = {
         ),
         (
             "with constraints that prescribe the motion",
-            "chaos chaos_ensemble",
+            "chaos chaos_ensemble periodic_orbit",
             "leave out a constraint, or use jacobian",
         ),
         ("without constraints", "project multipliers", "the system has none"),

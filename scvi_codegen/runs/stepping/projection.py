@@ -122,7 +122,7 @@ def _worst(stepper: Integrator, q: Array, p: Array, t: float, parameters: Parame
     largest = values[np.arange(2), worst]
     scales = np.full(2, np.abs(largest).max())
     if stepper.dimension <= MOST_DENSE:  # sums of |G_i x_i| of the positions and of the velocities x
-        rows = _linearised(stepper, t, parameters)(q)[1][worst]
+        rows = linearised(stepper, t, parameters)(q)[1][worst]
         places = np.stack([q, stepper._transform("velocity", q, p, t, parameters, "p")])
         scales = np.fmax(scales, np.abs(rows * places).sum(axis=1))
     names = [stepper.constraints[k] for k in worst]
@@ -183,7 +183,7 @@ def _dependent(stepper: Integrator, q: Array, t: float, parameters: Parameters, 
     """Return the message of :func:`rank_deficiency`; ``None`` for run-time sizes too large for dense linear algebra."""
     if stepper.interface.layout.coordinates and max(stepper.dimension, len(stepper.constraints)) > MOST_DENSE:
         return None
-    massless, at = _massless(stepper, q, t, parameters), _linearised(stepper, t, parameters)
+    massless, at = _massless(stepper, q, t, parameters), linearised(stepper, t, parameters)
     names = [stepper.constraints[k] for k in _imposed(stepper, at(q)[1])]
     return massless or rank_deficiency(names, q, lambda q: _rows(stepper, *at(q)), nearest=nearest)
 
@@ -266,11 +266,11 @@ def singular_position(stepper: Integrator, q: Array, t: float, parameters: Array
     """Return a remark on a failed step from positions where the constraints are nearly dependent, or ""."""
     if not stepper.constraints or max(stepper.dimension, len(stepper.constraints)) > MOST_DENSE:
         return ""
-    _, imposed = _rows(stepper, *_linearised(stepper, t, parameters)(q))
+    _, imposed = _rows(stepper, *linearised(stepper, t, parameters)(q))
     return nearly_dependent(imposed) if len(imposed) else ""
 
 
-def _linearised(stepper: Integrator, t: float, parameters: Parameters) -> Callable[[Array], tuple[Array, Array]]:
+def linearised(stepper: Integrator, t: float, parameters: Parameters) -> Callable[[Array], tuple[Array, Array]]:
     """Return a function that evaluates g and G by unit velocities; NaN where velocities have no momenta."""
 
     def at(q: Array) -> tuple[Array, Array]:
