@@ -281,7 +281,7 @@ class Continuation:
         step, failure = point.step, ""
         while step >= SMALLEST_STEP * self.step:
             try:
-                prediction = self._moved(point.y, step * point.along)
+                prediction = self._moved(self.search, point.y, step * point.along)
                 following = self.corrected(prediction, prediction - point.y, point)
             except (ArithmeticError, EventError, OrbitError, StepFailedError, np.linalg.LinAlgError) as error:
                 step, failure = step / 2.0, str(error)
@@ -308,7 +308,7 @@ class Continuation:
 
     def change_along(self, point: FamilyPoint) -> Array:
         """Return the change of the unknowns along the tangent of a point."""
-        return self._moved(point.y, point.along) - point.y
+        return self._moved(self.search, point.y, point.along) - point.y
 
     def end_at(self, first: FamilyPoint, before: FamilyPoint, after: FamilyPoint) -> str:
         """Return why a family ends at an orbit, or ``""``: it shrinks to a point, or passes its first orbit."""
@@ -504,7 +504,7 @@ class Continuation:
                 return np.append(y[:size], y[-tail:]), count
             if not length < CONTRACTION * last:
                 break
-            y, last = self._moved(y, -linear.into @ (change * linear.units)), length
+            y, last = self._moved(search, y, -linear.into @ (change * linear.units)), length
         raise OrbitError(f"the correction of an orbit of the period {prediction[size]:.6g} does not converge")
 
     def _onto(self, y: Array) -> Array:
@@ -512,9 +512,9 @@ class Continuation:
         search, size = self._with_parameter(self.search, y), 2 * self.search.stepper.dimension
         return block_diagonal([search.reduction.outward(*np.split(y[:size], 2)), np.eye(len(y) - size)])
 
-    def _moved(self, y: Array, change: Array) -> Array:
+    def _moved(self, search: OrbitSearch, y: Array, change: Array) -> Array:
         """Return unknowns after a change, of the starts of one or more segments."""
-        search, end = self._with_parameter(self.search, y + change), len(y) - (self.parameter is not None)
+        search, end = self._with_parameter(search, y + change), len(y) - (self.parameter is not None)
         return np.append(search.moved(y[:end], change[:end]), (y + change)[end:])
 
     def _linearised(self, search: OrbitSearch, y: Array) -> _Linearised:
