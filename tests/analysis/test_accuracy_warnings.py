@@ -95,14 +95,11 @@ class TestLongSteps:
 
 @pytest.fixture(scope="module")
 def pair():
-    return sc.LagrangianSystem.from_text(
-        name="falling",
-        coordinates=["x[N, 2]"],
-        lagrangian="""
-            sum(i in N, sum(a in 2, x_dot[i, a]**2)/2)
-            + sum(i < j in N, 1/sqrt(sum(a in 2, (x[i, a] - x[j, a])**2)))
-        """,
-    )
+    text = """
+        sum(i in N, sum(a in 2, x_dot[i, a]**2)/2)
+        + sum(i < j in N, 1/sqrt(sum(a in 2, (x[i, a] - x[j, a])**2)))
+        """
+    return lagrange("falling", ["x[N, 2]"], text)
 
 
 class TestLostEnergy:

@@ -13,6 +13,7 @@ import pytest
 import sympy
 from certified_cases import Case, case
 from commands import invoke
+from notation import lagrange
 from samples import QUICK_FLAGS, pushed_pendulum
 
 import scvi_codegen as sc
@@ -182,13 +183,9 @@ def test_inputs_are_certified_at_small_values(method) -> None:
 
 def test_constraints_are_certified_with_constant_inputs() -> None:
     """Cubics of time would push with 5000 after 50 units of it, and steps fail."""
-    pushed = sc.LagrangianSystem.from_text(
-        name="pushed rod",
-        coordinates=["x", "y"],
-        lagrangian="(x_dot**2 + y_dot**2)/2 - y",
-        constraints=["x**2 + y**2 = w**2"],
-        forces={"x": "u"},
-        inputs=["u", "w"],
+    text = "(x_dot**2 + y_dot**2)/2 - y"
+    pushed = lagrange(
+        "pushed rod", "x y", text, constraints=["x**2 + y**2 = w**2"], forces={"x": "u"}, inputs="u w"
     ).with_parameters(w_0=1.0)
     method = sc.SVI(2, "gauss-lobatto:3")
     stepper = sc.compile_stepper(pushed, method, flags=QUICK_FLAGS)

@@ -120,14 +120,8 @@ def test_maximal_growth_between_saved_states_is_found(galaxy):
 
 def test_friction_moves_the_middle_of_the_spectrum():
     """Pairs add up to minus the damping: Dressler, Phys. Rev. A 38 (1988) 2103."""
-    driven = sc.LagrangianSystem.from_text(
-        name="driven pendulum",
-        coordinates=["q"],
-        lagrangian="q_dot**2/2 + cos(q)",
-        parameters={"c": 0.25},
-        forces={"q": "1.5*cos(2*t/3)"},
-        dissipation="c*q_dot**2/2",
-    )
+    text = "q_dot**2/2 + cos(q)"
+    driven = lagrange("driven pendulum", "q", text, forces={"q": "1.5*cos(2*t/3)"}, dissipation="c*q_dot**2/2", c=0.25)
     run = sc.compile_stepper(driven, sc.SVI(4)).integrate([0.2], [0.0], h=0.1, steps=3000)
     assert run.lyapunov_exponents().sum() == pytest.approx(-0.25, abs=1e-6)
 

@@ -136,12 +136,8 @@ def test_an_unstable_orbit_with_impacts_by_multiple_shooting(billiard):
 
 def test_fits_and_orbits_of_arrays():
     """A chain that bounces on its end: a fit of array coordinates, and the orbit of one ball by its distance."""
-    chain = sc.LagrangianSystem.from_text(
-        name="chain",
-        coordinates=["y[N]"],
-        lagrangian="sum(i in N, y_dot[i]**2/2 - y[i] + 0*e*w) - k*sum(i in N-1, (y[i+1] - y[i])**2/2)",
-        parameters={"k": 6.0, "e": 0.7, "w": 0.12},
-    )
+    text = "sum(i in N, y_dot[i]**2/2 - y[i] + 0*e*w) - k*sum(i in N-1, (y[i+1] - y[i])**2/2)"
+    chain = lagrange("chain", "y[N]", text, k=6.0, e=0.7, w=0.12)
     stepper = sc.compile_stepper(chain, "svi:4", flags=FLAGS, events=sc.impact("y[0] - w", "e"))
     q, t = np.array([1.0, 1.6]), np.linspace(0.1, 4.0, 40)
     run = stepper.integrate(q, velocity=0 * q, h=0.1, steps=40, t_eval=t)

@@ -24,13 +24,9 @@ SOME = ["alpha", "beta", "delta"]
 
 @cache
 def oscillator():
-    system = sc.LagrangianSystem.from_text(
-        name="oscillator",
-        coordinates=["x"],
-        lagrangian="m*x_dot**2/2 - alpha*x**2/2 - beta*x**4/4",
-        parameters=TRUE,
-        forces={"x": "gamma*cos(omega*t)"},
-        dissipation="delta*x_dot**2/2",
+    text = "m*x_dot**2/2 - alpha*x**2/2 - beta*x**4/4"
+    system = lagrange(
+        "oscillator", "x", text, parameters=TRUE, forces={"x": "gamma*cos(omega*t)"}, dissipation="delta*x_dot**2/2"
     )
     return sc.compile_stepper(system, sc.SVI(6), flags=QUICK_FLAGS)
 
@@ -228,12 +224,8 @@ CHAOTIC = {"l": 0.8, "m": 1.3}
 @cache
 def two_rods():
     """A double pendulum, of masses as m to 1, and a noisy record of its angles over 17 Lyapunov times."""
-    system = sc.LagrangianSystem.from_text(
-        name="two rods",
-        coordinates=["a", "b"],
-        lagrangian="(m + 1)*a_dot**2/2 + l**2*b_dot**2/2 + l*a_dot*b_dot*cos(a - b) + 9.81*((m + 1)*cos(a) + l*cos(b))",
-        parameters={"m": 1.0, "l": 1.0},
-    )
+    text = "(m + 1)*a_dot**2/2 + l**2*b_dot**2/2 + l*a_dot*b_dot*cos(a - b) + 9.81*((m + 1)*cos(a) + l*cos(b))"
+    system = lagrange("two rods", "a b", text, m=1.0, l=1.0)
     stepper = sc.compile_stepper(system, sc.SVI(6), flags=QUICK_FLAGS)
     run = stepper.integrate([2.0, 2.5], [0.0, 0.0], h=0.02, steps=600, save_every=2, parameters=CHAOTIC)
     return stepper, run, run.q + NOISE * np.random.default_rng(0).normal(size=run.q.shape)
@@ -302,12 +294,8 @@ def test_least_squares_with_equality_constraints_and_bounds():
 
 @cache
 def kepler():
-    system = sc.LagrangianSystem.from_text(
-        name="Kepler and a spring",
-        coordinates=["x", "y", "z"],
-        lagrangian="(x_dot**2 + y_dot**2 + z_dot**2)/2 + mu/sqrt(x**2 + y**2) - k*z**2/2",
-        parameters={"mu": 1.0, "k": 1.0},
-    )
+    text = "(x_dot**2 + y_dot**2 + z_dot**2)/2 + mu/sqrt(x**2 + y**2) - k*z**2/2"
+    system = lagrange("Kepler and a spring", "x y z", text, mu=1.0, k=1.0)
     return sc.compile_stepper(system, sc.SVI(8), flags=QUICK_FLAGS)
 
 

@@ -2,19 +2,18 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 from scipy.special import ellipk
 
 import scvi_codegen as sc
 
-PENDULUM = sc.LagrangianSystem.from_text(
-    "pendulum", ["q"], "q_dot**2/2 + g*cos(q) + a*q**3", parameters={"g": 1, "a": 0}
-)
-RESTRICTED = sc.LagrangianSystem.from_text(
-    name="restricted three-body problem",
-    coordinates=["x", "y", "z"],
-    lagrangian="((x_dot - y)**2 + (y_dot + x)**2 + z_dot**2)/2"
+PENDULUM = lagrange("pendulum", "q", "q_dot**2/2 + g*cos(q) + a*q**3", g=1, a=0)
+RESTRICTED = lagrange(
+    "restricted three-body problem",
+    "x y z",
+    "((x_dot - y)**2 + (y_dot + x)**2 + z_dot**2)/2"
     " + (1 - mu)/sqrt((x + mu)**2 + y**2 + z**2) + mu/sqrt((x - 1 + mu)**2 + y**2 + z**2)",
-    parameters={"mu": 1.215058560962404e-2},
+    mu=1.215058560962404e-2,
 )
 MIRROR = ["x", "-y", "z"]
 

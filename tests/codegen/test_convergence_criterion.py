@@ -23,7 +23,6 @@ from scvi_codegen.methods import SCVI, SVI, SpectralCollocation
 from scvi_codegen.methods.exact.step import derived_step
 from scvi_codegen.runs.compiler import compile_stepper
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
-from scvi_codegen.systems.lagrangian import LagrangianSystem
 
 ROUNDING = 5e-16
 Q, P, STEPS = [1.2], [0.7], 5
@@ -399,9 +398,7 @@ def test_tolerance_of_adaptive_steps_ends_the_iteration_early(name):
     if name == "kepler":
         system, state = problem("kepler").system, {"q": [0.5, 0.0], "p": [0.0, 3**0.5]}
     else:
-        system = LagrangianSystem.from_text(
-            name="top", lagrangian="(omega_1**2 + omega_2**2 + omega_3**2/2)/2 - R_33", rotations={"R": "omega"}
-        )
+        system = lagrange("top", (), "(omega_1**2 + omega_2**2 + omega_3**2/2)/2 - R_33", rotations={"R": "omega"})
         turned = np.array([np.cos(0.2), np.sin(0.2), 0.0, 0.0])
         state = {"q": {"R": turned}, "velocity": {"omega": [0.1, 0.2, 3.0]}}
     stepper = compile_stepper(system, "svi:6")

@@ -48,11 +48,8 @@ def rotating() -> LagrangianSystem:
 
 def leaning() -> LagrangianSystem:
     """Three coordinates whose constant masses all meet."""
-    return LagrangianSystem.from_text(
-        name="leaning",
-        coordinates=["x", "y", "z"],
-        lagrangian="x_dot**2 + y_dot**2 + z_dot**2 + x_dot*y_dot/2 + y_dot*z_dot/3 + x_dot*z_dot/5 + x*y*z_dot - x**4",
-    )
+    text = "x_dot**2 + y_dot**2 + z_dot**2 + x_dot*y_dot/2 + y_dot*z_dot/3 + x_dot*z_dot/5 + x*y*z_dot - x**4"
+    return lagrange("leaning", "x y z", text)
 
 
 def relativistic() -> LagrangianSystem:

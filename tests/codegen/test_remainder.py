@@ -11,6 +11,7 @@ import warnings
 
 import numpy as np
 import pytest
+from notation import lagrange
 from samples import QUICK_FLAGS
 
 from scvi_codegen import LagrangianSystem, compile_stepper
@@ -20,9 +21,7 @@ LARGEST_SLOPE = 0.25
 """Largest admissible drift of the energy, in rounding errors per step."""
 STEPS = 20_000
 OSCILLATOR = LagrangianSystem.from_text("oscillator", ["x"], "x_dot**2/2-4*x**2/2")
-RING = LagrangianSystem.from_text(
-    "ring", ["u[N]"], "sum(i in N, u_dot[i]**2/2) - sum(i in N periodic, (u[i+1]-u[i])**2/2)"
-)
+RING = lagrange("ring", "u[N]", "sum(i in N, u_dot[i]**2/2) - sum(i in N periodic, (u[i+1]-u[i])**2/2)")
 WORST = [
     ("svi:2", 0.9),
     ("svi:2", 2.0),

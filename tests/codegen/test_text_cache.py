@@ -271,15 +271,9 @@ def others(value):
 
 
 def driven() -> sc.LagrangianSystem:
-    return sc.LagrangianSystem.from_text(
-        name="all",
-        coordinates=["x", "y"],
-        lagrangian="m*(x_dot**2 + y_dot**2)/2 - x**2*y**2/2",
-        parameters={"m": 1.5, "c": 0.25},
-        forces={"x": "u"},
-        damping="c",
-        constraints=["x - 2*y"],
-        inputs=["u"],
+    text = "m*(x_dot**2 + y_dot**2)/2 - x**2*y**2/2"
+    return lagrange(
+        "all", "x y", text, forces={"x": "u"}, damping="c", constraints=["x - 2*y"], inputs="u", m=1.5, c=0.25
     )
 
 

@@ -114,9 +114,7 @@ def test_points_use_the_vectors_that_registers_allow(name, method):
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the lengths of vectors of other processors are not chosen")
 @pytest.mark.parametrize("points", [2, 3, 8, 10])
 def test_sums_over_points_are_the_same_in_vectors_of_any_length(points):
-    top = sc.LagrangianSystem.from_text(
-        "top", rotations={"R": "w"}, lagrangian="(w_1**2 + 2*w_2**2 + 3*w_3**2)/2 - R_33 - R_12"
-    )
+    top = lagrange("top", (), "(w_1**2 + 2*w_2**2 + 3*w_3**2)/2 - R_33 - R_12", rotations={"R": "w"})
     ends = []
     for flags in (SHORT, LONG):
         stepper = sc.compile_stepper(top, sc.SVI(points), flags=flags)

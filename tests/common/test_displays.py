@@ -119,11 +119,8 @@ class TestSystem:
         assert "<mi>H</mi>" in sc.hamiltonian_of(sc.problem("planar-pendulum").system)._repr_html_()
 
     def test_long_lagrangian_is_abbreviated_with_a_count(self):
-        large = sc.LagrangianSystem.from_text(
-            name="chain",
-            coordinates=[f"q{k}" for k in range(40)],
-            lagrangian=" + ".join(f"q{k}_dot**2/2 - (q{k} - q{(k + 1) % 40})**4/4" for k in range(40)),
-        )._repr_html_()
+        text = " + ".join(f"q{k}_dot**2/2 - (q{k} - q{(k + 1) % 40})**4/4" for k in range(40))
+        large = lagrange("chain", [f"q{k}" for k in range(40)], text)._repr_html_()
         assert re.search(r"L: \d{3} operations", large)
         assert ".. (40)" in large
 

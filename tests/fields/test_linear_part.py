@@ -151,13 +151,11 @@ def test_steps_of_a_lattice_equal_dense_newton_steps():
     """Gauss(2) in NumPy for a discrete nonlinear Schroedinger equation with stiff random couplings."""
     n, h, root = 6, 0.2, np.sqrt(3.0) / 6
     coupling, q, p = np.random.default_rng(1).normal(size=(3, n)) * [[20], [1], [1]]
-    lattice = sc.HamiltonianSystem.from_text(
-        "lattice",
-        coordinates=["q[N]"],
-        parameters={"k[N]": 1},
-        hamiltonian="sum(i in N periodic, k[i]*(q[i]*q[i+1] + p_q[i]*p_q[i+1] + q[i]*p_q[i+1]))"
-        " + sum(i in N, (q[i]**2 + p_q[i]**2)**2/9)",
+    text = (
+        "sum(i in N periodic, k[i]*(q[i]*q[i+1] + p_q[i]*p_q[i+1] + q[i]*p_q[i+1]))"
+        " + sum(i in N, (q[i]**2 + p_q[i]**2)**2/9)"
     )
+    lattice = hamilton("lattice", "q[N]", text, parameters={"k[N]": 1})
     stepper = sc.compile_stepper(lattice, "gauss:2", solver="newton", flags=QUICK_FLAGS)
     run = stepper.integrate({"q": q}, p={"q": p}, h=h, steps=1, parameters={"k": coupling})
     shift = coupling[:, None] * np.roll(np.eye(n), 1, axis=1)

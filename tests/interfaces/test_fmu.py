@@ -32,13 +32,9 @@ NEVER_CALLED = (
 
 def pushed(**given):
     """A pushed pendulum with friction, some of whose mass is data, too."""
-    system = sc.LagrangianSystem.from_text(
-        name='pushed pendulum <&> "friends"',
-        coordinates=["q"],
-        lagrangian="(m + w)*q_dot**2/2 + cos(q)",
-        parameters={"c": 0.2, "m": 1.5},
-        forces={"q": "u - c*q_dot"},
-        inputs=["w", "u"],
+    text = "(m + w)*q_dot**2/2 + cos(q)"
+    system = lagrange(
+        'pushed pendulum <&> "friends"', "q", text, forces={"q": "u - c*q_dot"}, inputs="w u", c=0.2, m=1.5
     )
     return sc.Model(system=system, method=sc.SVI(4), q=(0.3,), h=H, t=0.5, span=2.3, **(given or {"velocity": (0.5,)}))
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import invoke
+from notation import lagrange
 from programs import needs
 
 import scvi_codegen as sc
@@ -91,12 +92,8 @@ def test_package_steps_as_the_compiled_system_without_sympy(name, tmp_path):
 def test_c_program_falls_back_to_newton_where_the_fixed_point_fails(h, solver, reported, tmp_path):
     """Two stiff springs with forces: omega h = 5 and more, where the fixed-point iteration diverges."""
     needs("make", "cc")
-    system = sc.LagrangianSystem.from_text(
-        name="springs",
-        coordinates=["x", "y"],
-        lagrangian="(x_dot**2 + y_dot**2)/2 - 50*(x**2 + y**2) - x**2*y**2",
-        forces={"x": "-0.1*x_dot", "y": "cos(t) - 0.1*y_dot"},
-    )
+    text = "(x_dot**2 + y_dot**2)/2 - 50*(x**2 + y**2) - x**2*y**2"
+    system = lagrange("springs", "x y", text, forces={"x": "-0.1*x_dot", "y": "cos(t) - 0.1*y_dot"})
     model = sc.Model(system=system, method="svi:2", q=(1.0, 0.5), velocity=(0.0, 0.0), h=h, steps=20)
     folder = sc.generate_package(replace(model, solver=solver), tmp_path / "springs_svi")
     if reported:

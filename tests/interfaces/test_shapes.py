@@ -99,9 +99,7 @@ def test_pictures_of_arrays_and_rotations_use_entries():
     model = sc.Model(system=body, method="svi:2", q=[0.5, 0.5, 0.5, 0.5], velocity=[0.0] * 4, h=0.1, steps=1)
     shape = shape_of_picture(drawn_system_of_model(model), {"points": {"a": ["R_11", "R_21", "R_31"], "o": [0, 0, 0]}})
     assert np.allclose(shape.positions(0.0, np.array([[0.5] * 4]), np.zeros((1, 4)), ())[0, 0], [0, 1, 0])
-    pair = sc.LagrangianSystem.from_text(
-        "pair", rotations={"R[2]": "w"}, lagrangian="sum(i in 2, w_1[i]**2 + w_2[i]**2 + w_3[i]**2)"
-    )
+    pair = lagrange("pair", (), "sum(i in 2, w_1[i]**2 + w_2[i]**2 + w_3[i]**2)", rotations={"R[2]": "w"})
     model = sc.Model(system=pair, method="svi:2", q=[0.5] * 8, velocity=[0.0] * 8, h=0.1, steps=1)
     shape = shape_of(drawn_system_of_model(model))
     (state,) = shape.positions(0.0, np.array([[0.5] * 8]), np.zeros((1, 8)), ())

@@ -290,12 +290,8 @@ def test_constraints_that_depend_on_time_forces_and_coupled_masses():
 @pytest.mark.parametrize("method", ["svi:1", "svi:2"])
 def test_constraints_dependent_on_the_manifold_are_named(method, third, message_text):
     """Generic points do not show it: G loses rank on the constraint manifold alone."""
-    system = sc.LagrangianSystem.from_text(
-        name="loop",
-        coordinates=["x", "y", "u", "w"],
-        lagrangian="(x_dot**2 + y_dot**2 + u_dot**2 + w_dot**2)/2 - y",
-        constraints=["x**2 + y**2 = 1", "u = x + 1", third],
-    )
+    text = "(x_dot**2 + y_dot**2 + u_dot**2 + w_dot**2)/2 - y"
+    system = lagrange("loop", "x y u w", text, constraints=["x**2 + y**2 = 1", "u = x + 1", third])
     stepper = sc.compile_stepper(system, method)
     for q in ([1.0, 0.0, 2.0, 0.0], [0.6, 0.8, 1.6, 0.3]):
         with pytest.raises(sc.StateError, match=message_text):
@@ -472,12 +468,8 @@ def test_unsupported_combinations_with_constraints_are_rejected():
 
 def test_projected_momenta_have_admissible_velocities_for_any_kinetic_energy():
     """Newton's method for the momentum needs several iterations where the kinetic energy is not quadratic."""
-    rod = sc.LagrangianSystem.from_text(
-        name="quartic",
-        coordinates=["x", "y"],
-        lagrangian="(x_dot**2 + y_dot**2)/2 + (x_dot**2 + y_dot**2)**2/8",
-        constraints=["(x - 3*sin(t)/10)**2 + y**2 - 1"],
-    )
+    text = "(x_dot**2 + y_dot**2)/2 + (x_dot**2 + y_dot**2)**2/8"
+    rod = lagrange("quartic", "x y", text, constraints=["(x - 3*sin(t)/10)**2 + y**2 - 1"])
     stepper = sc.compile_stepper(rod, "svi:1", flags=("-O1",))
     for angle, momentum in ((0.2, [3.0, 1.0]), (1.4, [-1.0, 2.0]), (2.5, [0.5, -4.0])):
         q, p = stepper.project([0.3 * np.sin(1.0) + np.cos(angle), np.sin(angle)], momentum, t=1.0)
@@ -487,12 +479,9 @@ def test_projected_momenta_have_admissible_velocities_for_any_kinetic_energy():
 @pytest.mark.rotated
 def test_ball_joints_of_rotations_need_no_newton_iteration():
     """Compare a body that is hung at a point by constraints with the states of Newton's iteration."""
-    body = sc.LagrangianSystem.from_text(
-        name="hung body",
-        coordinates=["x", "y", "z"],
-        rotations={"R": "omega"},
-        lagrangian="(x_dot**2 + y_dot**2 + z_dot**2)/2 - 9.81*z + (3*omega_1**2 + 2*omega_2**2 + omega_3**2)/20",
-        constraints=["x = R_13/2", "y = R_23/2", "z = R_33/2"],
+    text = "(x_dot**2 + y_dot**2 + z_dot**2)/2 - 9.81*z + (3*omega_1**2 + 2*omega_2**2 + omega_3**2)/20"
+    body = lagrange(
+        "hung body", "x y z", text, rotations={"R": "omega"}, constraints=["x = R_13/2", "y = R_23/2", "z = R_33/2"]
     )
     ours, newton = (sc.compile_stepper(body, lobatto(2), solver=solver) for solver in ("auto", "newton"))
     assert "constrained_point(" in ours.source.amalgamated().code

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
@@ -52,11 +53,9 @@ def test_steps_of_a_body_do_not_depend_on_the_reference_attitude():
     """A body that falls from rest, in two frames of space: at the reference attitude, components of its quaternion turn
     by far less than the body, which is to be accurate as a whole."""
     kinetic = "(I1*omega_1**2 + I2*omega_2**2 + I3*omega_3**2)/2"
-    body = sc.LagrangianSystem.from_text(
-        "body in a field",
-        rotations={"R": "omega"},
-        lagrangian=f"{kinetic} - g1*R_13 - g2*R_23 - g3*R_33",
-        parameters={"I1": 1.0, "I2": 2.0, "I3": 3.0, "g1": 0.1, "g2": 0.0, "g3": 1.0},
+    text = f"{kinetic} - g1*R_13 - g2*R_23 - g3*R_33"
+    body = lagrange(
+        "body in a field", (), text, rotations={"R": "omega"}, I1=1.0, I2=2.0, I3=3.0, g1=0.1, g2=0.0, g3=1.0
     )
     stepper = sc.compile_stepper(body, "svi:4")
     start, turned = np.eye(3), Rotation.from_euler("xyz", [0.7, 0.8, 0.9]).as_matrix()

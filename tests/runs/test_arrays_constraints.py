@@ -123,11 +123,9 @@ def test_momentum_maps_compatible_with_constraints_are_conserved():
 @pytest.mark.rotated
 def test_time_dependent_constraints_are_satisfied():
     """A pendulum whose pivot shakes is that written out in its angle."""
-    shaken = sc.LagrangianSystem.from_text(
-        name="shaken",
-        coordinates=["r[N, 2]"],
-        lagrangian="sum(i in N, sum(a in 2, r_dot[i, a]**2)/2 - r[i, 1])",
-        constraints=["(r[i, 0] - sin(3*t)/10)**2 + r[i, 1]**2 = 1 for i in N"],
+    text = "sum(i in N, sum(a in 2, r_dot[i, a]**2)/2 - r[i, 1])"
+    shaken = lagrange(
+        "shaken", ["r[N, 2]"], text, constraints=["(r[i, 0] - sin(3*t)/10)**2 + r[i, 1]**2 = 1 for i in N"]
     )
     stepper = sc.compile_stepper(shaken, "composition:8")
     run = stepper.integrate([[0.0, -1.0]], velocity=[[0.3, 0.0]], h=0.02, steps=100, save_every=100)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from notation import lagrange
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
@@ -20,14 +21,9 @@ K = np.array([1.0, 2.0])
 
 @pytest.fixture(scope="module")
 def chain() -> sc.Stepper:
-    system = sc.LagrangianSystem.from_text(
-        name="chain",
-        coordinates=["q[N]"],
-        tables=["bonds[B, 2]"],
-        parameters={"k[B]": 1.0},
-        inputs=["F"],
-        lagrangian="sum(i in N, q_dot[i]**2/2) - sum(b in B, k[b]*(q[bonds[b, 1]] - q[bonds[b, 0]])**2/2)",
-        forces={"q[0]": "F"},
+    text = "sum(i in N, q_dot[i]**2/2) - sum(b in B, k[b]*(q[bonds[b, 1]] - q[bonds[b, 0]])**2/2)"
+    system = lagrange(
+        "chain", "q[N]", text, tables=["bonds[B, 2]"], parameters={"k[B]": 1.0}, inputs="F", forces={"q[0]": "F"}
     )
     return sc.compile_stepper(system, "svi:3", flags=QUICK_FLAGS)
 
@@ -35,12 +31,8 @@ def chain() -> sc.Stepper:
 @pytest.fixture(scope="module")
 def pendulums() -> sc.Stepper:
     """Return pendulums with constraints, whose memory depends on positions."""
-    system = sc.LagrangianSystem.from_text(
-        name="pendulums",
-        coordinates=["x[N]", "y[N]"],
-        lagrangian="sum(i in N, x_dot[i]**2/2 + y_dot[i]**2/2 - y[i])",
-        constraints=["x[i]**2 + y[i]**2 - 1 for i in N"],
-    )
+    text = "sum(i in N, x_dot[i]**2/2 + y_dot[i]**2/2 - y[i])"
+    system = lagrange("pendulums", "x[N] y[N]", text, constraints=["x[i]**2 + y[i]**2 - 1 for i in N"])
     return sc.compile_stepper(system, "stoermer-verlet", flags=QUICK_FLAGS)
 
 

@@ -11,14 +11,11 @@ RANDOM = np.random.default_rng(1)
 
 def molecules():
     """Stiff bonds between soft ones, in the plane, by a table."""
-    return sc.LagrangianSystem.from_text(
-        name="molecules",
-        coordinates=["r[N, 2]"],
-        parameters={"k[B]": 1, "length[B]": 1},
-        tables=["bonds[B, 2]"],
-        lagrangian="sum(i in N, sum(a in 2, r_dot[i, a]**2)/2) - sum(b in B, k[b]/2"
-        "*(sqrt(sum(a in 2, (r[bonds[b, 0], a] - r[bonds[b, 1], a])**2)) - length[b])**2)",
+    text = (
+        "sum(i in N, sum(a in 2, r_dot[i, a]**2)/2) - sum(b in B, k[b]/2"
+        "*(sqrt(sum(a in 2, (r[bonds[b, 0], a] - r[bonds[b, 1], a])**2)) - length[b])**2)"
     )
+    return lagrange("molecules", ["r[N, 2]"], text, parameters={"k[B]": 1, "length[B]": 1}, tables=["bonds[B, 2]"])
 
 
 @pytest.mark.rotated

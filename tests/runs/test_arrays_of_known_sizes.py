@@ -16,12 +16,9 @@ FORCES = {"x": "cos(t)/10", "q[i]": "sin(t)*m[i]"}
 
 def body_on_ring(size: str) -> sc.LagrangianSystem:
     """A body joined by springs to the particles of a ring."""
-    return sc.LagrangianSystem.from_text(
-        name="body on ring",
-        coordinates=["x", f"q[{size}]"],
-        lagrangian=LAGRANGIAN.format(N=size),
-        parameters={"M": 2, "k": 1, f"m[{size}]": 1},
-        forces=FORCES,
+    text = LAGRANGIAN.format(N=size)
+    return lagrange(
+        "body on ring", ["x", f"q[{size}]"], text, parameters={"M": 2, "k": 1, f"m[{size}]": 1}, forces=FORCES
     )
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from notation import hamilton, lagrange
 from samples import QUICK_FLAGS
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
@@ -77,14 +78,10 @@ def test_arrays_of_rotations_move_as_by_names(tmp_path):
 @pytest.mark.parametrize("size", ["6", "N"])
 def test_spin_chain_against_scipy(size):
     """ds/dt = s x dH/ds with the field of the neighbours."""
-    chain = sc.HamiltonianSystem.from_text(
-        name="spin chain",
-        coordinates=[],
-        hamiltonian=f"-sum(i in {size} periodic, s_1[i]*s_1[i+1] + s_2[i]*s_2[i+1] + s_3[i]*s_3[i+1])"
-        f" - b*sum(i in {size}, s_3[i])",
-        parameters={"b": 0.3},
-        spins=[f"s[{size}]"],
+    text = (
+        f"-sum(i in {size} periodic, s_1[i]*s_1[i+1] + s_2[i]*s_2[i+1] + s_3[i]*s_3[i+1]) - b*sum(i in {size}, s_3[i])"
     )
+    chain = hamilton("spin chain", [], text, spins=[f"s[{size}]"], b=0.3)
     start = np.random.default_rng(0).normal(size=(6, 3))
 
     def rates(_: float, y: np.ndarray) -> np.ndarray:
@@ -103,12 +100,8 @@ def test_spin_chain_against_scipy(size):
 
 def test_batches_of_arrays_with_two_axes_are_states_one_by_one():
     """The axes of a batch precede those of an array."""
-    system = sc.LagrangianSystem.from_text(
-        "plates",
-        coordinates=["x[2, 3]"],
-        lagrangian="sum(i in 2, j in 3, x_dot[i, j]**2) + sum(i in 2, omega_1[i]**2 + omega_2[i]**2 + omega_3[i]**2)",
-        rotations={"R[2]": "omega"},
-    )
+    text = "sum(i in 2, j in 3, x_dot[i, j]**2) + sum(i in 2, omega_1[i]**2 + omega_2[i]**2 + omega_3[i]**2)"
+    system = lagrange("plates", ["x[2, 3]"], text, rotations={"R[2]": "omega"})
     q = {"x": RNG.normal(size=(5, 2, 3)), "R": RNG.normal(size=(5, 2, 4))}
     velocity = {"x": RNG.normal(size=(5, 2, 3)), "omega": RNG.normal(size=(5, 2, 3))}
     many = state_by_name(system, q, None, velocity)

@@ -19,12 +19,8 @@ def written(system):
 
 @pytest.fixture(scope="module")
 def ring():
-    return sc.LagrangianSystem.from_text(
-        name="FPUT ring",
-        coordinates=["q[N]"],
-        parameters={"beta": 0.25},
-        lagrangian="sum(i in N, q_dot[i]**2/2)- sum(i in N periodic, (q[i+1] - q[i])**2/2 + beta*(q[i+1] - q[i])**4/4)",
-    )
+    text = "sum(i in N, q_dot[i]**2/2)- sum(i in N periodic, (q[i+1] - q[i])**2/2 + beta*(q[i+1] - q[i])**4/4)"
+    return lagrange("FPUT ring", "q[N]", text, beta=0.25)
 
 
 @pytest.fixture(scope="module")
@@ -34,14 +30,8 @@ def steppers(ring):
 
 @pytest.fixture(scope="module")
 def driven():
-    return sc.LagrangianSystem.from_text(
-        name="driven",
-        coordinates=["q[N]"],
-        parameters={"c": 0.1},
-        inputs=["F"],
-        lagrangian="sum(i in N, q_dot[i]**2/2) - sum(i in 0..N-2, (q[i+1] - q[i])**2/2) - q[0]**2/2",
-        forces={"q[i]": "-c*q_dot[i]", "q[N-1]": "F"},
-    )
+    text = "sum(i in N, q_dot[i]**2/2) - sum(i in 0..N-2, (q[i+1] - q[i])**2/2) - q[0]**2/2"
+    return lagrange("driven", "q[N]", text, inputs="F", forces={"q[i]": "-c*q_dot[i]", "q[N-1]": "F"}, c=0.1)
 
 
 @pytest.mark.rotated

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from notation import hamilton, lagrange
 from programs import needs
 
 import scvi_codegen as sc
@@ -210,18 +211,10 @@ def test_newton_iteration_with_threads() -> None:
 
 @pytest.mark.rotated
 def test_hamiltonians_and_velocity_dependent_forces_with_threads() -> None:
-    field = sc.HamiltonianSystem.from_text(
-        name="field",
-        coordinates=["q[N]"],
-        momenta=["p[N]"],
-        hamiltonian="sum(i in N periodic, ((q[i+1] - q[i])**2 + (p[i+1] - p[i])**2)/2 - (q[i]**2 + p[i]**2)**2/4)",
-    )
-    damped = sc.LagrangianSystem.from_text(
-        name="damped",
-        coordinates=["q[N]"],
-        lagrangian="sum(i in N, q_dot[i]**2/2) - sum(i in N periodic, (q[i+1] - q[i])**2/2)",
-        forces={"q[i]": "-q_dot[i]**3", "q[0]": "cos(t)"},
-    )
+    text = "sum(i in N periodic, ((q[i+1] - q[i])**2 + (p[i+1] - p[i])**2)/2 - (q[i]**2 + p[i]**2)**2/4)"
+    field = hamilton("field", "q[N]", text, momenta="p[N]")
+    text = "sum(i in N, q_dot[i]**2/2) - sum(i in N periodic, (q[i+1] - q[i])**2/2)"
+    damped = lagrange("damped", "q[N]", text, forces={"q[i]": "-q_dot[i]**3", "q[0]": "cos(t)"})
     for system, method in ((field, "gauss:4"), (damped, "svi:4")):
         stepper, q = sc.compile_stepper(system, method), np.sin(0.1 * np.arange(5000))
         found = [bits(stepper.integrate(q, np.cos(0.2 * q), h=0.1, steps=4, threads=threads)) for threads in THREADS]
@@ -260,12 +253,8 @@ def test_invalid_thread_counts_are_rejected() -> None:
     for threads in (0, -1, 65):
         with pytest.raises(sc.StateError, match="threads"):
             stepper.start(q, h=0.1, threads=threads)
-    rods = sc.LagrangianSystem.from_text(
-        name="rods",
-        coordinates=["r[N, 2]"],
-        lagrangian="sum(i in N, sum(a in 2, r_dot[i, a]**2)/2)",
-        constraints=["sum(a in 2, r[i, a]**2) = 1 for i in N"],
-    )
+    text = "sum(i in N, sum(a in 2, r_dot[i, a]**2)/2)"
+    rods = lagrange("rods", ["r[N, 2]"], text, constraints=["sum(a in 2, r[i, a]**2) = 1 for i in N"])
     with pytest.raises(sc.MethodError, match="the step uses one"):
         sc.compile_stepper(rods, "stoermer-verlet").start(np.array([[1.0, 0.0]]), h=0.1, threads=2)
 

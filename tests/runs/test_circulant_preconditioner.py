@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.codegen.lowering.program import lower_arrays
@@ -38,12 +39,8 @@ def stepper_of(name, method="svi:4", solver="newton"):
 
 def lattice(name):
     potential = LATTICES[name]
-    return sc.LagrangianSystem.from_text(
-        name=name,
-        coordinates=["q[NX, NY]" if "NX" in potential else "q[N]"],
-        parameters={"k": 1},
-        lagrangian=f"{KINETIC[2 if 'NX' in potential else 1]} - ({potential})",
-    )
+    text = f"{KINETIC[2 if 'NX' in potential else 1]} - ({potential})"
+    return lagrange(name, ["q[NX, NY]" if "NX" in potential else "q[N]"], text, k=1)
 
 
 def smooth(shape):
@@ -79,13 +76,12 @@ def test_fourier_modes_of_a_plane_decouple(shape):
 
 def test_each_array_has_its_circulant_preconditioner():
     """Components, and arrays of other axes: all are asked at a time, and none answers for another."""
-    arrays = sc.LagrangianSystem.from_text(
-        name="arrays",
-        coordinates=["r[N, 3]", "u[NX, NY]"],
-        lagrangian="sum(i in N, sum(a in 3, r_dot[i, a]**2/2)) + sum(i in NX, j in NY, u_dot[i, j]**2/2)"
+    text = (
+        "sum(i in N, sum(a in 3, r_dot[i, a]**2/2)) + sum(i in NX, j in NY, u_dot[i, j]**2/2)"
         "- sum(i in N periodic, 9*(r[i+1, 0] - r[i, 0])**2 + 900*(r[i+2, 1] - r[i, 1])**2 + r[i, 2]**2)"
-        "- sum(i in NX periodic, j in NY periodic, 300*(u[i+1, j] - u[i, j+1])**2)",
+        "- sum(i in NX periodic, j in NY periodic, 300*(u[i+1, j] - u[i, j+1])**2)"
     )
+    arrays = lagrange("arrays", ["r[N, 3]", "u[NX, NY]"], text)
     stepper = sc.compile_stepper(arrays, "svi:4", solver="newton")
     start = {"r": RANDOM.normal(size=(60, 3)), "u": RANDOM.normal(size=(20, 33))}
     assert products_of(stepper, start, 1.0) <= 3
@@ -121,12 +117,8 @@ def test_corrections_are_accurate_in_badly_scaled_systems(name):
 
 def test_diagonal_preconditioner_is_used_for_nonuniform_lattices():
     """Places that differ by a factor of a million, with springs between them that are soft to most."""
-    places = sc.LagrangianSystem.from_text(
-        name="places",
-        coordinates=["q[N]"],
-        parameters={"w[N]": 1},
-        lagrangian="sum(i in N, q_dot[i]**2/2 - w[i]*q[i]**2/2) - sum(i in N periodic, 2*(q[i+1] - q[i])**2)",
-    )
+    text = "sum(i in N, q_dot[i]**2/2 - w[i]*q[i]**2/2) - sum(i in N periodic, 2*(q[i+1] - q[i])**2)"
+    places = lagrange("places", "q[N]", text, parameters={"w[N]": 1})
     stepper, w = sc.compile_stepper(places, "svi:4", solver="newton"), 10.0 ** RANDOM.uniform(0, 6, size=400)
     assert products_of(stepper, RANDOM.normal(size=400), 1.0, parameters={"w": w}) <= 120
 
@@ -146,25 +138,17 @@ def test_diagonal_preconditioner_is_used_for_nonuniform_lattices():
     ],
 )
 def test_systems_with_a_circulant_preconditioner(term, reach):
-    system = sc.LagrangianSystem.from_text(
-        name="some",
-        coordinates=["u[N, 2]"],
-        parameters={"w[B]": 1},
-        tables=["bonds[B, 2]"],
-        lagrangian=f"sum(i in N, sum(a in 2, u_dot[i, a]**2/2)) - {term}",
-    )
+    text = f"sum(i in N, sum(a in 2, u_dot[i, a]**2/2)) - {term}"
+    system = lagrange("some", ["u[N, 2]"], text, parameters={"w[B]": 1}, tables=["bonds[B, 2]"])
     assert lower_arrays(system, sc.as_method("svi:2"), prefix="some", solver="newton").loops.reach == reach
 
 
 @pytest.mark.quick
 @pytest.mark.parametrize(("coordinates", "reach"), [(["u[N]"], 1), (["u[N]", "s"], 0), (["u[N]", "r[3]"], 0)])
 def test_circulant_preconditioner_requires_lattices_only(coordinates, reach):
-    system = sc.LagrangianSystem.from_text(
-        name="some",
-        coordinates=coordinates,
-        lagrangian="sum(i in N, u_dot[i]**2/2) - sum(i in N periodic, (u[i+1] - u[i])**2)"
-        + {1: "", 0: " + s_dot**2/2 - s**2" if "s" in coordinates else " + sum(a in 3, r_dot[a]**2/2 - r[a]**2)"}[
-            reach
-        ],
+    text = (
+        "sum(i in N, u_dot[i]**2/2) - sum(i in N periodic, (u[i+1] - u[i])**2)"
+        + {1: "", 0: " + s_dot**2/2 - s**2" if "s" in coordinates else " + sum(a in 3, r_dot[a]**2/2 - r[a]**2)"}[reach]
     )
+    system = lagrange("some", coordinates, text)
     assert lower_arrays(system, sc.as_method("svi:2"), prefix="some", solver="newton").loops.reach == reach

@@ -285,9 +285,7 @@ def test_a_coordinate_that_does_not_move_is_confirmed():
 @pytest.mark.rotated
 @pytest.mark.filterwarnings("error")
 def test_rest_is_confirmed_and_its_energy_is_that_of_rounding():
-    body = sc.LagrangianSystem.from_text(
-        "body", [], "(omega_1**2 + 2*omega_2**2 + 3*omega_3**2)/2", rotations={"R": "omega"}
-    )
+    body = lagrange("body", [], "(omega_1**2 + 2*omega_2**2 + 3*omega_3**2)/2", rotations={"R": "omega"})
     start = {"velocity": {"omega": [0.0, 0.0, 0.0]}, "t_end": 20.0}
     run = sc.compile_stepper(body, "svi:6").integrate({"R": [1.0, 0.0, 0.0, 0.0]}, **start, error=1e-9)
     assert run.confirmation.confirmed

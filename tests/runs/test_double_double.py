@@ -380,12 +380,7 @@ def test_velocities_at_times_of_two_words() -> None:
     text = "(2 + sin(t))*(x_dot**2 + y_dot**2)/2 - x**2*cos(t)/2 + t*x_dot"
     moving = sc.LagrangianSystem.from_text(name="moving", coordinates=["x", "y"], lagrangian=text)
     stepper = sc.compile_stepper(moving, "svi:4", precision="double-double")
-    ring = sc.LagrangianSystem.from_text(
-        name="ring",
-        coordinates=["x", "y"],
-        lagrangian="(x_dot**2 + y_dot**2)/2",
-        constraints=["x**2 + y**2 = (1 + sin(t)/4)**2"],
-    )
+    ring = lagrange("ring", "x y", "(x_dot**2 + y_dot**2)/2", constraints=["x**2 + y**2 = (1 + sin(t)/4)**2"])
     with mp.workdps(40):
         t = 3 + mp.mpf(3) / 10**17
         run = stepper.integrate(["1", "0"], velocity=["0.3", "0.1"], t=t, h=1 / 64, steps=1)
@@ -453,12 +448,7 @@ def test_ensembles(tmp_path: Path) -> None:
 @pytest.mark.rotated
 def test_explicit_ensembles() -> None:
     """Trajectories in SIMD lanes equal the formulas in 50 digits, whatever their neighbours are."""
-    driven = sc.LagrangianSystem.from_text(
-        name="driven",
-        coordinates=["x", "y"],
-        parameters={"m": 1.0, "k": 1.0},
-        lagrangian="m*(x_dot**2 + 2*y_dot**2)/2 - k*cos(x - y) - x*y**2*sin(t)",
-    )
+    driven = lagrange("driven", "x y", "m*(x_dot**2 + 2*y_dot**2)/2 - k*cos(x - y) - x*y**2*sin(t)", m=1.0, k=1.0)
     starts = [[f"0.{j}1", f"-1/{j + 3}"] for j in range(11)]
     numbers = {"m": [f"1.{j}" for j in range(11)], "k": "0.3"}
     with mp.workdps(50):

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 from mpmath import mp
+from notation import hamilton, lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.common.errors import EventError, EventWarning, MethodError
 from scvi_codegen.runs.states.words import as_mpmath
 
-BALL = sc.LagrangianSystem.from_text(
-    name="ball", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y", parameters={"e": 0.8, "b": 8.0}
-)
+BALL = lagrange("ball", "x y", "(x_dot**2 + y_dot**2)/2 - y", e=0.8, b=8.0)
 FLOOR = sc.impact("y + x**2/b - sin(2*t)/20", restitution="e")
 KICK = sc.Event("t - 1/3", then={"y_dot": "y_dot + 1/7", "x": "x - 1/9"})
 PARAMETERS = {"e": "0.8", "b": 8}
@@ -134,12 +133,7 @@ def test_edge() -> None:
 
     A pass leaves 1/(1 + 3 a^2) of the rate of approach, 0.1 or 0.2. The second is too slow for 31 digits, not for 16.
     """
-    point = sc.LagrangianSystem.from_text(
-        name="point",
-        coordinates=["x", "y", "z"],
-        lagrangian="(x_dot**2 + y_dot**2 + z_dot**2)/2 + 2*x - 2*z",
-        parameters={"a": 1.0},
-    )
+    point = lagrange("point", "x y z", "(x_dot**2 + y_dot**2 + z_dot**2)/2 + 2*x - 2*z", a=1.0)
     walls = [sc.impact("x - y", restitution=0), sc.impact("a*(x + y - 2*z) - x + y", restitution=0)]
     stepper = compiled(point, "svi:2", events=walls)
     with mp.workdps(50):
@@ -178,9 +172,7 @@ def test_recordings(steps: dict[str, float], tmp_path: Path) -> None:
 @pytest.mark.rotated
 def test_energies_of_impacts() -> None:
     """Impacts conserve energies that are not quadratic in p, also with constraints, to 31 digits."""
-    fast = sc.HamiltonianSystem.from_text(
-        name="fast", coordinates=["x", "y"], momenta=["a", "b"], hamiltonian="sqrt(1 + a**2 + 2*b**2) + y"
-    )
+    fast = hamilton("fast", "x y", "sqrt(1 + a**2 + 2*b**2) + y", momenta="a b")
     run = compiled(fast, "svi:6").integrate(
         ["0", "1"], ["0.7", "0.2"], h=0.125, steps=60, events=sc.impact("y + x/3 + 1/10")
     )
@@ -198,9 +190,7 @@ def test_energies_of_impacts() -> None:
 @pytest.mark.rotated
 def test_constraints() -> None:
     """A rod that hits a wall is a pendulum that reverses its angular velocity, times a restitution."""
-    rod = sc.LagrangianSystem.from_text(
-        name="rod", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 - 1"]
-    )
+    rod = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 - 1"])
     angle = sc.LagrangianSystem.from_text(name="angle", coordinates=["a"], lagrangian="a_dot**2/2 + cos(a)")
     with mp.workdps(50):
         a, rate = mp.mpf("0.75"), mp.mpf("0.5")

@@ -7,18 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 from mpmath import mp
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.runs.states.words import as_mpmath, product_of, quotient_of, sum_of, with_low
 
 pytestmark = pytest.mark.rotated
 
-KEPLER = sc.LagrangianSystem.from_text(
-    name="kepler",
-    coordinates=["x", "y"],
-    lagrangian="(x_dot**2 + y_dot**2)/2 + mu/sqrt(x**2 + y**2)",
-    parameters={"mu": 1.0},
-)
+KEPLER = lagrange("kepler", "x y", "(x_dot**2 + y_dot**2)/2 + mu/sqrt(x**2 + y**2)", mu=1.0)
 RADIUS = "sqrt(x**2 + y**2)"
 
 

@@ -153,11 +153,8 @@ def test_numbers_of_first_order_states() -> None:
         many = stepper.integrate_ensemble({"x": ["1/3", np.int64(1)], "y": "0.1"}, **step)
         assert abs(many.mp("x")[0] - [expected[0], 1]).max() < 1e-32
         assert abs(many.mp("y")[0] - expected[1]).max() < 1e-32
-        turning = sc.LagrangianSystem.from_text(
-            name="turning",
-            coordinates=["x"],
-            rotations={"R": "w"},
-            lagrangian="x_dot**2/2 + (w_1**2 + 2*w_2**2 + 3*w_3**2)/2 - x**2/2 - R_11*x",
+        turning = lagrange(
+            "turning", "x", "x_dot**2/2 + (w_1**2 + 2*w_2**2 + 3*w_3**2)/2 - x**2/2 - R_11*x", rotations={"R": "w"}
         )
         body = sc.compile_stepper(turning, "svi:1", precision="double-double")
         run = body.integrate({"x": "1/3", "R": np.eye(3)}, velocity={"x": "0.1", "w": [1, 2, 3]}, **step)
@@ -181,12 +178,8 @@ def test_constraints_from_rest_at_zero(h: float) -> None:
 
     def run(c: str, start: int) -> sc.Trajectory:
         loop = [f"cos(a) - 4*cos(a + b) - 5*sin({c}) + 3", f"sin(a) - 4*sin(a + b) + 5*cos({c}) - 5"]
-        linkage = sc.LagrangianSystem.from_text(
-            name="linkage",
-            coordinates=["a", "b", "c"],
-            lagrangian="(a_dot**2 + b_dot**2 + c_dot**2)/2",
-            forces={"a": "1"},
-            constraints=loop,
+        linkage = lagrange(
+            "linkage", "a b c", "(a_dot**2 + b_dot**2 + c_dot**2)/2", forces={"a": "1"}, constraints=loop
         )
         stepper = sc.compile_stepper(linkage, "svi:4", precision="double-double")
         return stepper.integrate([0, 0, start], velocity=[0, 0, 0], h=h, steps=5)

@@ -554,12 +554,8 @@ def test_impacts_of_relativistic_pendulums_contain_the_work_of_a_moving_constrai
 
 def test_derivatives_through_impacts_of_a_moving_rod_with_a_quartic_kinetic_energy():
     """Differences of sixth order also require impacts that depend smoothly on the initial state, to round-off."""
-    rod = sc.LagrangianSystem.from_text(
-        name="quartic",
-        coordinates=["x", "y"],
-        lagrangian="(x_dot**2 + y_dot**2)/2 + (x_dot**2 + y_dot**2)**2/8 - y/4",
-        constraints=["(x - 3*sin(t)/10)**2 + y**2 - 1"],
-    )
+    text = "(x_dot**2 + y_dot**2)/2 + (x_dot**2 + y_dot**2)**2/8 - y/4"
+    rod = lagrange("quartic", "x y", text, constraints=["(x - 3*sin(t)/10)**2 + y**2 - 1"])
     stepper, q = sc.compile_stepper(rod, "svi:4", flags=FLAGS), np.array([np.sin(-0.4), -np.cos(-0.4)])
     wall, unit = sc.impact("3/10 + sin(2*t)/20 - x", 0.9), np.array([np.cos(-0.4), np.sin(-0.4)])
 

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from notation import hamilton, lagrange
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 
 pytestmark = pytest.mark.rotated
 
-TOP = sc.LagrangianSystem.from_text(
-    "top",
-    rotations={"R": "omega"},
-    parameters={"A": 1.3, "B": 1.8, "g": 1.2},
-    lagrangian="(A*omega_1**2 + B*omega_2**2 + omega_3**2/2)/2 - g*R_33",
+TOP = lagrange(
+    "top", (), "(A*omega_1**2 + B*omega_2**2 + omega_3**2/2)/2 - g*R_33", rotations={"R": "omega"}, A=1.3, B=1.8, g=1.2
 )
 TRUE = {"A": 1.2, "B": 1.7, "g": 1.3}
 ENTRIES = [f"R_{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)]
@@ -68,12 +66,7 @@ def test_body_momenta_are_measurements(stepper, true):
 
 
 def test_spins_are_fitted_without_their_phase():
-    pair = sc.HamiltonianSystem.from_text(
-        "pair",
-        spins=["a", "b"],
-        parameters={"J": 1.0, "f": 0.5},
-        hamiltonian="J*(a_1*b_1 + a_2*b_2 + 1.5*a_3*b_3) + f*a_3",
-    )
+    pair = hamilton("pair", (), "J*(a_1*b_1 + a_2*b_2 + 1.5*a_3*b_3) + f*a_3", spins=["a", "b"], J=1.0, f=0.5)
     stepper = sc.compile_stepper(pair, "svi:2", flags=QUICK_FLAGS)
     run = stepper.integrate({"a": [1, 0, 0], "b": [0, 0.6, 0.8]}, h=0.05, steps=80, parameters={"J": 1.1, "f": 0.6})
     measured, names = np.hstack([run.spin("a"), run.spin("b")]), [f"{s}_{k}" for s in "ab" for k in (1, 2, 3)]

@@ -3,17 +3,14 @@
 import numpy as np
 import pytest
 import sympy
-from notation import hamilton
+from notation import hamilton, lagrange
 from samples import QUICK_FLAGS
 from sympy.physics.mechanics import Point, ReferenceFrame, RigidBody, dynamicsymbols, inertia
 
 import scvi_codegen as sc
 
-TOP = sc.LagrangianSystem.from_text(
-    "heavy top",
-    rotations={"R": "omega"},
-    parameters={"w": 1.0},
-    lagrangian="(3*omega_1**2/2 + 5*omega_2**2/2 + 3*omega_3**2/2)/2 - w*R_33",
+TOP = lagrange(
+    "heavy top", (), "(3*omega_1**2/2 + 5*omega_2**2/2 + 3*omega_3**2/2)/2 - w*R_33", rotations={"R": "omega"}, w=1.0
 )
 START = {"q": {"R": [1, 0.3, 0, 0.1]}, "velocity": {"omega": [0.1, 0.2, 1]}}
 

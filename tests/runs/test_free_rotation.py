@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 from samples import QUICK_FLAGS
 from scipy.spatial.transform import Rotation
 
@@ -42,9 +43,7 @@ def compiled(system, method, **how):
 
 @pytest.mark.second
 def test_a_symmetric_body_rotates_exactly_in_a_step_of_any_size():
-    system = sc.LagrangianSystem.from_text(
-        "free", rotations={"R": "omega"}, lagrangian="(omega_1**2 + 2*omega_2**2 + 2*omega_3**2)/2"
-    )
+    system = lagrange("free", (), "(omega_1**2 + 2*omega_2**2 + 2*omega_3**2)/2", rotations={"R": "omega"})
     stepper, momentum = compiled(system, "stoermer-verlet"), OMEGA * (1, 2, 2)
     for h in (0.05, 0.2, 7.0):
         run = stepper.integrate({"R": ATTITUDE}, velocity={"omega": OMEGA}, h=h, steps=1)
@@ -98,13 +97,8 @@ def test_hamiltonians_with_rotations_have_the_same_steps(moving):
 @pytest.mark.rotated
 def test_arrays_of_bodies_move_as_by_an_implicit_method():
     body = "2*omega_1[i]**2 + J[i]*omega_2[i]**2 + 2*omega_3[i]**2 + x_dot[i]**2/2 - x[i]*R_33[i]"
-    system = sc.LagrangianSystem.from_text(
-        name="bodies",
-        coordinates=["x[N]"],
-        lagrangian=f"sum(i in N, {body}) - sum(i < j in N, R_13[i]*R_13[j] + x[i]*x[j]/2)",
-        parameters={"J[N]": 1},
-        rotations={"R[N]": "omega"},
-    )
+    text = f"sum(i in N, {body}) - sum(i < j in N, R_13[i]*R_13[j] + x[i]*x[j]/2)"
+    system = lagrange("bodies", "x[N]", text, parameters={"J[N]": 1}, rotations={"R[N]": "omega"})
     start = {"x": [0.3, -0.2], "R": [[1, 0.2, 0, 0.3], [0.5, 0.5, -0.1, 0]]}
     moving = {"x": [0, 0.1], "omega": [[0.7, -0.4, 1.5], [0.2, 1.0, -0.3]]}
     ends = []

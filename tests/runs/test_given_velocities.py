@@ -46,12 +46,8 @@ def test_velocity_with_zero_momentum_is_accepted():
 @pytest.mark.second
 def test_velocities_of_nonlinear_momenta_are_found_to_round_off():
     """Newton's iteration for L_v = p, where one that ends early is seen only when it ends between two squares."""
-    system = sc.LagrangianSystem.from_text(
-        name="relativistic particle in space",
-        coordinates=["x", "y", "z"],
-        lagrangian="-m*c**2*sqrt(1 - (x_dot**2 + y_dot**2 + z_dot**2)/c**2) - x*y - z**2",
-        parameters={"m": 0.7, "c": 1.3},
-    )
+    text = "-m*c**2*sqrt(1 - (x_dot**2 + y_dot**2 + z_dot**2)/c**2) - x*y - z**2"
+    system = lagrange("relativistic particle in space", "x y z", text, m=0.7, c=1.3)
     stepper = sc.compile_stepper(system, sc.SVI(1), flags=QUICK_FLAGS)
     generator, (m, c) = np.random.default_rng(5), (0.7, 1.3)
     for p in generator.normal(size=(100, 3)):

@@ -408,13 +408,11 @@ class TestOtherRuns:
         assert run.confirmed_until == 6.0
 
     def test_confirmed_runs_of_arrays(self):
-        system = sc.LagrangianSystem.from_text(
-            name="chain",
-            coordinates=["q[N]"],
-            lagrangian="sum(i in N, q_dot[i]**2/2) - sum(i in N - 1, (q[i+1] - q[i])**2/2 + k*(q[i+1] - q[i])**4/4)"
-            " - q[0]**2/2 - k*q[0]**4/4 - q[N - 1]**2/2 - k*q[N - 1]**4/4",
-            parameters={"k": 0.0},
+        text = (
+            "sum(i in N, q_dot[i]**2/2) - sum(i in N - 1, (q[i+1] - q[i])**2/2 + k*(q[i+1] - q[i])**4/4)"
+            " - q[0]**2/2 - k*q[0]**4/4 - q[N - 1]**2/2 - k*q[N - 1]**4/4"
         )
+        system = lagrange("chain", "q[N]", text, k=0.0)
         start = [0.5, -0.3, 0.8, 0.1]
         stepper = sc.compile_stepper(system, "svi:6")
         run = stepper.integrate(start, [0.0] * 4, t=2.0, t_end=12.0, parameters={"k": 0.3}, error=1e-9)

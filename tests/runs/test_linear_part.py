@@ -106,10 +106,6 @@ def test_fast_vibrations_that_cannot_be_extrapolated_begin_with_a_straight_line(
     count, q = 8, [0.9 * np.sin(np.pi * (k + 1) / 9) for k in range(8)]
     ends = ["0", *(f"q{k}" for k in range(count)), "0"]
     springs = [f"-({b} - {a})**2/2 - ({b} - {a})**4/4" for a, b in pairwise(ends)]
-    chain = sc.LagrangianSystem.from_text(
-        name="fput",
-        coordinates=ends[1:-1],
-        lagrangian="+".join(f"q{k}_dot**2/2" for k in range(count)) + "".join(springs),
-    )
+    chain = lagrange("fput", ends[1:-1], "+".join(f"q{k}_dot**2/2" for k in range(count)) + "".join(springs))
     run = sc.compile_stepper(chain, SVI(8)).integrate(q, [0.0] * count, t_end=400.0, tolerance=1e-2)
     assert run.iterations.sum() < 450

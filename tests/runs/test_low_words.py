@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from notation import hamilton
+from notation import hamilton, lagrange
 from oracle import collocation_tableau, points
 from samples import QUICK_FLAGS
 
@@ -50,21 +50,13 @@ def coupled_hamiltonian() -> sc.HamiltonianSystem:
 
 def rod() -> sc.LagrangianSystem:
     """Two bodies on a rod, and a third: the lengths along x alone are compared."""
-    return sc.LagrangianSystem.from_text(
-        name="rod",
-        coordinates=["x", "y", "z", "w"],
-        lagrangian="x_dot**2 + y_dot**2/2 + z_dot**2/4 + w_dot**2/2 - (y - z)**4/4 + cos(z - x + t)/3",
-        constraints=["(x - y)**2 + w**2 = 1"],
-    )
+    text = "x_dot**2 + y_dot**2/2 + z_dot**2/4 + w_dot**2/2 - (y - z)**4/4 + cos(z - x + t)/3"
+    return lagrange("rod", "x y z w", text, constraints=["(x - y)**2 + w**2 = 1"])
 
 
 def array() -> sc.LagrangianSystem:
-    return sc.LagrangianSystem.from_text(
-        name="bodies of an array",
-        coordinates=["q[N]"],
-        parameters={"m[N]": 1.0},
-        lagrangian="sum(i in N, m[i]*q_dot[i]**2/2) - sum(i in 0..N-2, (q[i+1] - q[i])**2 + (q[i+1] - q[i])**4/4)",
-    )
+    text = "sum(i in N, m[i]*q_dot[i]**2/2) - sum(i in 0..N-2, (q[i+1] - q[i])**2 + (q[i+1] - q[i])**4/4)"
+    return lagrange("bodies of an array", "q[N]", text, parameters={"m[N]": 1.0})
 
 
 RATTLE = {"method": "svi", "degree": 1, "quadrature": "gauss-lobatto:2"}

@@ -10,6 +10,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from notation import lagrange
 from samples import QUICK_FLAGS
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
@@ -293,9 +294,7 @@ MOTIONS = {
     "double body": double_body(DOUBLE),
     "jointed bodies": double_body(JOINTED, *centres_of_mass()),
     "direction": Motion(
-        sc.LagrangianSystem.from_text(
-            "spherical pendulum", directions=["n"], lagrangian="(n_1_dot**2 + n_2_dot**2 + n_3_dot**2)/2 - 2*n_3"
-        ),
+        lagrange("spherical pendulum", (), "(n_1_dot**2 + n_2_dot**2 + n_3_dot**2)/2 - 2*n_3", directions=["n"]),
         lambda: [solve(pendulum_rates, np.r_[N, V], 2)[:3]],
         {"n": N},
         {"n": V},

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 from scipy.integrate import solve_ivp
 
 import scvi_codegen as sc
@@ -14,12 +15,8 @@ LIGHT, SPAN = 1e-4, 5.0
 @pytest.fixture(scope="module")
 def cart():
     """A pendulum on a cart of a ten-thousandth of its mass, which is flung aside whenever the bob passes below."""
-    return sc.LagrangianSystem.from_text(
-        name="light cart",
-        coordinates=["x", "th"],
-        lagrangian="(M + m)*x_dot**2/2 + m*l*x_dot*th_dot*cos(th) + m*l**2*th_dot**2/2 + m*g*l*cos(th)",
-        parameters={"M": LIGHT, "m": 1.0, "l": 1.0, "g": 9.81},
-    )
+    text = "(M + m)*x_dot**2/2 + m*l*x_dot*th_dot*cos(th) + m*l**2*th_dot**2/2 + m*g*l*cos(th)"
+    return lagrange("light cart", "x th", text, M=LIGHT, m=1.0, l=1.0, g=9.81)
 
 
 @pytest.fixture(scope="module")
@@ -60,13 +57,8 @@ def test_step_count_is_bounded_by_the_tolerance(stepper):
 
 def test_first_step_of_a_sleeping_top_is_not_tiny():
     """At phi = psi = 0 the shortest steps show nothing but rounding, as a part of hardly any motion."""
-    top = sc.LagrangianSystem.from_text(
-        name="sleeping top",
-        coordinates=["phi", "theta", "psi"],
-        lagrangian="A*(theta_dot**2 + phi_dot**2*sin(theta)**2)/2"
-        " + C*(psi_dot + phi_dot*cos(theta))**2/2 - g*cos(theta)",
-        parameters={"A": 1.0, "C": 0.4, "g": 1.5},
-    )
+    text = "A*(theta_dot**2 + phi_dot**2*sin(theta)**2)/2 + C*(psi_dot + phi_dot*cos(theta))**2/2 - g*cos(theta)"
+    top = lagrange("sleeping top", "phi theta psi", text, A=1.0, C=0.4, g=1.5)
     run = sc.compile_stepper(top, sc.SVI(8)).integrate([0, 0.05, 0], velocity=[0.1, 0.3, 8.0], t_end=3.0)
     assert run.steps < 200
     assert np.ptp(run.energy()) < 1e-13 * run.energy()[0]

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from notation import lagrange
 from programs import needs
 
 import scvi_codegen as sc
@@ -27,13 +28,8 @@ CUT = 1.9
 def liquid(skin: float | None = 0.3, pair: str = WELL) -> Any:
     """Return the liquid with a list of neighbours, or with all pairs."""
     near = {"near": {"of": "r", "box": "box", "cutoff": "cut", "skin": skin}}
-    return sc.LagrangianSystem.from_text(
-        name="liquid",
-        coordinates=["r[N, 3]"],
-        parameters={"box": BOX, "cut": CUT},
-        neighbours=near if skin else None,
-        lagrangian=f"{KINETIC} - sum(i < j in {'near' if skin else 'N'}, {pair})",
-    )
+    text = f"{KINETIC} - sum(i < j in {'near' if skin else 'N'}, {pair})"
+    return lagrange("liquid", ["r[N, 3]"], text, neighbours=near if skin else None, box=BOX, cut=CUT)
 
 
 @cache

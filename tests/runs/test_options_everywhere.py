@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.common.errors import ScviCodegenError
@@ -19,9 +20,7 @@ from scvi_codegen.interfaces.distributed import integrate_ensemble
 from scvi_codegen.runs.ensembles import batches
 
 PENDULUM = sc.LagrangianSystem.from_text("pendulum", ["x"], "x_dot**2/2 + k*cos(x)", parameters={"k": 1.0})
-PUSHED = sc.LagrangianSystem.from_text(
-    "pushed", ["x"], "x_dot**2/2 + k*cos(x)", forces={"x": "u - x_dot/10"}, parameters={"k": 1.0}, inputs=["u"]
-)
+PUSHED = lagrange("pushed", "x", "x_dot**2/2 + k*cos(x)", forces={"x": "u - x_dot/10"}, inputs="u", k=1.0)
 Q, P = np.array([[1.0], [1.2], [0.7]]), np.array([[0.0], [0.1], [-0.2]])
 FIXED, ADAPTIVE = {"h": 0.125, "steps": 40}, {"t_end": 5.0}
 PULSE = {"inputs": {"u": ([0.0, 2.0, 5.0], [0.0, 1.0, 0.0])}}

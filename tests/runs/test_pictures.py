@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
@@ -14,14 +15,11 @@ pytestmark = pytest.mark.rotated
 
 @pytest.fixture(scope="module")
 def run():
-    system = sc.LagrangianSystem.from_text(
-        "top beside a pendulum",
-        ["x", "y", "z"],
+    text = (
         "(x_dot**2 + y_dot**2 + z_dot**2)/2 + (omega_1**2 + omega_2**2 + omega_3**2/2)/2 - R_33"
-        " + (n_1_dot**2 + n_2_dot**2 + n_3_dot**2)/2 - n_3",
-        rotations={"R": "omega"},
-        directions=["n"],
+        " + (n_1_dot**2 + n_2_dot**2 + n_3_dot**2)/2 - n_3"
     )
+    system = lagrange("top beside a pendulum", "x y z", text, rotations={"R": "omega"}, directions=["n"])
     return sc.compile_stepper(system, "svi:2", flags=QUICK_FLAGS).integrate(
         {"x": 1, "y": 0, "z": 0, "R": {"axis": [1, 0, 0], "angle": 0.6}, "n": [1, 0, 0]},
         velocity={"x": 0.1, "y": 0, "z": 0.2, "omega": [0, 0, 6], "n": [0, 0.3, 0]},

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from notation import hamilton, lagrange
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
@@ -17,12 +18,10 @@ from scvi_codegen.runs.states.reduction import Reduction
 
 pytestmark = pytest.mark.rotated
 
-BODY = sc.LagrangianSystem.from_text(
-    "free body", rotations={"R": "omega"}, lagrangian="(omega_1**2 + 2*omega_2**2 + 2.5*omega_3**2)/2"
-)
-MIXED = sc.LagrangianSystem.from_text(
+BODY = lagrange("free body", (), "(omega_1**2 + 2*omega_2**2 + 2.5*omega_3**2)/2", rotations={"R": "omega"})
+MIXED = lagrange(
     "body, pendulum and mass",
-    ["x"],
+    "x",
     "x_dot**2/2 - x**2/2 + (omega_1**2 + 2*omega_2**2 + omega_3**2/2)/2 - x*R_33"
     " + (n_1_dot**2 + n_2_dot**2 + n_3_dot**2)/2 - n_3*(1 + R_13)",
     rotations={"R": "omega"},
@@ -30,9 +29,7 @@ MIXED = sc.LagrangianSystem.from_text(
 )
 START = {"x": 0, "n": [1, 0, 0], "R": {"euler": "zxz", "angles": [0.3, 0.8, -0.4]}}
 MOVING = {"x": 1, "n": [0, 0.2, 0.1], "omega": [0.7, -0.4, 2.5]}
-SPINS = sc.HamiltonianSystem.from_text(
-    "three spins", spins=["a", "b", "c"], hamiltonian="a_1*b_1 + 2*a_2*b_2 + b_3*c_3 + b_1*c_2 + a_1/3 + c_3/2"
-)
+SPINS = hamilton("three spins", (), "a_1*b_1 + 2*a_2*b_2 + b_3*c_3 + b_1*c_2 + a_1/3 + c_3/2", spins=["a", "b", "c"])
 DIRECTIONS = {"a": [1, 0, 0], "b": [0, 0.6, 0.8], "c": [0, 0, -1]}
 
 

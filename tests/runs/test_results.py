@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from notation import hamilton, lagrange
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 
 pytestmark = pytest.mark.rotated
 
-TOP = sc.LagrangianSystem.from_text(
+TOP = lagrange(
     "top on a spring beside a pendulum",
-    ["x"],
+    "x",
     "x_dot**2/2 - x**2/2 + (omega_1**2 + 2*omega_2**2 + omega_3**2/2)/2 - x*R_33"
     " + (n_1_dot**2 + n_2_dot**2 + n_3_dot**2)/2 - n_3",
     rotations={"R": "omega"},
@@ -69,11 +70,8 @@ def test_datasets_have_vectors_with_named_axes(stepper, run):
 
 def test_spins_and_body_momenta_of_a_hamiltonian_are_named():
     pytest.importorskip("pandas")
-    system = sc.HamiltonianSystem.from_text(
-        "spin in a top",
-        rotations={"R": "Pi"},
-        spins=["s"],
-        hamiltonian="(Pi_1**2 + 2*Pi_2**2 + 3*Pi_3**2)/2 + s_3*R_33 + s_1",
+    system = hamilton(
+        "spin in a top", (), "(Pi_1**2 + 2*Pi_2**2 + 3*Pi_3**2)/2 + s_3*R_33 + s_1", rotations={"R": "Pi"}, spins=["s"]
     )
     stepper = sc.compile_stepper(system, "svi:2", flags=QUICK_FLAGS)
     run = stepper.integrate({"R": [1, 0, 0, 0], "s": [0, 0.6, 0.8]}, {"Pi": [1, 2, 3]}, h=0.1, steps=4)

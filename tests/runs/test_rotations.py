@@ -6,6 +6,7 @@ References integrate Euler's equations for (q, omega), in which nothing of the p
 import numpy as np
 import pytest
 import sympy
+from notation import hamilton
 from samples import QUICK_FLAGS
 from scipy.spatial.transform import Rotation
 
@@ -56,12 +57,8 @@ def test_velocities_are_rejected_where_there_are_spins():
 
 @pytest.mark.second
 def test_a_hamiltonian_in_body_momenta_is_that_of_the_lagrangian():
-    system = sc.HamiltonianSystem.from_text(
-        "heavy top",
-        rotations={"R": "Pi"},
-        parameters={"A": 1.0, "B": 2.0, "C": 3.0, "g": 1.3},
-        hamiltonian="(Pi_1**2/A + Pi_2**2/B + Pi_3**2/C)/2 + g*rotate_3(R, 0.1, 0.2, 1)",
-    )
+    text = "(Pi_1**2/A + Pi_2**2/B + Pi_3**2/C)/2 + g*rotate_3(R, 0.1, 0.2, 1)"
+    system = hamilton("heavy top", (), text, rotations={"R": "Pi"}, A=1.0, B=2.0, C=3.0, g=1.3)
     by_momentum = compiled(system, "svi:4").integrate({"R": ATTITUDE}, {"Pi": INERTIA * OMEGA}, h=0.1, steps=20)
     by_velocity = compiled(TOP, "svi:4").integrate({"R": ATTITUDE}, velocity={"omega": OMEGA}, h=0.1, steps=20)
     np.testing.assert_allclose(by_momentum.rotation(), by_velocity.rotation(), rtol=0, atol=1e-14)

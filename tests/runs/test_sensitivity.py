@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from certified_cases import Case
 from certified_cases import case as certified
+from notation import lagrange
 from numpy.testing import assert_allclose
 from samples import QUICK_FLAGS
 from scipy.linalg import block_diag
@@ -19,14 +20,9 @@ from scvi_codegen.runs.stepping.step_derivatives import Starts
 
 def pushed_pendulum():
     """A damped pendulum with an input, whose five parameters are those of its piece."""
-    return sc.LagrangianSystem.from_text(
-        name="pushed pendulum",
-        coordinates=["q"],
-        lagrangian="l*q_dot**2/2 + cos(q)",
-        parameters={"l": 1.2, "c": 0.1},
-        forces={"q": "u"},
-        dissipation="c*q_dot**2/2",
-        inputs=["u"],
+    text = "l*q_dot**2/2 + cos(q)"
+    return lagrange(
+        "pushed pendulum", "q", text, forces={"q": "u"}, dissipation="c*q_dot**2/2", inputs="u", l=1.2, c=0.1
     ).with_parameters(u_0=0.3, u_1=-0.2, u_2=0.5, u_3=0.1, u_t=0.05)
 
 

@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.codegen.native import capacity
 
 OSCILLATOR = sc.LagrangianSystem.from_text("oscillator", ["x"], "x_dot**2/2-w**2*x**2/2", parameters={"w": 1.0})
-ARRAY = sc.LagrangianSystem.from_text(
-    "array", ["x[N]"], "sum(i in N, x_dot[i]**2-w**2*x[i]**2)/2", parameters={"w": 1.0}
-)
+ARRAY = lagrange("array", "x[N]", "sum(i in N, x_dot[i]**2-w**2*x[i]**2)/2", w=1.0)
 SLOW, FAST, TIME = 1.0, 2e4, 1.0
 
 

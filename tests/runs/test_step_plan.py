@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mpmath import mp
+from notation import lagrange
 from numpy.testing import assert_allclose
 
 import scvi_codegen as sc
@@ -74,9 +75,7 @@ def test_absolute_tolerances_by_name_of_coordinate_array_and_rotation() -> None:
     assert absolute_tolerances(interface, 2, (("y", 0.5),)).tolist() == [0.0, 0.5]
     bound = chain().bind({"u": np.zeros(3)}, None)[0]
     assert absolute_tolerances(bound.interface, 3, (("u", 0.25),)).tolist() == [0.25] * 3
-    body = sc.LagrangianSystem.from_text(
-        "body", ["z"], "z_dot**2/2 + (omega_1**2 + 2*omega_2**2 + 3*omega_3**2)/2", rotations={"R": "omega"}
-    )
+    body = lagrange("body", "z", "z_dot**2/2 + (omega_1**2 + 2*omega_2**2 + 3*omega_3**2)/2", rotations={"R": "omega"})
     stepper = sc.compile_stepper(body, "svi:2")
     values = absolute_tolerances(stepper.interface, stepper.dimension, (("R", 0.1), ("z", 0.2)))
     assert values.tolist() == [0.2, *[0.1] * (stepper.dimension - 1)]

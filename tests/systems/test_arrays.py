@@ -2,9 +2,9 @@
 
 import pytest
 import sympy
-from notation import hamilton
+from notation import hamilton, lagrange
 
-from scvi_codegen import HamiltonianSystem, LagrangianSystem, SystemDefinitionError, unroll_sums
+from scvi_codegen import LagrangianSystem, SystemDefinitionError, unroll_sums
 from scvi_codegen.common.errors import SizesRequiredError
 from scvi_codegen.systems.arrays.reading import arrays_from_text
 from scvi_codegen.systems.arrays.symmetry import momentum_maps
@@ -67,13 +67,8 @@ def test_a_chain_between_walls_has_no_momentum() -> None:
 
 def test_unrolled_system_has_one_coordinate_per_element() -> None:
     """Every element with its own coordinates, parameters and places."""
-    net = LagrangianSystem.from_text(
-        name="net",
-        coordinates=["q[N]"],
-        parameters={"k[B]": 1, "c": 2},
-        tables=["bonds[B, 2]"],
-        lagrangian="sum(i in N, q_dot[i]**2/2) - c*sum(b in B, k[b]*(q[bonds[b, 0]] - q[bonds[b, 1]])**2)",
-    )
+    text = "sum(i in N, q_dot[i]**2/2) - c*sum(b in B, k[b]*(q[bonds[b, 0]] - q[bonds[b, 1]])**2)"
+    net = lagrange("net", "q[N]", text, parameters={"k[B]": 1, "c": 2}, tables=["bonds[B, 2]"])
     found = unroll_sums(net, {"N": 3, "B": 2}, tables={"bonds": [[0, 2], [2, 1]]}, parameters={"k": [5, 7], "c": 3})
     q, v, k = (sympy.symbols(f"{name}_:3{end}", real=True) for name, end in (("q", ""), ("q", "_dot"), ("k", "")))
     c = sympy.Symbol("c", real=True)
@@ -141,13 +136,11 @@ def test_periodic_sympy_index_outside_a_sum_is_rejected() -> None:
 
 def test_momentum_maps_of_a_hamiltonian() -> None:
     """Shifts, turns of positions with their momenta, and phases."""
-    bodies = HamiltonianSystem.from_text(
-        name="charges",
-        coordinates=["r[N, 2]"],
-        parameters={"B": 1},
-        hamiltonian="sum(i in N, (p_r[i, 0] + B*r[i, 1]/2)**2 + (p_r[i, 1] - B*r[i, 0]/2)**2)/2"
-        f"- sum(i < j in N, 1/{DISTANCE.replace('3', '2', 1)})",
+    text = (
+        "sum(i in N, (p_r[i, 0] + B*r[i, 1]/2)**2 + (p_r[i, 1] - B*r[i, 0]/2)**2)/2"
+        f"- sum(i < j in N, 1/{DISTANCE.replace('3', '2', 1)})"
     )
+    bodies = hamilton("charges", ["r[N, 2]"], text, B=1)
     assert [each.name for each in momentum_maps(bodies)] == ["angular momentum of r[.., 0], r[.., 1]"]
     oscillators = hamilton("oscillators", "q[N]", "sum(i in N, (q[i]**2 + p_q[i]**2)**2)")
     assert [each.name for each in momentum_maps(oscillators)] == ["norm of q"]

@@ -7,6 +7,7 @@ import sympy
 from counting import at_most
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from notation import lagrange
 from sympy import Integer, Rational, S, Symbol, pi
 
 import scvi_codegen as sc
@@ -296,16 +297,12 @@ ROOTS = ["sqrt(a**2*(1 + x**2))", "(a**2/(x**2 + 1))**(3/2)", "(a**4*(1 + x**2))
 
 @pytest.mark.parametrize("potential", ROOTS)
 def test_even_roots_of_parameters_are_smooth_formulas(potential: str) -> None:
-    system = sc.LagrangianSystem.from_text(
-        "root", ["x"], f"(b**2 + 1)*x_dot**2/2 - {potential}", parameters={"a": -2.0, "b": 0.5}
-    )
+    system = lagrange("root", "x", f"(b**2 + 1)*x_dot**2/2 - {potential}", a=-2.0, b=0.5)
     values = {"x": 0.3, "a": -2.0, "b": 0.5, "x_dot": 0.0}
     exact = -float(eval(potential, {"sqrt": math.sqrt}, values))
     numbers = {each: values[each.name] for each in (*system.coordinates, *system.velocities, *system.parameters)}
     assert float(system.lagrangian.xreplace(numbers)) == pytest.approx(exact, rel=1e-15)
-    again = sc.LagrangianSystem.from_text(
-        "root", ["x"], format_expression(system.lagrangian), parameters={"a": -2.0, "b": 0.5}
-    )
+    again = lagrange("root", "x", format_expression(system.lagrangian), a=-2.0, b=0.5)
     assert again == system
     for parameter in system.parameters:
         derivative = system.lagrangian.diff(parameter).xreplace(numbers)

@@ -85,9 +85,8 @@ def test_order_2s_against_the_equations_without_gauge(name: str) -> None:
 @pytest.mark.second
 def test_a_gauge_that_depends_on_time() -> None:
     """theta_x = y (1 + sin(t)/2)/2 and theta_y = -x (1 + sin(t)/2)/2 require the term F_t in H."""
-    driven = sc.LagrangianSystem.from_text(
-        "driven", ["x", "y"], "(1 + sin(t)/2)*(y + y**3/3)*x_dot/2 - (1 + sin(t)/2)*x*y_dot/2 - x**2/2 - y**2/2"
-    )
+    text = "(1 + sin(t)/2)*(y + y**3/3)*x_dot/2 - (1 + sin(t)/2)*x*y_dot/2 - x**2/2 - y**2/2"
+    driven = lagrange("driven", "x y", text)
 
     def right(t: float, state: np.ndarray) -> list[float]:
         x, y = state
@@ -144,12 +143,8 @@ def test_lotka_volterra_in_four_dimensions_agrees_with_the_published_reference()
 @pytest.mark.parametrize("size", ["3", "N"])
 def test_arrays_of_vortices(size: str) -> None:
     pairs = f"sum(i in {size}, j in {size}, G[i]*G[j]*log((x[i] - x[j])**2 + (y[i] - y[j])**2 + 0.1))/(8*pi)"
-    cloud = sc.LagrangianSystem.from_text(
-        "vortices",
-        [f"x[{size}]", f"y[{size}]"],
-        f"sum(i in {size}, G[i]*x[i]*y_dot[i]) + {pairs}",
-        parameters={f"G[{size}]": 1.0},
-    )
+    text = f"sum(i in {size}, G[i]*x[i]*y_dot[i]) + {pairs}"
+    cloud = lagrange("vortices", [f"x[{size}]", f"y[{size}]"], text, parameters={f"G[{size}]": 1.0})
     start = {"x": [0.0, 1.0, 0.3], "y": [0.0, 0.2, 1.2]}
     run = sc.compile_stepper(cloud, "svi:2").integrate(start, h=0.1, steps=10)
     one = "+".join(f"x{i}*y{i}_dot" for i in range(3))

@@ -223,9 +223,7 @@ def test_energy_error_is_relative_to_the_action_if_the_energy_starts_at_0():
 
 
 def test_the_hamiltonian_of_a_direction_has_its_energy():
-    pendulum = sc.LagrangianSystem.from_text(
-        "spherical pendulum", directions=["n"], lagrangian="(n_1_dot**2 + n_2_dot**2 + n_3_dot**2)/2 - n_3"
-    )
+    pendulum = lagrange("spherical pendulum", (), "(n_1_dot**2 + n_2_dot**2 + n_3_dot**2)/2 - n_3", directions=["n"])
     hamiltonian = hamiltonian_of(pendulum).hamiltonian  # expanded determinants took minutes
     n, v = np.array([0.36, 0.48, 0.8]), np.array([0.8, -0.6, 0.0])
     values = {f"n_{x}": a for x, a in zip("xyz", n, strict=True)} | {

@@ -95,13 +95,8 @@ def test_unsupported_systems_are_rejected(system, message):
 def test_inputs_retain_their_names():
     q = [f"q{i}" for i in range(4)]
     springs = "".join(f" - ({b} - {a})**2/2" for a, b in pairwise(q))
-    system = sc.LagrangianSystem.from_text(
-        name="driven",
-        coordinates=q,
-        lagrangian=" + ".join(f"{a}_dot**2/2" for a in q) + springs + " + q0*u",
-        inputs=["u"],
-        forces={"q3": "-u*q3_dot"},
-    )
+    text = " + ".join(f"{a}_dot**2/2" for a in q) + springs + " + q0*u"
+    system = lagrange("driven", q, text, inputs="u", forces={"q3": "-u*q3_dot"})
     found = sc.roll_sums(system)
     assert found.system.inputs == ("u",)
     assert (

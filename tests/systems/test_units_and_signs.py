@@ -13,13 +13,8 @@ from scvi_codegen.common.errors import MethodError
 def test_multipliers_of_an_orbit_are_those_of_its_variations():
     """A damped pendulum that is driven: two multipliers, not in pairs, by differences of DOP853."""
     parameters = {"m": 1.75, "k": 2.5, "a": 0.375, "w": 1.25}
-    system = sc.LagrangianSystem.from_text(
-        name="driven",
-        coordinates=["x"],
-        lagrangian="m*x_dot**2/2 - k*x**2/2 - x**4/4 + a*x*cos(w*t)",
-        parameters=dict.fromkeys(parameters, 1.0),
-        forces={"x": "-x_dot/4"},
-    )
+    text = "m*x_dot**2/2 - k*x**2/2 - x**4/4 + a*x*cos(w*t)"
+    system = lagrange("driven", "x", text, parameters=dict.fromkeys(parameters, 1.0), forces={"x": "-x_dot/4"})
     stepper, period = sc.compile_stepper(system, "svi:4"), 2 * np.pi / parameters["w"]
     orbit = sc.periodic_orbit(stepper, [0.3], [0.1], period=period, steps=200, parameters=parameters, fixed_period=True)
 

@@ -138,10 +138,10 @@ def catalogue(name: str) -> Callable[[], MechanicalSystem]:
 
 
 def rods() -> LagrangianSystem:
-    return LagrangianSystem.from_text(
-        name="rods",
-        coordinates=["x1", "y1", "x2", "y2"],
-        lagrangian="2*(x1_dot**2 + y1_dot**2)/2 + (x2_dot**2 + y2_dot**2)/2 - 3*(2*y1 + y2)",
+    return lagrange(
+        "rods",
+        "x1 y1 x2 y2",
+        "2*(x1_dot**2 + y1_dot**2)/2 + (x2_dot**2 + y2_dot**2)/2 - 3*(2*y1 + y2)",
         constraints=["x1**2 + y1**2 = 1", "(x2 - x1)**2 + (y2 - y1)**2 = 1"],
     )
 
@@ -157,12 +157,12 @@ def vibration() -> HamiltonianSystem:
 
 
 def rubbed() -> LagrangianSystem:
-    return LagrangianSystem.from_text(
-        name="rubbed",
-        coordinates=["x", "y"],
-        lagrangian="(x_dot**2 + 2*y_dot**2)/2 - x**2 - (x - y)**4/4",
-        parameters={"c": 0.05},
+    return lagrange(
+        "rubbed",
+        "x y",
+        "(x_dot**2 + 2*y_dot**2)/2 - x**2 - (x - y)**4/4",
         forces={"x": "-c*x_dot*y**2 + cos(t)", "y": "-c*y_dot"},
+        c=0.05,
     )
 
 
@@ -176,25 +176,25 @@ def ring() -> ArraySystem:
 
 
 def forms() -> ArraySystem:
-    return LagrangianSystem.from_text(
-        name="forms",
-        coordinates=["u[NX, NY]", "q[N]"],
-        parameters={"m[N]": 1, "k[B]": 1, "g": 0.5},
-        tables=["bonds[B, 2]"],
-        lagrangian="sum(i in NX, j in NY, u_dot[i, j]**2/2 - u[i, j]**2) + sum(i in N, m[i]*q_dot[i]**2/2 - q[i]**4)"
+    return lagrange(
+        "forms",
+        ["u[NX, NY]", "q[N]"],
+        "sum(i in NX, j in NY, u_dot[i, j]**2/2 - u[i, j]**2) + sum(i in N, m[i]*q_dot[i]**2/2 - q[i]**4)"
         " - sum(i in NX periodic, j in NY, u[i-1, j]*u[i+2, j]*cos(g*t)/9)"
         " - sum(i < j in N, sqrt(1 + (q[i] - q[j])**2))"
         " - sum(b in B, k[b]*(q[bonds[b, 0]] - q[bonds[b, 1]])**2)",
+        parameters={"m[N]": 1, "k[B]": 1, "g": 0.5},
+        tables=["bonds[B, 2]"],
     )
 
 
 def rubbed_ring() -> ArraySystem:
-    return LagrangianSystem.from_text(
-        name="rubbed ring",
-        coordinates=["q[N]"],
-        parameters={"c": 0.01},
-        lagrangian="sum(i in N, q_dot[i]**2/2) - sum(i in N periodic, (q[i+1] - q[i])**2/2 - cos(q[i]))",
+    return lagrange(
+        "rubbed ring",
+        "q[N]",
+        "sum(i in N, q_dot[i]**2/2) - sum(i in N periodic, (q[i+1] - q[i])**2/2 - cos(q[i]))",
         forces={"q[i]": "-c*q_dot[i]*(1 + q[i]**2)", "q[0]": "cos(t)"},
+        c=0.01,
     )
 
 
@@ -208,18 +208,16 @@ def rotors() -> ArraySystem:
 
 
 def swings() -> ArraySystem:
-    return LagrangianSystem.from_text(
-        name="swings",
-        coordinates=["r[N, 2]"],
-        lagrangian="sum(i in N, sum(a in 2, r_dot[i, a]**2)/2 - r[i, 1])",
+    return lagrange(
+        "swings",
+        ["r[N, 2]"],
+        "sum(i in N, sum(a in 2, r_dot[i, a]**2)/2 - r[i, 1])",
         constraints=["r[i, 0]**2 + (r[i, 1] - 2)**2 = 1 for i in N"],
     )
 
 
 def body() -> LagrangianSystem:
-    return LagrangianSystem.from_text(
-        "body", rotations={"R": "w"}, lagrangian="(w_1**2 + w_2**2 + 2.5*w_3**2)/2 - R_33 - R_13**2"
-    )
+    return lagrange("body", (), "(w_1**2 + w_2**2 + 2.5*w_3**2)/2 - R_33 - R_13**2", rotations={"R": "w"})
 
 
 BONDS = (tuple(place for b in range(6) for place in (b, (3 * b + 1) % 7)),)

@@ -7,6 +7,7 @@ from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
+from notation import hamilton, lagrange
 from oracle import Mechanics, numbers, oracle_step
 
 from scvi_codegen import HamiltonianSystem, LagrangianSystem, Stepper, compile_stepper, problem
@@ -50,16 +51,12 @@ def driven_duffing() -> LagrangianSystem:
 
 def pumped_cart_pole() -> LagrangianSystem:
     """A cart and a pendulum whose rod is shortened and lengthened: the mass matrix depends on theta and on time."""
-    return LagrangianSystem.from_text(
-        name="pumped cart and pole",
-        coordinates=["x", "theta"],
-        lagrangian="""
-            M*x_dot**2/2 - k*x**2/2 + m*g*l*(1 + a*sin(w*t))*cos(theta)
-            + m*(x_dot + l*a*w*cos(w*t)*sin(theta) + l*(1 + a*sin(w*t))*cos(theta)*theta_dot)**2/2
-            + m*(l*(1 + a*sin(w*t))*sin(theta)*theta_dot - l*a*w*cos(w*t)*cos(theta))**2/2
-        """,
-        parameters={"M": 2.0, "m": 1.0, "l": 0.8, "g": 3.0, "a": 0.2, "w": 1.7, "k": 0.5},
-    )
+    text = """
+        M*x_dot**2/2 - k*x**2/2 + m*g*l*(1 + a*sin(w*t))*cos(theta)
+        + m*(x_dot + l*a*w*cos(w*t)*sin(theta) + l*(1 + a*sin(w*t))*cos(theta)*theta_dot)**2/2
+        + m*(l*(1 + a*sin(w*t))*sin(theta)*theta_dot - l*a*w*cos(w*t)*cos(theta))**2/2
+        """
+    return lagrange("pumped cart and pole", "x theta", text, M=2.0, m=1.0, l=0.8, g=3.0, a=0.2, w=1.7, k=0.5)
 
 
 def linkage() -> LagrangianSystem:
@@ -87,75 +84,46 @@ def two_rods() -> LagrangianSystem:
 
 def sleigh() -> LagrangianSystem:
     """Chaplygin's, between springs: its blade at (x, y) goes where it points, its mass is d ahead of it."""
-    return LagrangianSystem.from_text(
-        name="sleigh",
-        coordinates=["x", "y", "a"],
-        lagrangian="""m*(x_dot**2 + y_dot**2)/2 + J*a_dot**2/2 + m*d*a_dot*(y_dot*cos(a) - x_dot*sin(a))
-            - k*(x**2 + 2*y**2)/2""",
-        parameters={"m": 1.3, "J": 0.7, "d": 0.2, "k": 0.5},
-        constraints=["x_dot*sin(a) - y_dot*cos(a)"],
-    )
+    text = """m*(x_dot**2 + y_dot**2)/2 + J*a_dot**2/2 + m*d*a_dot*(y_dot*cos(a) - x_dot*sin(a))
+        - k*(x**2 + 2*y**2)/2"""
+    return lagrange("sleigh", "x y a", text, constraints=["x_dot*sin(a) - y_dot*cos(a)"], m=1.3, J=0.7, d=0.2, k=0.5)
 
 
 def pushed_pendulum() -> LagrangianSystem:
     """Return a pendulum with a force u and a moving pivot w."""
-    return LagrangianSystem.from_text(
-        name="pushed pendulum",
-        coordinates=["q"],
-        lagrangian="q_dot**2/2 + (1 + w)*cos(q)",
-        parameters={"c": 0.2},
-        forces={"q": "u - c*q_dot"},
-        inputs=["u", "w"],
-    )
+    text = "q_dot**2/2 + (1 + w)*cos(q)"
+    return lagrange("pushed pendulum", "q", text, forces={"q": "u - c*q_dot"}, inputs="u w", c=0.2)
 
 
 def damped_pendulum() -> LagrangianSystem:
     """Return a pendulum on a cart with a spring; damping rate from two parameters, and explicit time in L."""
-    return LagrangianSystem.from_text(
-        name="damped pendulum",
-        coordinates=["x", "a"],
-        lagrangian="m*x_dot**2/2 + x_dot*a_dot*cos(a) + a_dot**2/2 - (1 + cos(t)/3)*x**2 + cos(a)",
-        parameters={"m": 2.0, "c": 0.4, "r": 0.7},
-        damping="c*r",
-    )
+    text = "m*x_dot**2/2 + x_dot*a_dot*cos(a) + a_dot**2/2 - (1 + cos(t)/3)*x**2 + cos(a)"
+    return lagrange("damped pendulum", "x a", text, damping="c*r", m=2.0, c=0.4, r=0.7)
 
 
 def pumped_swing() -> HamiltonianSystem:
     """A Hamiltonian with time, rubbed and pushed."""
-    return HamiltonianSystem.from_text(
-        name="pumped swing",
-        coordinates=["q"],
-        momenta=["p"],
-        hamiltonian="p**2/(2*l**2*(1 + a*sin(w*t))**2) - g*l*(1 + a*sin(w*t))*cos(q)",
-        parameters={"l": 0.8, "g": 3.0, "a": 0.2, "w": 1.7, "c": 0.1},
-        forces={"q": "-c*p + cos(t)"},
+    text = "p**2/(2*l**2*(1 + a*sin(w*t))**2) - g*l*(1 + a*sin(w*t))*cos(q)"
+    return hamilton(
+        "pumped swing", "q", text, momenta="p", forces={"q": "-c*p + cos(t)"}, l=0.8, g=3.0, a=0.2, w=1.7, c=0.1
     )
 
 
 def turning_wire() -> LagrangianSystem:
     """A bead on a straight wire that turns: one constraint, with time, on coordinates that the masses couple."""
-    return LagrangianSystem.from_text(
-        name="turning wire",
-        coordinates=["u", "v"],
-        lagrangian="((u_dot + v_dot)**2 + 2*(u_dot - v_dot)**2)/2 - k*(u**2 + 2*v**2 + u**4)",
-        parameters={"w": 0.8, "k": 3.0},
-        constraints=["(u + v)*sin(w*t) = (u - v)*cos(w*t)"],
-    )
+    text = "((u_dot + v_dot)**2 + 2*(u_dot - v_dot)**2)/2 - k*(u**2 + 2*v**2 + u**4)"
+    return lagrange("turning wire", "u v", text, constraints=["(u + v)*sin(w*t) = (u - v)*cos(w*t)"], w=0.8, k=3.0)
 
 
 def tangle() -> LagrangianSystem:
     """Four coordinates that all meet, each pair in its own way: a mass matrix without zeros, potentials, time."""
-    return LagrangianSystem.from_text(
-        name="tangle",
-        coordinates=["x", "y", "z", "w"],
-        lagrangian="""
-            a*x_dot**2 + (2 + sin(x*z))*y_dot**2/2 + b*(1 + w**2)*z_dot**2/2 + (3 + cos(y))*w_dot**2/2
-            + (1 + x*y)*x_dot*y_dot/3 + cos(w)*x_dot*z_dot/2 + z*x_dot*w_dot/4 + (1 + z**2)*y_dot*z_dot/3
-            + sin(x)*y_dot*w_dot/2 + y*z_dot*w_dot/3 + c*x*y*w_dot + sin(t)*z*y_dot
-            - (x**4 + y**4 + z**4 + w**4)/4 - (x - z)**2 - x*y*w/2 - cos(2*y - w + t)
-        """,
-        parameters={"a": 0.8, "b": 1.3, "c": 0.4},
-    )
+    text = """
+        a*x_dot**2 + (2 + sin(x*z))*y_dot**2/2 + b*(1 + w**2)*z_dot**2/2 + (3 + cos(y))*w_dot**2/2
+        + (1 + x*y)*x_dot*y_dot/3 + cos(w)*x_dot*z_dot/2 + z*x_dot*w_dot/4 + (1 + z**2)*y_dot*z_dot/3
+        + sin(x)*y_dot*w_dot/2 + y*z_dot*w_dot/3 + c*x*y*w_dot + sin(t)*z*y_dot
+        - (x**4 + y**4 + z**4 + w**4)/4 - (x - z)**2 - x*y*w/2 - cos(2*y - w + t)
+        """
+    return lagrange("tangle", "x y z w", text, a=0.8, b=1.3, c=0.4)
 
 
 def pumped_chain(count: int = 8) -> LagrangianSystem:
@@ -165,12 +133,8 @@ def pumped_chain(count: int = 8) -> LagrangianSystem:
         f"{3 - 2 * (i % 2)}*x{i}_dot*x{j}_dot" for i, j in pairs
     ]
     springs = [f"(x{j} - x{i})**4/4 + (1 + a*sin(w*t))*(x{j} - x{i})**2/2" for i, j in pairs]
-    return LagrangianSystem.from_text(
-        name="pumped chain",
-        coordinates=[f"x{i}" for i in numbers],
-        lagrangian=f"{' + '.join(masses)} - ({' + '.join(springs)}) - x0**2/2",
-        parameters={"m": 1.1, "a": 0.3, "w": 1.1},
-    )
+    text = f"{' + '.join(masses)} - ({' + '.join(springs)}) - x0**2/2"
+    return lagrange("pumped chain", [f"x{i}" for i in numbers], text, m=1.1, a=0.3, w=1.1)
 
 
 def three_bodies() -> LagrangianSystem:
@@ -178,11 +142,9 @@ def three_bodies() -> LagrangianSystem:
     pairs = (("a", "b"), ("b", "c"), ("a", "c"))
     kinetic = " + ".join(f"m_{body}*(x_{body}_dot**2 + y_{body}_dot**2)/2" for body in "abc")
     springs = [f"((x_{i} - x_{j})**2 + (y_{i} - y_{j})**2)" for i, j in pairs]
-    return LagrangianSystem.from_text(
-        name="three bodies",
-        coordinates=[f"{axis}_{body}" for body in "abc" for axis in "xy"],
-        lagrangian=kinetic + "".join(f" - k*{square}/2 - k*{square}**2/8" for square in springs),
-        parameters={"m_a": 1.0, "m_b": 0.7, "m_c": 1.6, "k": 0.9},
+    text = kinetic + "".join(f" - k*{square}/2 - k*{square}**2/8" for square in springs)
+    return lagrange(
+        "three bodies", [f"{axis}_{body}" for body in "abc" for axis in "xy"], text, m_a=1.0, m_b=0.7, m_c=1.6, k=0.9
     )
 
 
@@ -201,24 +163,14 @@ def forced_cart_pole() -> LagrangianSystem:
 def radial_friction() -> LagrangianSystem:
     """Friction along the radius, a mass that depends on place: no torque."""
     drag = "-c*{0}*(x*x_dot + y*y_dot)*(1 + x_dot**2 + y_dot**2)/(x**2 + y**2)"
-    return LagrangianSystem.from_text(
-        name="radial friction",
-        coordinates=["x", "y"],
-        lagrangian="(x_dot**2 + y_dot**2)*(1 + x**2 + y**2)/2 + 1/sqrt(x**2 + y**2)",
-        parameters={"c": 0.3},
-        forces={"x": drag.format("x"), "y": drag.format("y")},
-    )
+    text = "(x_dot**2 + y_dot**2)*(1 + x**2 + y**2)/2 + 1/sqrt(x**2 + y**2)"
+    return lagrange("radial friction", "x y", text, forces={"x": drag.format("x"), "y": drag.format("y")}, c=0.3)
 
 
 def damped_pair() -> LagrangianSystem:
     """Two coupled coordinates with uniform damping, a mass that depends on place, and time."""
-    return LagrangianSystem.from_text(
-        name="damped",
-        coordinates=["x", "y"],
-        lagrangian="(1 + x**2)*x_dot**2/2 + y_dot**2/2 + x_dot*y_dot/3 + cos(x) - y**2*x/4 + y*cos(2*t)/5",
-        parameters={"c": 0.4, "m": 0.9},
-        damping="c*m",
-    )
+    text = "(1 + x**2)*x_dot**2/2 + y_dot**2/2 + x_dot*y_dot/3 + cos(x) - y**2*x/4 + y*cos(2*t)/5"
+    return lagrange("damped", "x y", text, damping="c*m", c=0.4, m=0.9)
 
 
 def runaway() -> LagrangianSystem:
