@@ -179,6 +179,7 @@ class TestDegree:
 
 @pytest.mark.rotated
 class TestHonesty:
+    @pytest.mark.second
     def test_a_step_for_newton_alone_is_not_advised(self):
         """For a chain of springs, steps beyond the fixed-point limit meet the tolerance at ten times the cost."""
         chosen = problem("fput-chain")
@@ -230,6 +231,7 @@ class TestHonesty:
         ends = [stepper.integrate(entry.q, p, h=advice.h / n, steps=n * advice.steps).q[-1] for n in (1, 3)]
         assert 1e-7 < np.linalg.norm(ends[0] - ends[1]) / np.linalg.norm(ends[1]) < 2e-5
 
+    @pytest.mark.second
     def test_quadratic_error_growth_is_extrapolated_quadratically(self):
         system, (q, p) = problem("kepler").system, kepler_start(0.5)
         message = advise(system, RadauIIA(3), q, p, 50_000.0, 1e-6).message

@@ -1,15 +1,13 @@
-"""Support headers satisfy ``.clang-format``; generated sources are short, and amalgamation does not change results."""
+"""Support headers satisfy ``.clang-format``; generated sources are short."""
 
-import re
 import subprocess
 from pathlib import Path
 
 import pytest
 from style import CLANG_FORMAT, STYLE
 
-from scvi_codegen import SVI, LagrangianSystem, compile_stepper, generate_source, problem
+from scvi_codegen import SVI, LagrangianSystem, generate_source
 from scvi_codegen.codegen.rendering.environment import support_text
-from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.common.cache import template_folder
 
 FOLDER = Path(__file__).parents[2] / "generated"
@@ -40,18 +38,3 @@ def test_long_titles_are_wrapped():
     system = LagrangianSystem.from_text(name=3 * words, coordinates=["q"], lagrangian="q_dot**2/2 - q**4/4")
     source = generate_source(system, SVI(3), prefix="long_name")[0]
     assert [line for text in source.files.values() for line in text.splitlines() if len(line) > 120] == []
-
-
-@pytest.mark.rotated
-def test_amalgamated_text_computes_the_same_bits():
-    system = problem("double-pendulum").system
-    stepper = compile_stepper(system, SVI(3))
-    whole = stepper.source.amalgamated()
-    assert re.findall(r'#include "support', whole.code) == []
-    assert whole.support == ()
-    other = type(stepper)(whole, stepper.interface)
-    q, p = [1.0, 0.5], [0.3, -0.2]
-    ours, theirs = (each.integrate(q, p, h=0.05, steps=50) for each in (stepper, other))
-    assert (ours.q == theirs.q).all()
-    assert (ours.p == theirs.p).all()
-    assert isinstance(whole, Source)

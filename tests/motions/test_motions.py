@@ -16,8 +16,8 @@ CASES = [
     if applies(Case(problem, method, situation))
 ]
 
-DEAR = ("two_words", "packages", "work_and_impulses")
-"""Properties that compile more than one integrator."""
+DEAR = ("two_words", "packages", "work_and_impulses", "hessians", "flows")
+"""Properties that compile more than one integrator, or much code."""
 
 pytestmark = pytest.mark.long
 

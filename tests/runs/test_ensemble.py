@@ -414,15 +414,6 @@ class TestFiles:
         values = {"mu": [1.0, 1e9, 1.2]}  # the second falls into the centre
         return kepler.integrate_ensemble(*states("kepler", 3), h=0.05, steps=100, save_every=10, parameters=values)
 
-    def test_npz_round_trip(self, result: sc.EnsembleTrajectory, tmp_path):
-        result.save(tmp_path / "runs.npz")
-        with np.load(tmp_path / "runs.npz") as file:
-            for name in ("t", "q", "p", "status", "steps", "h", "parameters"):
-                assert np.array_equal(file[name], getattr(result, name), equal_nan=name in "qp")
-            assert file["coordinates"].tolist() == ["q1", "q2"]
-            assert file["parameter_names"].tolist() == ["mu"]
-        assert [result[j].steps for j in range(3)] == result.steps.tolist()
-
     def test_csv_has_long_format_and_omits_failures(self, result: sc.EnsembleTrajectory, tmp_path):
         result.save(tmp_path / "runs.csv")
         assert (tmp_path / "runs.csv").read_text().startswith("trajectory,mu,t,q1,q2,p_q1,p_q2\n0,1,0,")

@@ -370,6 +370,7 @@ class TestEnsembles:
 
 @pytest.mark.rotated
 class TestOtherRuns:
+    @pytest.mark.second
     def test_saved_states_and_events_are_confirmed(self, kepler_stepper):
         start = {"q": [1.6, 0.0], "p": [0.0, 0.5]}
         at = kepler_stepper.integrate(**start, t_end=50.0, error=1e-9, t_eval=[10.0, 30.0])
@@ -407,6 +408,7 @@ class TestOtherRuns:
         assert np.abs(q - exact).max() <= run.global_error <= 1e-9
         assert run.confirmed_until == 6.0
 
+    @pytest.mark.second
     def test_confirmed_runs_of_arrays(self):
         text = (
             "sum(i in N, q_dot[i]**2/2) - sum(i in N - 1, (q[i+1] - q[i])**2/2 + k*(q[i+1] - q[i])**4/4)"

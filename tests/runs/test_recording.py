@@ -305,6 +305,21 @@ class TestFiles:
         assert Path("a.npz").read_bytes() == before
 
 
+@pytest.mark.parametrize("t_end", [60.0, -60.0])
+def test_run_may_be_extended_or_shortened_but_not_reversed(kepler, t_end):
+    sc.record_run(kepler.start(**STATE, t_end=t_end, tolerance=1e-10), "a.run", rows=64, save_every=3)
+    longer = sc.resume_run("a.run", t_end=1.5 * t_end)
+    assert longer.finished
+    assert t_end in longer.t
+    assert longer.t[-1] == 1.5 * t_end
+    assert np.abs(longer.q[-1] - kepler.integrate(**STATE, t_end=1.5 * t_end).q[-1]).max() < 1e-6
+    with pytest.raises(sc.StateError, match="beyond"):
+        sc.resume_run("a.run", t_end=t_end)
+    with pytest.raises(sc.StateError, match="omit steps"):
+        sc.resume_run("a.run", steps=1000)
+    assert sc.load_run("a.run").manifest == longer.manifest
+
+
 def test_missing_inputs_leave_no_folder():
     stepper = sc.compile_stepper(pushed_pendulum(), sc.SVI(2))
     run = stepper.start([0.3], [0.0], h=0.1)
