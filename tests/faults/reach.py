@@ -107,7 +107,7 @@ class Reach:
             reached = {test: 1 for test in self.seconds if path in self.templates[test]}
         else:
             old = path if path in self.texts else self._former(path)
-            lines = self._former_lines(path, old, line)
+            lines = self._former_lines(path, old, line) if old else set()
             reached = {test: len(own) for test in self.seconds if lines & {*(own := self.lines[test].get(old, ()))}}
         named = sorted(str(file.relative_to(ROOT)) for file in ROOT.glob(f"tests/*/test_{stem}.py"))
         order = sorted(reached, key=lambda test: self.seconds[test] / reached[test])
