@@ -51,11 +51,11 @@ for n in LEAPS:
         if action:
             S += KICK[n] * L
     if DRIFT[n] != 0:
+        P[i] = p0[i] + p[i]
+    if DRIFT[n] != 0:
         if masses:
-            P[i] = p0[i] + p[i]
             q[i] += h * DRIFT[n] * inverse_mass[i] * P[i]
         else:
-            P[i] = p0[i] + p[i]
             v[i] = velocity(P, t)
             q[i] += h * DRIFT[n] * v[i]
         if action:
@@ -65,7 +65,8 @@ for n in LEAPS:
 """
 """Kicks and drifts (Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. II.5), with the increments q and p
 of positions and momenta. S is the action divided by h, the sum of the Lagrangian L at rest and the kinetic energies.
-Rigid bodies are turned by the flow of their kinetic energy in the time of a drift."""
+Rigid bodies are turned by the flow of their kinetic energy in the time of a drift. Momenta P have a condition, and so a
+loop, of their own: of two coordinates gcc makes faster code of two loops (.9 of the time of one)."""
 
 
 class _Leapfrogs(Method):

@@ -6,8 +6,9 @@
  * forces of a kick and continues the coordinates behind them to the positions of the next kick, also into the next
  * step. Within a step the increments are in the memory of the compensation terms. Infinite and undefined numbers remain
  * in a state, so that many steps are checked at once; if one fails, they are repeated one by one. With PLAIN_SUMS
- * increments are added to the state at once, and their rounding errors are dropped. Requires: arrays.h,
- * add_forces, LEAPS, TOGETHER, the tables; with ROWS array_rows.h. */
+ * increments are added to the state at once, and their rounding errors are dropped; the kicks at the end of a step and at
+ * the start of the next one are one where steps are checked together. Requires: arrays.h, add_forces, LEAPS, TOGETHER,
+ * the tables; with ROWS array_rows.h. */
 
 /* Workspace: positions of the next kick, forces at the end of a step; the state before steps that are checked. */
 typedef struct {
@@ -67,17 +68,12 @@ static inline __attribute__((always_inline)) void continue_coordinates(double *r
 #ifdef PLAIN_SUMS
   (void)dq, (void)dp, (void)X;
   for (long long i = 0; i < count; i++) {
-    double moving = p[i];
-    if (by.ends && ends_with_a_kick())
-      moving += by.end * F[i];
-    if (by.starts) {
-      moving += by.start * F[i];
+    if ((by.ends && ends_with_a_kick()) || by.starts)
+      p[i] += (by.starts ? by.start : by.end) * F[i];
+    if (by.starts)
       F[i] = 0.0;
-    }
-    if (by.ends || by.starts)
-      p[i] = moving;
     if (by.moves)
-      q[i] += by.drift * (inverse_mass[i] * moving);
+      q[i] += by.drift * (inverse_mass[i] * p[i]);
   }
 #else
   for (long long i = 0; i < count; i++) {
@@ -186,7 +182,12 @@ static void take_step(run_memory *run, const problem *arrays, const work_arrays 
     const continuation then = {.ends = k == last, .moves = 1, .arrives = k == last - kicks_end, .drift = h * DRIFT[k]};
     kick(run, arrays, work, POSITIONS(run, work), run->t + KICK_ABSCISSA[k] * h, h * KICK[k], INCREMENTS(run), then);
   }
-  if (kicks_end) {
+#ifdef PLAIN_SUMS
+  if (kicks_end && into_next) /* with the first kick of the next step */
+    kick(run, arrays, work, run->q, run->t + KICK_ABSCISSA[last] * h, h * (KICK[last] + KICK[0]), run->p, starting(h, 0, 0));
+  else
+#endif
+      if (kicks_end) {
     const continuation then = into_next ? starting(h, 1, 1) : (continuation){.ends = 1, .end = h * KICK[last]};
     kick(run, arrays, work, run->q, run->t + KICK_ABSCISSA[last] * h, 1.0, work->F, then);
   }
