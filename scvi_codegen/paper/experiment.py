@@ -271,17 +271,17 @@ def draw(picture: Picture, kind: str) -> bytes:
     return file.getvalue()
 
 
-def thinned(*series: ArrayLike, most: int = MOST_POINTS) -> tuple[Array, ...]:
-    """Return every k-th entry of each series, at most ``most``."""
+def thinned(*series: ArrayLike) -> tuple[Array, ...]:
+    """Return every k-th entry of each series, at most ``MOST_POINTS``."""
     arrays = [np.asarray(values, dtype=float) for values in series]
-    every = max(1, -(-len(arrays[0]) // most))
+    every = max(1, -(-len(arrays[0]) // MOST_POINTS))
     return tuple(values[::every] for values in arrays)
 
 
-def largest_in_bins(t: ArrayLike, error: ArrayLike, *, bins: int = BINS) -> tuple[Array, Array]:
+def largest_in_bins(t: ArrayLike, error: ArrayLike) -> tuple[Array, Array]:
     """Return times and the largest |error| from each to the next."""
     times, values = np.asarray(t, dtype=float), np.abs(np.asarray(error, dtype=float))
-    size = max(1, len(times) // bins)
+    size = max(1, len(times) // BINS)
     starts = np.arange(0, max(1, len(times) - size + 1), size)  # the last bin includes the remainder
     largest: Any = np.maximum.reduceat(values, starts)
     return times[starts], largest

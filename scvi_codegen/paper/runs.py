@@ -311,9 +311,7 @@ MEASURES: Mapping[str, Measure] = {
 }
 """Quantities by the name of the attribute; arrays have an entry for each state."""
 
-
 Runs: TypeAlias = Mapping[str, MeasuredRun]
-View: TypeAlias = Callable[[Runs], Iterable[Panel]]
 
 
 def compared(claim: str, check: str, runs: Runs) -> Comparison:
@@ -353,7 +351,7 @@ def _value(term: str, attribute: str, runs: Runs) -> float:
     return math.nan if value is None else float(factor or 1.0) * abs(value)
 
 
-def figure(name: str, title: str, setting: RunSetting, views: Sequence[View], checks: str) -> Experiment:
+def figure(name: str, title: str, setting: RunSetting, views: Sequence[Mapping[str, Any]], checks: str) -> Experiment:
     """Return the experiment that runs the schemes of a setting, draws views of them and tests statements.
 
     ``checks``: statements of the paper, a line each, followed by indented lines as in :func:`compared`.
@@ -363,7 +361,7 @@ def figure(name: str, title: str, setting: RunSetting, views: Sequence[View], ch
 
     def run(_: Mapping[str, Result]) -> Result:
         runs = {key: setting.run(key) for key in setting.schemes}
-        panels = tuple(panel for view in views for panel in view(runs))
+        panels = tuple(panel for view in views for panel in _panels(runs, **view))
         columns = {1: 1, 2: 2, 4: 2}.get(len(panels), 3)
         picture = Picture(panels=panels, columns=columns, size=(7.0, 4.2) if len(panels) == 1 else (4.0, 3.8))
         return Result(
@@ -374,6 +372,11 @@ def figure(name: str, title: str, setting: RunSetting, views: Sequence[View], ch
         )
 
     return Experiment(name=name, title=title, run=run)
+
+
+def _panels(every_run: Runs, *, draw: str, runs: Sequence[str] = (), **how: Any) -> Iterable[Panel]:
+    """Return the panels of a view, of the named runs or of all."""
+    return VIEWS[draw]({key: every_run[key] for key in runs or every_run}, **how)
 
 
 def measured_table(runs: Runs, measures: Sequence[str]) -> TableBlock:
@@ -392,60 +395,53 @@ def _series(run: MeasuredRun, xs: ArrayLike, ys: ArrayLike, **style: str) -> Ser
 
 
 def plane(
-    *keys: str, kind: str = "phase", part: str = ":", window: tuple[float, float] | None = None, more: str = ""
-) -> View:
-    """Return the view of states over the exact curve, a panel for each run.
+    runs: Runs, *, kind: str = "phase", part: str = ":", window: tuple[float, float] | None = None, more: str = ""
+) -> Iterable[Panel]:
+    """Yield states over the exact curve, a panel for each run.
 
     Args:
-        keys: runs, by default all.
+        runs: runs by key.
         kind: ``"phase"`` for (q_i, p_i) of every coordinate, ``"orbit"`` for (q_1, q_2).
         part: states that are drawn, as in ``"-63:"``.
         window: range of both axes.
         more: text after the label in the title.
     """
     drawn_states = slice(*(int(bound) if bound else None for bound in part.split(":")))
+    xlabel, ylabel = ("q", "p") if kind == "phase" else ("$q_1$", "$q_2$")
 
     def curves(run: MeasuredRun, states: slice) -> list[tuple[ArrayLike, ArrayLike]]:
         q, p = run.q[states], run.p[states]
         return [(q[:, 0], q[:, 1])] if kind == "orbit" else list(zip(q.T, p.T, strict=True))
 
-    def view(runs: Runs) -> Iterable[Panel]:
-        for run in (runs[key] for key in keys or runs):
-            dots = [_series(run, *xy, marker=".", line="", label="") for xy in curves(run, drawn_states)]
-            exact = [_series(run.setting.reference, *xy, label="") for xy in curves(run.setting.reference, slice(None))]
-            xlabel, ylabel = ("q", "p") if kind == "phase" else ("$q_1$", "$q_2$")
-            curves_and_dots, title = (*exact, *dots), f"{run.label}{more}"
-            yield Panel(title=title, series=curves_and_dots, xlabel=xlabel, ylabel=ylabel, equal=True, window=window)
-
-    return view
+    for run in runs.values():
+        dots = [_series(run, *xy, marker=".", line="", label="") for xy in curves(run, drawn_states)]
+        exact = [_series(run.setting.reference, *xy, label="") for xy in curves(run.setting.reference, slice(None))]
+        series, title = (*exact, *dots), f"{run.label}{more}"
+        yield Panel(title=title, series=series, xlabel=xlabel, ylabel=ylabel, equal=True, window=window)
 
 
-def over_time(*keys: str, quantity: str, title: str = "", periods: bool = False, error: bool = True) -> View:
-    """Return the view of a quantity over time, one panel with all runs.
+def over_time(
+    runs: Runs, *, quantity: str, title: str = "", periods: bool = False, error: bool = True
+) -> Iterable[Panel]:
+    """Yield one panel of a quantity of all runs over time.
 
     Args:
-        keys: runs, by default all.
+        runs: runs by key.
         quantity: attribute of the runs.
         title: title of the panel.
         periods: True for time in periods of 2 pi.
         error: True for the largest absolute value in each of some hundred intervals, on a logarithmic axis.
     """
     unit, lines = PERIOD if periods else 1.0, ("-", ":", "--")
-
-    def view(runs: Runs) -> Iterable[Panel]:
-        series, colors = [], list[str]()
-        for run in (runs[key] for key in keys or runs):
-            colors.append(run.scheme.color)
-            points = (run.t / unit, getattr(run, quantity))
-            line = lines[(colors.count(run.scheme.color) - 1) % len(lines)]
-            series.append(_series(run, *(largest_in_bins(*points) if error else points), line=line))
-        name = MEASURES[quantity].heading
-        ylabel = f"|{name}|, largest in each interval" if error else name
-        xlabel = "t, in periods" if periods else "t"
-        log = "y" if error else ""
-        yield Panel(title=title or name, series=tuple(series), xlabel=xlabel, ylabel=ylabel, log=log)
-
-    return view
+    series, colors = [], list[str]()
+    for run in runs.values():
+        colors.append(run.scheme.color)
+        points = (run.t / unit, getattr(run, quantity))
+        line = lines[(colors.count(run.scheme.color) - 1) % len(lines)]
+        series.append(_series(run, *(largest_in_bins(*points) if error else points), line=line))
+    name, xlabel = MEASURES[quantity].heading, "t, in periods" if periods else "t"
+    ylabel, log = (f"|{name}|, largest in each interval", "y") if error else (name, "")
+    yield Panel(title=title or name, series=tuple(series), xlabel=xlabel, ylabel=ylabel, log=log)
 
 
 def _settings(tables: Mapping[str, Mapping[str, Any]]) -> dict[str, RunSetting]:
@@ -477,14 +473,10 @@ def _figure(
 ) -> Experiment:
     """Return the figure of a table of the file; ``span`` if it differs from that of the setting."""
     run_setting = SETTINGS[setting] if span is None else replace(SETTINGS[setting], span=span)
-    return figure(name, title, run_setting, [_view(**view) for view in views], checks)
+    return figure(name, title, run_setting, views, checks)
 
 
-def _view(draw: str, runs: Sequence[str] = (), **how: Any) -> View:
-    return VIEWS[draw](*runs, **how)
-
-
-VIEWS: Mapping[str, Callable[..., View]] = {"plane": plane, "over time": over_time}
+VIEWS: Mapping[str, Callable[..., Iterable[Panel]]] = {"plane": plane, "over time": over_time}
 _TABLES = package_table("paper/figures.toml")
 SETTINGS = _settings(_TABLES.pop("settings"))
 EXPERIMENTS = tuple(_figure(name, **table) for name, table in _TABLES.items())
