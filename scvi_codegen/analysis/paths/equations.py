@@ -35,7 +35,7 @@ class Band:
         self.positive: bool | None = None
         if shift:
             diagonal = diagonal + shift * np.eye(diagonal.shape[1])
-            self.positive = not _negative_pivots(diagonal, upper, lower)[-1]
+            self.positive = not negative_pivots(diagonal, upper, lower)[-1]
         count, d, _ = diagonal.shape
         self.shape, self.reach = (count, d), 2 * d - 1
         # LAPACK's band storage for dgbtrf: the entry (I, J) is in row 2 reach + I - J and column J
@@ -105,16 +105,12 @@ def factors_of(at: Linearised, intervals: Intervals, shift: float = 0.0) -> Band
     return Sparse(at, intervals, shift) if intervals.sparse else Band(at, shift)
 
 
-def negative_directions(at: Linearised) -> list[int]:
-    """Return the Morse index of [t_0, t_k], k = 1 to N, by the inertia of the pivots."""
-    return _negative_pivots(*hessian_blocks(at))
-
-
-def _negative_pivots(diagonal: Array, upper: Array, lower: Array) -> list[int]:
-    """Return the numbers of negative eigenvalues of the leading 0, 1, .., N - 1 blocks.
+def negative_pivots(diagonal: Array, upper: Array, lower: Array) -> list[int]:
+    """Return the numbers of negative eigenvalues of the leading 0, 1, .., N - 1 blocks of a Hessian.
 
     Block LDL^T factorisation of a symmetric block-tridiagonal matrix: the pivots are D_1 = H_11 and
     D_k = H_kk - H_(k, k-1) D_(k-1)^-1 H_(k-1, k); by Sylvester's law of inertia their negative eigenvalues add up.
+    They are the Morse indices of [t_0, t_k], k = 1 to N.
     """
     indices = [0]
     inverse_pivot = np.zeros_like(diagonal[0])

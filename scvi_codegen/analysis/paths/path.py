@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.analysis.paths import solver
 from scvi_codegen.analysis.paths.discretisation import Discretisation, discretisation_of, kinetic_energy_is_positive
-from scvi_codegen.analysis.paths.equations import Band, condensed_hessian, negative_directions
+from scvi_codegen.analysis.paths.equations import Band, condensed_hessian, hessian_blocks, negative_pivots
 from scvi_codegen.analysis.paths.intervals import Intervals, ManyCoordinates, ReducedIntervals
 from scvi_codegen.analysis.paths.starts import curves_around, curves_at_random
 from scvi_codegen.codegen.native.arguments import checked_number, real_array
@@ -119,7 +119,7 @@ class Path:
             )
         if intervals.symmetry is not None or intervals.sparse:
             return [solution.factors.negative]
-        return negative_directions(at)
+        return negative_pivots(*hessian_blocks(at))
 
     @property
     def at_rest(self) -> bool:

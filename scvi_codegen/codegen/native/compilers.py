@@ -154,11 +154,7 @@ def from_wheel(compiler: tuple[str, ...]) -> bool:
 
 def compiler_title() -> str:
     """Return the first line of the compiler's version."""
-    return _title_of(find_compiler())
-
-
-@cache
-def _title_of(command: tuple[str, ...]) -> str:
+    command = find_compiler()
     return (_version_output(command).splitlines() or [" ".join(command)])[0]
 
 
@@ -173,6 +169,7 @@ def compiler_version(compiler: tuple[str, ...]) -> str:
     return _version_output(compiler)
 
 
+@cache
 def _version_output(compiler: tuple[str, ...]) -> str:
     settings: dict[str, Any] = {"capture_output": True, "text": True, "errors": "replace", "timeout": 60}
     try:

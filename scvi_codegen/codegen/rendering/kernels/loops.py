@@ -129,7 +129,9 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
         "mass_names": [rolled.kernel.name for rolled in loops.masses],
         "scalar_kernels": [kernel_text(kernel, DOUBLE) for kernel in scalars],
         "inverse_roots": inverse_roots(scalars),
-        "vector_functions": _vector_functions(program),
+        "vector_functions": loop_functions(
+            [] if program.fixed_point else [rolled.kernel for rolled in loops.forces]  # of an explicit method
+        ),
         "coordinates": function_of_sizes(
             layout,
             "static long long coordinates_of(const problem *arrays)",
@@ -245,11 +247,6 @@ def _step_work(program: ArrayProgram) -> int:
     roots = 2 * max(map(_axes, program.layout.coordinates))  # of unity, of every axis
     waves = (1 + momenta) * FOURIER_VECTORS * program.fixed_point.lanes + roots if _on_lattices(program) else 0
     return (iteration + linear) * program.fixed_point.lanes + waves + STEP_VECTORS
-
-
-def _vector_functions(program: ArrayProgram) -> list[str]:
-    """Return the functions of the vector library that occur in the forces of an explicit method."""
-    return loop_functions([rolled.kernel for rolled in program.loops.forces] if program.fixed_point is None else [])
 
 
 def _force_text(program: ArrayProgram, rolled: RolledKernel) -> str:

@@ -344,22 +344,21 @@ def lane_table(name: str, numbers: tuple[Number, ...] | NumberTable, points: int
     return table(f"static const {kind} {name}{size}", lines, braces=bool(points))
 
 
-HEAD = "/* Predictor tables from former steps to the next, by changes of the step-size level. Requires: points.h. */\n"
-
-
 def predictor_text(predictor: AdaptivePredictor) -> str:
-    """Return the header."""
-    return HEAD + "".join(f"{table}\n" for table in _predictor_tables(predictor))
+    """Return the header of the tables from stored values to predicted ones.
 
-
-def _predictor_tables(predictor: AdaptivePredictor) -> Iterator[str]:
-    """Yield the tables from stored values to predicted ones: of a rejected step, the last one, each of the last two."""
+    They are of a rejected step, the last one, and each of the last two.
+    """
+    text = (
+        "/* Predictor tables from former steps to the next, by changes of the step-size level. Requires: points.h. */\n"
+    )
     changes, size = len(predictor.alone), "[POINTS * GROUPS]"
     for name, tables in (("INSIDE", predictor.inside), ("ALONE", predictor.alone)):
-        yield table(f"static const lanes PREDICTOR_{name}[{len(tables)}]{size}", list(map(_columns, tables)))
+        text += table(f"static const lanes PREDICTOR_{name}[{len(tables)}]{size}", list(map(_columns, tables))) + "\n"
     for name, lines in (("LAST", predictor.last), ("BEFORE", predictor.before)):
         rows = [[f"{{{', '.join(_columns(numbers))}}}" for numbers in line] for line in lines]
-        yield table(f"static const lanes PREDICTOR_{name}[{changes}][{changes}]{size}", rows)
+        text += table(f"static const lanes PREDICTOR_{name}[{changes}][{changes}]{size}", rows) + "\n"
+    return text
 
 
 def _columns(rows: NumberTable) -> list[str]:
