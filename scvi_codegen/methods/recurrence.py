@@ -62,7 +62,25 @@ RowTables: TypeAlias = tuple[tuple[str, tuple[tuple[str, Vector], ...]], ...]
 
 
 @dataclass(frozen=True, slots=True)
-class ExplicitStep:
+class StepTables:
+    """Statements of a step, and its tables of numbers by their name, those of the same rows by the name of the rows."""
+
+    statements: str
+    tables: RowTables
+
+    @property
+    def numbers(self) -> dict[str, Vector]:
+        """The tables by their names."""
+        return {name: numbers for _, named in self.tables for name, numbers in named}
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Number of rows by their name."""
+        return {rows: len(named[0][1]) for rows, named in self.tables}
+
+
+@dataclass(frozen=True, slots=True)
+class ExplicitStep(StepTables):
     """An explicit step as statements (:mod:`scvi_codegen.methods.statements`).
 
     With the state q0, p0 at the start, in one or two words, statements compute the increments q and p, which are 0 at
@@ -73,9 +91,6 @@ class ExplicitStep:
         statements: their text.
         tables: numbers by their name, those of the same rows by the name of the rows.
     """
-
-    statements: str
-    tables: RowTables
 
     __repr__ = summary("statements")
 
@@ -105,16 +120,6 @@ class ExplicitStep:
                 for rows, named in tables.items()
             ),
         )
-
-    @property
-    def numbers(self) -> dict[str, Vector]:
-        """The tables by their names."""
-        return {name: numbers for _, named in self.tables for name, numbers in named}
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        """Number of rows by their name."""
-        return {rows: len(named[0][1]) for rows, named in self.tables}
 
 
 def _checked_tables(rows: str, named: Any) -> Mapping[str, Sequence[Any]]:

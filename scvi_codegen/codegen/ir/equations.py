@@ -13,6 +13,7 @@ from enum import Enum, auto
 from typing import Literal, TypeAlias
 
 from scvi_codegen.codegen.ir.kernel import Kernel, Number, NumberTable, RolledKernel
+from scvi_codegen.methods.recurrence import StepTables
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -391,12 +392,10 @@ def transposed(table: NumberTable, points: int) -> NumberTable:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Splitting:
+class Splitting(StepTables):
     """An explicit step: its statements (:mod:`scvi_codegen.methods.statements`), and their kernels.
 
     Attributes:
-        statements: their text.
-        tables: numbers by their name, those of the same rows by the name of the rows.
         force: L_q at (q, t).
         drift: the constant diagonal of M (no arguments), v = M^-1 p, or v = H_p at p.
         by_masses: True for M^-1 p.
@@ -409,8 +408,6 @@ class Splitting:
         driven: whether forces depend on inputs, which may jump between steps: no step reuses the force of former ones.
     """
 
-    statements: str
-    tables: tuple[tuple[str, tuple[tuple[str, tuple[Number, ...]], ...]], ...]
     force: Kernel
     drift: Kernel
     by_masses: bool
@@ -425,16 +422,6 @@ class Splitting:
     def kernels(self) -> tuple[Kernel, ...]:
         """Kernels of kicks and drifts."""
         return tuple(kernel for kernel in (self.force, self.drift, self.turning, self.at_rest) if kernel)
-
-    @property
-    def numbers(self) -> dict[str, tuple[Number, ...]]:
-        """The tables by their names."""
-        return {name: numbers for _, named in self.tables for name, numbers in named}
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        """Number of rows by their name."""
-        return {rows: len(named[0][1]) for rows, named in self.tables}
 
     @property
     def acts(self) -> bool:
