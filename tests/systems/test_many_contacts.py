@@ -244,3 +244,17 @@ def test_adaptive_steps_of_a_table_on_four_feet_end_at_the_same_place() -> None:
     start = {"q": [0, 0, 0.3, 0, 0, 0], "velocity": [0.04, -0.2, 0, 0.1, -0.3, 0.2], "t_end": 1.0}
     fixed, adaptive = (dining_table(0.0).integrate(**start, **k) for k in ({"h": 0.002}, {"tolerance": 1e-9}))
     assert np.abs(adaptive.q[-1] - fixed.q[-1]).max() < 1e-6
+
+
+@pytest.mark.filterwarnings("ignore:a transition has several motions")
+@pytest.mark.parametrize("steps", [{"h": 0.005}, {"t_end": 0.5, "tolerance": 1e-9}])
+def test_feet_that_come_to_rest_after_checkpoints_have_the_bits_of_the_uncut_run(steps: dict[str, float]) -> None:
+    start = {"q": [0, 0, 0.3, 0, 0, 0], "velocity": [0.04, -0.2, 0, 0.1, -0.3, 0.2]}
+    whole = dining_table(0.0).integrate(**start, **({"t_end": 0.5} | steps))
+    plan = steps if "tolerance" in steps else {}
+    run, cuts = dining_table(0.0).start(**start, **steps), 0
+    while run.t < 0.5 - 1e-9:  # in slips and at rest
+        run.advance(2)
+        run, cuts = dining_table(0.0).from_checkpoint(run.checkpoint(), **plan), cuts + 1
+    assert cuts > 10
+    assert np.array_equal([run.q, run.p], [whole.q[-1], whole.p[-1]])
