@@ -296,7 +296,9 @@ def _primitive(total: sympy.Add) -> tuple[sympy.Rational, Sequence[sympy.Expr]]:
     """Return content and terms of SymPy's ``primitive()``, which takes ten times as long for products."""
     pairs = [term.as_coeff_Mul() for term in total.args]
     divisor, multiple = math.gcd(*(c.p for c, _ in pairs)), math.lcm(*(c.q for c, _ in pairs))
-    if divisor == multiple or not all(isinstance(rest, sympy.Symbol | sympy.Mul | Intermediate) for _, rest in pairs):
+    if divisor == multiple:  # 1, which has no factor in common with another one
+        return sympy.S.One, total.args
+    if not all(isinstance(rest, sympy.Symbol | sympy.Mul | Intermediate) for _, rest in pairs):
         content, primitive = total.primitive()
         return content, primitive.args
     scaled = [(sympy.Integer(c.p // divisor * (multiple // c.q)), rest) for c, rest in pairs]

@@ -27,7 +27,7 @@ def array_value(expression: Expr, values: dict[Expr, Any]) -> Any:
     >>> array_value(x**2 + 1, {x: np.arange(3.0)}).tolist()
     [1.0, 2.0, 5.0]
     """
-    for quantity in intermediates(expression):
+    for quantity in intermediates(expression, without=values):
         _value_in(quantity, values)
     return _value_in(expression, values)
 

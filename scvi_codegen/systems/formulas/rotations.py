@@ -32,6 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import product
 from typing import Any
 
@@ -348,12 +349,7 @@ class RotationNames:
 
     def inertia(self, member: Homogeneous, reduced: Expr, parameters: Sequence[Symbol]) -> Expr:
         """Return I0 of a member: the mean of the diagonal of l's Hessian in its rates if that is constant, else 1."""
-        entries = [S.Zero] * len(AXES)
-        for i, row in gradient(reduced, member.rates).items():
-            entries[i] = gradient(row, member.rates).get(i, S.Zero)
-            if not entries[i].free_symbols <= set(parameters):
-                return S.One
-        return Add(*entries) / len(AXES) if any(entries) else S.One
+        return _mean_inertia(member.rates, reduced, frozenset(parameters))
 
     def lagrangian(self, reduced: Expr, parameters: Sequence[Symbol]) -> Expr:
         """Return l plus the scaling terms, as a function of the homogeneous coordinates and their velocities."""
@@ -609,3 +605,13 @@ def _symbols(member: Homogeneous) -> tuple[Symbol, ...]:
 def _all_names(member: Homogeneous) -> tuple[str, ...]:
     torques = (_torque_names(member, in_space=in_space) for in_space in (False, True))
     return (*(entry.name for entry in _symbols(member)), *(name for names in torques for name in names))
+
+
+@lru_cache(maxsize=4)
+def _mean_inertia(rates: tuple[Symbol, ...], reduced: Expr, parameters: frozenset[Symbol]) -> Expr:
+    entries = [S.Zero] * len(AXES)
+    for i, row in gradient(reduced, rates).items():
+        entries[i] = gradient(row, rates).get(i, S.Zero)
+        if not entries[i].free_symbols <= parameters:
+            return S.One
+    return Add(*entries) / len(AXES) if any(entries) else S.One

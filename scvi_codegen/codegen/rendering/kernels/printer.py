@@ -174,8 +174,8 @@ def _every_part(kernel: Kernel) -> Iterator[Part]:
 
 def _functions(part: Part, counts: Callable[[Expression], bool]) -> set[str]:
     """Return the functions that occur in the operations that count."""
-    operations = (expression for expression in _expressions(part) if isinstance(expression, Operation))
-    return {operation.operator for operation in operations if counts(operation)} - PRECEDENCE.keys()
+    operations = (x for x in _expressions(part) if isinstance(x, Operation) and x.operator not in PRECEDENCE)
+    return {operation.operator for operation in operations if counts(operation)}
 
 
 def _expressions(part: Part) -> Iterator[Expression]:

@@ -59,11 +59,11 @@ class _Product(NamedTuple):
 
 def with_factors_in_roots(kernel: Kernel) -> Kernel:
     """Return the kernel with products of a root as ``inverse_root_k_times(x, factor)``, if they are few."""
+    if kernel.sums or not 0 < len(_roots(kernel)) <= MOST_ROOTS:
+        return kernel
     rewritten = _Rewriting(kernel).kernel()
-    roots = _roots(kernel)
     products = Counter(root.operator.endswith(TIMES) for root in _roots(rewritten))
-    few = 0 < len(roots) <= MOST_ROOTS and not products[False] and products[True] <= MOST_PRODUCTS
-    return rewritten if few and not kernel.sums else kernel
+    return rewritten if not products[False] and products[True] <= MOST_PRODUCTS else kernel
 
 
 def _roots(kernel: Kernel) -> list[Operation]:
