@@ -425,6 +425,12 @@ def test_what_a_heat_bath_excludes_is_refused_by_name(tmp_path):
         sc.compile_stepper(system, "svi:2", precision="double-double")
 
 
+@pytest.mark.second
+def test_the_remedy_of_kinks_exists_in_a_bath():
+    with pytest.warns(sc.MethodWarning, match=r"Use short steps \(h=\) or, with named coordinates, metropolis=True"):
+        compiled("svi:1", **{**WELL, "lagrangian": "x_dot**2/2 - abs(x)"})
+
+
 @pytest.mark.rotated
 def test_model_files_and_generated_programs_have_the_same_noise(tmp_path):
     model = sc.Model(system=sc.LagrangianSystem.from_text("well", **WELL), method="svi:2", q=[1.0], p=[0.0], h=0.1,

@@ -567,7 +567,7 @@ def render_ensemble(
         return None
     prefix, by_masses = f"{program.prefix}_ensemble", bool(program.rattle and program.rattle.lower_masses)
     velocities = by_masses or (fixed_point is not None and fixed_point.kept is StoredValues.VELOCITIES)
-    between = bath and bath.kernel, program.quantities.legendre, program.quantities.inverse_legendre
+    between = bath.kernel if bath else None, program.quantities.legendre, program.quantities.inverse_legendre
     context = {
         "program": program,
         "points": points,
@@ -579,7 +579,7 @@ def render_ensemble(
         "needs_velocities": velocities and not bath,
         "line_velocities": velocities and bath,
         "hot": "static",
-        "inverse_roots": inverse_roots([*filter(None, between)]) if bath else (),
+        "inverse_roots": inverse_roots([kernel for kernel in between if kernel]) if bath else (),
         "fixed_point": source,
         "own_headers": headers,
         "scratch": scratch_size(program),

@@ -292,7 +292,7 @@ def warn_of_formulas(of: Any, subject: str) -> None:
         u, loop, indices = kinks[0].partition(" for ")
         remedy = "Use short steps (h=, max_step=), or sizes= with at most 256 switching functions"
         if getattr(of, "temperature", None) is not None:
-            remedy = "In a heat bath use short steps (h=), or metropolis=True, with which averages have no error of h"
+            remedy = "Use short steps (h=) or, with named coordinates, metropolis=True: its averages have no error of h"
         warn(
             f"{subject} does not locate the kinks of this system, such as {clipped(u, 60)} = 0{loop}{indices}: steps "
             f'across them use the formulas as they are and lose order. {remedy}; steppers with kinks="as formulas" do '
