@@ -97,7 +97,7 @@ def equilibrium(stepper: Stepper, q: ArrayLike, *, t: float = 0.0, parameters: P
 
     Raises:
         OrbitError: if the iteration does not converge.
-        MethodError: if the stepper has no derivatives, constraints or transformed time.
+        MethodError: if the stepper has no derivatives, nonholonomic constraints or transformed time.
         StateError: if a shape, name or number is invalid.
     """
     stepper = stepper.bind(q, parameters)[0]._known_with_events
