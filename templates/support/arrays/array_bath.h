@@ -40,9 +40,9 @@ static void half_of_bath(run_memory *run, long long n, int second)
             later + from);
       memset(taken, 0, sizeof taken);
       for (long long j = 0; j < count; j++) {
-        const double old = p[from + j] + carry[from + j], change = fma(decay[from + j], old, strength[from + j] * xi[j]);
-        taken[j] = change * (old + 0.5 * change) * inverse_mass[from + j];
-        p[from + j] = old + change, carry[from + j] = 0.0;
+        const double p0 = p[from + j] + carry[from + j], change = fma(decay[from + j], p0, strength[from + j] * xi[j]);
+        taken[j] = change * (p0 + 0.5 * change) * inverse_mass[from + j];
+        p[from + j] = p0 + change, carry[from + j] = 0.0;
       }
       for (int half = NORMALS_AT_ONCE / 2; half > 0; half /= 2) /* a sum in vectors */
         for (int j = 0; j < half; j++)

@@ -167,14 +167,14 @@ static inline bath_number product(int n, const bath_number *x, const bath_number
 static inline bath_number exchange_heat(const present_factors *bath, const bath_number *normals, bath_number *p,
     bath_number *carry)
 {
-  const bath_number *w = bath->w, *v = bath->v, *at_rest = bath->terms + 1, *sigma = bath->terms + BATH_TERMS - STRENGTHS;
+  const bath_number *w = bath->w, *v = bath->v, *mean = bath->terms + 1, *sigma = bath->terms + BATH_TERMS - STRENGTHS;
   bath_number heat = {0};
   for (int b = 0, first = 0, n; b < BLOCKS; b++, w += n * n, v += n * n, first += n) {
     const int *at = BLOCK_COORDINATE + first;
     bath_number x[LARGEST_BLOCK], noise[LARGEST_BLOCK], change[LARGEST_BLOCK];
     n = BLOCK_SIZE[b];
     for (int i = 0; i < n; i++) {
-      x[i] = (p[at[i]] - at_rest[at[i]]) + carry[at[i]];
+      x[i] = (p[at[i]] - mean[at[i]]) + carry[at[i]];
       if (STRENGTHS)
         noise[i] = bath->root * sigma[at[i]] * normals[M + at[i]];
     }
