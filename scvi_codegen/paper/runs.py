@@ -1,8 +1,8 @@
 """Figures of runs (1, 3-5, 9-15, 21-30): several methods on one system, views as panels, and conditions of a verdict.
 
 The paper ends the nonlinear iteration when max(|Q^{i+1} - Q^i|, |P^{i+1} - P^i|) < TOL with TOL = 1e-14 in section 3
-and 1e-12 in section 4, after at most 1000 iterations: :data:`SECTION_3` and :data:`SECTION_4`. Code is compiled with
-flags that give the same bits on every machine. Settings, views and checks are those of ``figures.toml``.
+and 1e-12 in section 4, after at most 1000 iterations: :data:`SECTION_3` with the tolerance of the setting. Code is
+compiled with flags that give the same bits on every machine. Settings, views and checks are those of ``figures.toml``.
 """
 
 from __future__ import annotations
@@ -45,7 +45,6 @@ from scvi_codegen.runs.trajectory import Trajectory
 from scvi_codegen.systems.system import MechanicalSystem
 
 SECTION_3 = SolverOptions(tolerance=1e-14, max_iterations=1000, absolute=True)
-SECTION_4 = SolverOptions(tolerance=1e-12, max_iterations=1000, absolute=True)
 ROUNDOFF = SolverOptions(max_iterations=1000)
 """Default convergence criterion of this package, to round-off, where the paper states none."""
 NO_DRIFT = 1e-12

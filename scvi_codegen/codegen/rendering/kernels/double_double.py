@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 from scvi_codegen.codegen.ir.kernel import Constant, Expression, Kernel, Load, Number, Operation
-from scvi_codegen.codegen.rendering.kernels.printer import INVERSE_ROOT, scalar_functions
+from scvi_codegen.codegen.rendering.kernels.printer import scalar_functions
 from scvi_codegen.codegen.rendering.kernels.simd import Lanes
 from scvi_codegen.codegen.rendering.text import table, wrapped, wrapped_comment, wrapped_prototype
 from scvi_codegen.common.cache import template_folder
@@ -20,7 +20,6 @@ OPERATORS = {"+": "sum", "-": "difference", "/": "divide", "neg": "negative"}
 SUMS = ("+", "-", "neg")
 PRODUCTS, SETTLED_PRODUCTS = ("squared", "multiple", "product"), ("square", "scale", "multiply")
 """Functions of ``templates/support/double_double/pairs.h``: square, product with one word, and of pairs."""
-ROOTS = frozenset(("sqrt", *(f"{INVERSE_ROOT}{k}" for k in (1, 3, 5, 7))))
 FUNCTIONS = frozenset(
     "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp log pow".split()  # noqa: SIM905
 )
