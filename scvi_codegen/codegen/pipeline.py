@@ -570,7 +570,6 @@ class ArraySources(Sources):
             constraints=tuple(term.loops for term in system.constraints),
             continued=not (self.method.fractions or system.constraints),
             momentum_formulas=sites.momenta if sites else (),
-            velocity_formulas=sites.velocities if sites else (),
             couplings=(*system.potentials, *system.applied_forces) if self.solver == "newton" else (),
             symmetric=not (system.momenta or system.velocities),
             neighbours=tuple(near.name for near in system.neighbours),

@@ -318,8 +318,8 @@ class ArrayLayout(ArrayDeclarations):
         depends_on_time: whether L or H depends on t explicitly.
         constraints: loops of each constraint.
         continued: whether the predictor extrapolates previous steps instead of reusing the forces at their end.
-        momentum_formulas, velocity_formulas: L_v in (q, v) and H_p in (q, p) of a Lagrangian that is integrated by its
-            Hamiltonian (:class:`~scvi_codegen.systems.formulas.array_statements.ArrayForce`).
+        momentum_formulas: L_v in (q, v) of a Lagrangian that is integrated by its Hamiltonian
+            (:class:`~scvi_codegen.systems.formulas.array_statements.ArrayForce`).
         couplings: terms of the potential energy and forces, which couple the coordinates that occur in them.
         symmetric: whether the linear part of a step is symmetric: without momenta and forces of velocities.
         data: values of fields and tables by name for runs that pass none.
@@ -335,7 +335,6 @@ class ArrayLayout(ArrayDeclarations):
     constraints: tuple[tuple[Loop, ...], ...] = ()
     continued: bool = False
     momentum_formulas: tuple[Any, ...] = ()
-    velocity_formulas: tuple[Any, ...] = ()
     couplings: tuple[Any, ...] = ()
     symmetric: bool = True
     data: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
