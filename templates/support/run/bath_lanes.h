@@ -1,7 +1,7 @@
 #include "bath.h"
 
-/* Half steps of the bath of many trajectories, which are SIMD lanes; trajectory k has stream k of the noise, as in single
- * runs (bath_run.h). Requires: ensemble_run.h, bath.h. */
+/* Half steps of the bath of many trajectories, which are SIMD lanes; trajectory k has stream k of the noise, as in
+ * single runs (bath_run.h). Requires: ensemble_run.h, bath.h. */
 enum {
   DRAWN = M + STRENGTHS, /* normals of a half step */
   STEPS_DRAWN = DRAWN * LANES < NORMALS_AT_ONCE ? NORMALS_AT_ONCE / (DRAWN * LANES) : 1 /* at once */
