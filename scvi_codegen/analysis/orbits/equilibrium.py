@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.analysis.estimation.fixed_steps import tangents_along
+from scvi_codegen.analysis.orbits.constraint_manifold import reduction_of
 from scvi_codegen.common.errors import OrbitError, StateError, StepFailedError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import checks_arguments
@@ -22,7 +23,6 @@ from scvi_codegen.runs.accuracy.size import RESOLVED, roundoff
 from scvi_codegen.runs.states.reduction import Reduction
 from scvi_codegen.runs.states.validation import Array, Parameters, check_step_given
 from scvi_codegen.runs.stepper import STEPPER, Stepper
-from scvi_codegen.runs.stepping.constraint_manifold import reduction_of
 from scvi_codegen.runs.stepping.features import require
 
 LEAST_CHANGE = 0.1

@@ -30,6 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.analysis.estimation.fixed_steps import tangents_along
 from scvi_codegen.analysis.estimation.measurements import state_names
+from scvi_codegen.analysis.orbits.constraint_manifold import reduction_of
 from scvi_codegen.analysis.orbits.reversor import Reversor
 from scvi_codegen.analysis.orbits.step_sequence import StepSequence
 from scvi_codegen.codegen.native.arguments import checked_number, checked_step
@@ -53,7 +54,6 @@ from scvi_codegen.runs.states.reduction import Reduction
 from scvi_codegen.runs.states.times import steps_within
 from scvi_codegen.runs.states.validation import Array, Parameters, check_inputs_given
 from scvi_codegen.runs.stepper import STEPPER, Stepper
-from scvi_codegen.runs.stepping.constraint_manifold import reduction_of
 from scvi_codegen.runs.stepping.features import require
 from scvi_codegen.runs.stepping.projection import consistent
 from scvi_codegen.runs.stepping.step_plan import ErrorControl, Fixed
