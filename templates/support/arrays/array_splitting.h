@@ -6,9 +6,9 @@
  * forces of a kick and continues the coordinates behind them to the positions of the next kick, also into the next
  * step. Within a step the increments are in the memory of the compensation terms. Infinite and undefined numbers remain
  * in a state, so that many steps are checked at once; if one fails, they are repeated one by one. With PLAIN_SUMS
- * increments are added to the state at once, and their rounding errors are dropped; the kicks at the end of a step and at
- * the start of the next one are one where steps are checked together. Requires: arrays.h, add_forces, LEAPS, TOGETHER,
- * the tables; with ROWS array_rows.h. */
+ * increments are added to the state at once, and their rounding errors are dropped; the kicks at the end of a step and
+ * at the start of the next one are one where steps are checked together. Requires: arrays.h, add_forces, LEAPS,
+ * TOGETHER, the tables; with ROWS array_rows.h. */
 
 /* Workspace: positions of the next kick, forces at the end of a step; the state before steps that are checked. */
 typedef struct {
@@ -184,7 +184,8 @@ static void take_step(run_memory *run, const problem *arrays, const work_arrays 
   }
 #ifdef PLAIN_SUMS
   if (kicks_end && into_next) /* with the first kick of the next step */
-    kick(run, arrays, work, run->q, run->t + KICK_ABSCISSA[last] * h, h * (KICK[last] + KICK[0]), run->p, starting(h, 0, 0));
+    kick(run, arrays, work, run->q, run->t + KICK_ABSCISSA[last] * h, h * (KICK[last] + KICK[0]), run->p,
+        starting(h, 0, 0));
   else
 #endif
       if (kicks_end) {
