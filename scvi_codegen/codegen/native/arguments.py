@@ -20,6 +20,8 @@ REAL_KINDS = "iufO"
 
 def real_array(value: ArrayLike, name: str) -> NDArray[np.float64]:
     """Return a contiguous copy in binary64 of real numbers, possibly not finite; StateError for others and masks."""
+    if type(value) is float:  # the usual value of a coordinate by name
+        return np.array(value)
     for word in ("unit", "units"):  # of astropy, of pint; not the label of a row or a column
         unit = getattr(value, word) if hasattr(type(value), word) else None
         if unit is not None and str(unit) not in ("", "dimensionless"):

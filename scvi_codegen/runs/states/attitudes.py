@@ -6,6 +6,7 @@ frame to components in the space frame. Formulas: :mod:`scvi_codegen.systems.rot
 """
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -115,12 +116,17 @@ def _of_matrices(matrix: Array, name: str) -> Array:
         raise StateError(
             f"the matrix of '{name}' is not a rotation: {wrong}. Give an orthogonal matrix with determinant 1"
         )
+    q = np.linalg.eigh(np.einsum("...ij,abij->...ab", matrix, _forms()))[1][..., -1]
+    return np.asarray(q * np.sign(np.take_along_axis(q, np.abs(q).argmax(axis=-1, keepdims=True), axis=-1)))
+
+
+@cache
+def _forms() -> Array:
+    """Return (4, 4, 3, 3) F of |q|^2 R(q) = sum_ab q_a q_b F_ab."""
     unit = np.eye(4)
     pairs = unit[:, np.newaxis] + unit
-    forms = matrices(pairs) * (pairs**2).sum(axis=-1)[..., np.newaxis, np.newaxis]
-    forms = (forms - matrices(unit)[:, np.newaxis] - matrices(unit)) / 2  # |q|^2 R(q) = sum_ab q_a q_b forms_ab
-    q = np.linalg.eigh(np.einsum("...ij,abij->...ab", matrix, forms))[1][..., -1]
-    return np.asarray(q * np.sign(np.take_along_axis(q, np.abs(q).argmax(axis=-1, keepdims=True), axis=-1)))
+    of_pairs = matrices(pairs) * (pairs**2).sum(axis=-1)[..., np.newaxis, np.newaxis]
+    return np.asarray((of_pairs - matrices(unit)[:, np.newaxis] - matrices(unit)) / 2)
 
 
 def unit_vectors(q: Array) -> Array:

@@ -237,4 +237,7 @@ def column(values: Mapping[str, Any], name: str, argument: str) -> Array:
 def joined_columns(parts: Mapping[str, Array], argument: str) -> Array:
     """Return the columns of all parts by name beside each other, of as many states as the longest."""
     shape = common_shape({f"{argument}: '{name}'": part.shape[:-1] for name, part in parts.items()})
-    return np.concatenate([np.broadcast_to(part, (*shape, part.shape[-1])) for part in parts.values()], axis=-1)
+    columns = (
+        part if part.shape[:-1] == shape else np.broadcast_to(part, (*shape, part.shape[-1])) for part in parts.values()
+    )
+    return np.concatenate([*columns], axis=-1)

@@ -85,8 +85,10 @@ def shapes_of(interface: Interface) -> Shapes | None:
 
 def common_shape(shapes: Mapping[str, tuple[int, ...]]) -> tuple[int, ...]:
     """Return the shape of the states by name, of which one counts for all; StateError for two numbers of states."""
+    if len(different := {*shapes.values()}) == 1:
+        return different.pop()
     try:
-        return np.broadcast_shapes(*shapes.values())
+        return np.broadcast_shapes(*different)
     except ValueError:
         pairs = combinations(shapes, 2)
         first, second = next(pair for pair in pairs if not _agree(*(shapes[name] for name in pair)))
