@@ -375,17 +375,19 @@ def system_of_tree(
 
     def made(**fields: Any) -> Any:
         members = fields.get("rotations", ())
-        drawn = tuple(DrawnLink.of(link, tree.leaders.get(link.joint.name)) for link in tree.links)
+        pictures = tuple(DrawnLink.of(link, tree.leaders.get(link.joint.name)) for link in tree.links)
         ranges = tuple((name, *limits) for _, name, limits, _ in actuators if limits is not None)
         names = {label: name for label, name, *_ in actuators}
-        fields |= {"links": drawn, "contacts": contacts, "input_ranges": ranges, "actuators": names, **own}
+        fields |= {"links": pictures, "contacts": contacts, "input_ranges": ranges, "actuators": names, **own}
         if constraints or contacts or tendons[0] != 0 or len(fields["coordinates"]) - len(members) < SMALLEST:
             return kind(**fields)
         return kind(**fields, dual_energy=_in_quaternions(dual_energy(tree), **fields))
 
     arguments = tree.arguments(actuated)
     formula = arguments.pop("lagrangian") + tendons[0] - tendons[1]
-    arguments["dissipation"] = Add(arguments["dissipation"], tendons[2], *(each[-1] for each in actuators)) or None
+    arguments["dissipation"] = (
+        Add(arguments["dissipation"], tendons[2], *(actuator[-1] for actuator in actuators)) or None
+    )
     arguments["inputs"] += [name for _, name, *_ in actuators]
     try:
         return system_from_sympy(made, "Lagrangian", formula, name=name, constraints=constraints, **arguments)

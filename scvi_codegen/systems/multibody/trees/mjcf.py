@@ -121,7 +121,9 @@ class _MujocoModel:
     def __init__(self, root: Element, parts: Collection[str]) -> None:
         self.root, self.unread, self.parts = root, Unread(), parts
         option = _merged(root, "option", root.children("option"))
-        flags = _merged(root, "flag", [flag for each in root.children("option") for flag in each.children("flag")])
+        flags = _merged(
+            root, "flag", [flag for element in root.children("option") for flag in element.children("flag")]
+        )
         self.disabled = {key for key in flags.node.attrib if flags.choice(key, "enable", "disable") == "disable"}
         self.gravity = option.vector("gravity", (0, 0, -9.81)) * ("gravity" not in self.disabled)
         passive = not {"spring", "damper"} <= self.disabled
@@ -174,7 +176,7 @@ class _MujocoModel:
             factors = tuple((self.single(part, "joint").name, part.number("coef")) for part in tendon.children("joint"))
             points = tuple(self.place(part, "site") for part in tendon.children("site"))
             low, *high = map(float, tendon.vector("springlength", (-1,), (1, 2)))
-            slack = None if low == -1 else (low, high[0] if high else low)
+            slack = None if low == -1 else (low, [*high, low][0])
             pull = self.bounds(tendon, "actuatorfrc")
             if armature and self.responses:
                 tendon.refuse(f"has armature, which is not read with the springdamper of '{min(self.responses)}'")
@@ -331,7 +333,7 @@ class _MujocoModel:
         for label, joint in self.singles.items() if elements else ():
             own = Tendon(((joint.name, 1.0),), pull=self.bounds(self.joints[label], "actuatorfrc"))
             parts |= {("joint", label): own, ("jointinparent", label): own}
-        targets = [next(((x, each.text(x)) for x in ACTED if each.has(x)), ("", "")) for each in elements]
+        targets = [next(((x, element.text(x)) for x in ACTED if element.has(x)), ("", "")) for element in elements]
         for element, target in zip(elements, targets, strict=True):
             if target not in parts:
                 element.refuse("acts on no hinge, slide or tendon of the model, which are the parts that are read")

@@ -20,7 +20,7 @@ from scvi_codegen.systems.multibody.trees.energies import (
     position_of,
     rotation_of,
 )
-from scvi_codegen.systems.multibody.trees.tree import SINGLE, Link, Pose
+from scvi_codegen.systems.multibody.trees.tree import SINGLE, Joint, Link, Pose
 from scvi_codegen.systems.rotations.points import torque_of
 
 
@@ -65,11 +65,18 @@ def length_of(links: Sequence[Link], tendon: Tendon) -> Expr:
     return length
 
 
+def _numbers_of(joint: Joint) -> list[str]:
+    """Return the names of the coordinates of a joint that are no rotation."""
+    if joint.kind in SINGLE:
+        return [joint.name]
+    return [*position_of(joint)] if joint.kind == "free" else []
+
+
 def rate_of(links: Sequence[Link], length: Expr) -> Expr:
     """Return the derivative in time of a function of coordinates and rotations."""
     rate = S.Zero
     for joint in (link.joint for link in links if link.joint.kind != "fixed"):
-        names = [joint.name] if joint.kind in SINGLE else position_of(joint) if joint.kind == "free" else []
+        names = _numbers_of(joint)
         rate += derivative_along(length, [*map(symbol, names)], [symbol(name + DOT) for name in names])
         if joint.kind not in SINGLE:
             turn = rotation_of(joint)
@@ -92,7 +99,7 @@ def mean_inverses(links: Sequence[Link], labels: Collection[str]) -> Iterator[tu
     energy = dual_energy(Tree(links, np.zeros(3))) if labels else S.Zero
     values = {symbol(link.joint.name): link.joint.zero for link in links}
     for k, joint in enumerate(link.joint for link in links if energy != 0):
-        names = [joint.name] if joint.kind in SINGLE else position_of(joint) if joint.kind == "free" else []
+        names = _numbers_of(joint)
         momenta = [*map(symbol, default_momenta(names)), *(() if joint.kind in SINGLE else rotation_of(joint).rates)]
         if joint.kind != "fixed" and joint.label in labels:
             yield k, 2 * sum(_evaluated(links, energy, values | {p: 1.0}) for p in momenta) / len(momenta)
@@ -104,4 +111,4 @@ def _evaluated(links: Sequence[Link], expression: Expr, values: dict[Expr, float
         turn = joint.pose.rotation.flat if joint.kind == "free" else Pose().rotation.flat
         values = values | dict(zip(rotation_of(joint).entries, turn, strict=True))
         values |= zip(map(symbol, position_of(joint)), joint.pose.position, strict=True)
-    return float(evaluate(expression, {each: float(values.get(each, 0)) for each in expression.free_symbols}))
+    return float(evaluate(expression, {x: float(values.get(x, 0)) for x in expression.free_symbols}))
