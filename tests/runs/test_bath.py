@@ -4,6 +4,7 @@ Averages have fixed seeds, and bounds of four standard errors, which are those o
 """
 
 import subprocess
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -327,6 +328,30 @@ def test_failed_steps_are_repeated_in_halves():
     well = compiled("svi:1", "edge", **{**WELL, "lagrangian": "x_dot**2/2 + sqrt(x)"})
     with pytest.raises(sc.StepFailedError):  # at the edge of the domain of L
         well.integrate([1.0], [-100.0], h=1.0, steps=1, parameters={"kT": 0, "g": 0})
+
+
+@pytest.mark.second
+def test_steps_to_spurious_roots_are_repeated_in_halves():
+    """Energies in thermal bounds where single steps jump, with and without friction."""
+    pendulum = compiled(
+        *("svi:1", "jumping"),
+        coordinates=["a", "b"],
+        lagrangian="a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)",
+        parameters={"kT": 2.0, "g": 0.5},
+        damping="g",
+        temperature="kT",
+    )
+    for seed in range(8):  # P(energy > 40) < 1e-7 for the two degrees of freedom, of potential energies from -3 to 3
+        assert pendulum.integrate([0.3, 0.2], [0.0, 0.0], h=0.3, steps=300, seed=seed).energy().max() < 40
+    jumps = 0
+    for q, p in np.random.default_rng(0).normal(size=(400, 2, 2)) * [[[3.0], [2.5]]]:
+        run = pendulum.integrate(q, p, h=0.3, steps=1, parameters={"g": 0.0})
+        with suppress(sc.StepFailedError):
+            whole = pendulum.step(q, p, 0.3)[:2]
+            is_jump = abs(pendulum.energy(*whole) - pendulum.energy(q, p)) > 60
+            assert not (is_jump and np.array_equal((run.q[1], run.p[1]), whole))
+            jumps += is_jump
+    assert jumps > 0
 
 
 @pytest.mark.second

@@ -5,6 +5,7 @@
  * Computations, 2010, sec. 2.2). Requires: run.h, bath.h, energies.h. */
 
 #define MOST_PARTS 64 /* of a failed step: it is halved six times */
+#define FEW_ITERATIONS 7 /* of a step: to a root near the initial guess */
 #define LARGEST_RETURN_ERROR 1e-8 /* of Phi_-h(Phi_h(q)) relative to |q| and the step: it is reversible */
 #define RETURN_ROUNDING 1e-14 /* relative to the largest coordinate, in which others may round */
 
@@ -19,6 +20,7 @@ typedef struct {
   const solver_options *options;
   solver_report *report;
   double *workspace;
+  const bath_factors *bath;
 } bath_call;
 
 /* Half a step of the bath. Iterations start from the state alone: earlier velocities are those before the noise. */
@@ -28,6 +30,29 @@ static void half_of_bath(run_memory *run, const bath_factors *bath, const double
 #ifndef EXPLICIT_RUN
   run->guess = 0;
 #endif
+}
+
+/* Change of the energy between states, with forces frozen at t; NaN if it is undefined. */
+static double energy_change(const bath_call *call, double t, const double *q0, const double *p0, const double *q1,
+    const double *p1)
+{
+  double energy[2] = {NAN, NAN};
+  NAME(energy)(t, q0, p0, call->parameters, &energy[0], call->workspace);
+  NAME(energy)(t, q1, p1, call->parameters, &energy[1], call->workspace);
+  return energy[1] - energy[0];
+}
+
+/* Status of a step: SPURIOUS_SOLUTION if, at a temperature, many iterations change the energy by more than kT and the
+ * kinetic energy, K + max(0, U0 - U1), that the positions permit. */
+static int status_of_root(const bath_call *call, const state *before, const double *q0, const double *p0,
+    const double *q1, const double *p1)
+{
+  const double t = before->t, *q = before->q, *p = before->p, *terms = call->bath->terms; /* kT, momenta at rest */
+  if (terms[0] == 0 || call->report->iterations <= FEW_ITERATIONS)
+    return OK;
+  const double now = energy_change(call, t, q0, terms + 1, q, p), later = energy_change(call, t, q1, terms + 1, q, p);
+  const double change = fabs(energy_change(call, t, q0, p0, q1, p1));
+  return change <= terms[0] + fmax(now, later) ? OK : STATUS(SPURIOUS_SOLUTION);
 }
 
 /* Repeats a failed step as two of h / 2, each in the same way if it fails: a function of the state alone. */
@@ -43,6 +68,7 @@ static int step_in_halves(const bath_call *call, const state *before, double h, 
     memcpy(p0, p, sizeof p0);
     status = NAME(step)(before->t + done * part, size * part, q0, p0, call->parameters, call->options, q, p,
         call->report, call->workspace);
+    status = status == OK && size > 1 ? status_of_root(call, before, q0, p0, q, p) : status;
     if (status == OK)
       done += size;
     else if (size == 1)
@@ -59,11 +85,9 @@ static int step_in_halves(const bath_call *call, const state *before, double h, 
 static int is_accepted(const bath_call *call, const run_memory *run, const state *before, double h, double temperature)
 {
   const double chance = uniform_number(run->seed, (uint64_t)run->step, ACCEPTANCE, (uint32_t)run->trajectory);
-  double energy[2], q[M], p[M], size[M], largest = 0;
+  double q[M], p[M], size[M], largest = 0;
   int reversible = 1;
-  if (NAME(energy)(before->t, before->q, before->p, call->parameters, &energy[0], call->workspace) != OK ||
-      NAME(energy)(before->t, run->q, run->p, call->parameters, &energy[1], call->workspace) != OK ||
-      !(log(chance) <= (energy[0] - energy[1]) / temperature))
+  if (!(log(chance) <= -energy_change(call, before->t, before->q, before->p, run->q, run->p) / temperature))
     return 0;
 #ifndef EXPLICIT_RUN
   solver_report unread;
@@ -97,7 +121,7 @@ static int step_of_bath(const bath_call *call, run_memory *run, double temperatu
   if (status == STATUS(FALLBACK_REQUIRED))
     return status;
 #endif
-  if (status == OK && !run->metropolis)
+  if (status == OK && !run->metropolis && status_of_root(call, &before, before.q, before.p, run->q, run->p) == OK)
     return OK;
   run->step -= status == OK; /* as before the step */
   if (run->metropolis) {
@@ -128,7 +152,7 @@ int NAME(advance)(run_memory *run, long long steps, long long every, const real 
 {
   bath_factors bath;
   solver_report total = {0}, of_step;
-  const bath_call call = {parameters, options, &of_step, workspace};
+  const bath_call call = {parameters, options, &of_step, workspace, &bath};
   double first[STEPS_DRAWN][DRAWN], second[STEPS_DRAWN][DRAWN];
   long long stored = 0;
   int status = steps == 0 || prepare_bath(&bath, run->t, run->h, run->q, parameters) ? OK : NOT_FINITE;
