@@ -3,6 +3,7 @@
 How many iterations runs of them take stands beside it: what is slower than it was has forgotten former steps.
 """
 
+import re
 from functools import cache
 
 import numpy as np
@@ -128,3 +129,14 @@ def test_adaptive_steps_are_controlled_at_every_scale(method, solver, exponent):
     one, scaled = (made.integrate(s * Q, s * P, t_end=2.0, tolerance=1e-9) for s in (1.0, 2.0**exponent))
     assert scaled.steps == pytest.approx(one.steps, abs=2)
     assert np.abs(np.ldexp(scaled.q["q"][-1], -exponent) - one.q["q"][-1]).max() < 1e-8
+
+
+@pytest.mark.second
+def test_steps_of_two_arrays_are_those_of_coordinates():
+    """Steps of one coefficient are controlled by the displacement and the curvature of each array."""
+    energy = "x_dot**2/2 + y_dot**2/2 - x**4/4 - 8*y**2 - x*y/4"
+    one = sc.compile_stepper(lagrange("pair", "x y", energy), "svi:1")
+    indexed = re.sub(r"\b([xy](?:_dot)?)\b", r"\1[i]", energy)
+    two = sc.compile_stepper(lagrange("pairs", "x[N] y[N]", f"sum(i in N, {indexed})"), "svi:1")
+    run = two.integrate({"x": [1.0], "y": [0.01]}, t_end=0.01, tolerance=1e-3)
+    assert np.array_equal(run.t, one.integrate([1.0, 0.01], [0.0, 0.0], t_end=0.01, tolerance=1e-3).t)
