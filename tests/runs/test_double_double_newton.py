@@ -202,6 +202,8 @@ def test_initial_states() -> None:
     assert (again.mp("q")[0] == q.mp()).all()
     assert (again.mp("p")[0] == p.mp()).all()
     assert np.abs(again.constraint_values()).max() < 1e-30
+    with pytest.warns(sc.AccuracyWarning, match=r"violates the constraints by 1\.0e-04"):
+        stepper.integrate([0.6, -0.8], velocity=[0.80006, 0.59992], h=0.1, steps=1)
     many = stepper.integrate_ensemble([q, [0.6, -0.8]], velocity=[stepper.velocity(q, p), [0.8, 0.6]], h=0.1, steps=1)
     assert np.abs(many[1].constraint_values()).max() < 1e-30
     circle = [(Fraction(a * a - b * b, a * a + b * b), Fraction(2 * a * b, a * a + b * b)) for a, b in PAIRS]
