@@ -19,6 +19,8 @@ REFUSALS = {
     3: "no impulses satisfy the law of impact with friction at t = {t:.17g}, contact {k}: reduce its friction",
     5: "contact {k} has impossible coefficients at t = {t:.17g}: friction is {value:.6g}, which must not be negative, "
     "nor at rest above static friction; restitution must be 0 to 1",
+    6: "contact {k} pulls, or exceeds its friction, at t = {t:.17g} in each mode that was tried: limit the steps by "
+    "max_step= (or h=), or reduce its friction",
     4: "the impacts at t = {t:.17g} do not end: contacts close a corner; set a restitution to 0",
 }
 """Messages by the reasons of contacts.h."""

@@ -13,7 +13,8 @@ enum {
   CONTACT_WITHOUT_MODE, /* Painleve's paradox, or redundant contacts */
   CONTACT_WITHOUT_IMPULSE,
   CONTACT_IN_CORNER,
-  CONTACT_IMPOSSIBLE /* coefficients */
+  CONTACT_IMPOSSIBLE, /* coefficients */
+  CONTACT_LEAVES_CONE
 };
 
 /* A contact without gap is always closed; one without friction does not stick, and has direction 0. Slip in space that

@@ -21,33 +21,36 @@ static int stops_at(const event_step *step, const contact_terms *of, int k)
   return CONTACTS[k].slips == 1 || length_of(of->rate + CONTACTS[k].tangential, 2) <= CONTACT_SLOW * speed;
 }
 
-/* Whether normal forces push and friction is in its cone, in the present modes at a state. */
-static int are_forces_possible(const event_step *step, const contact_terms *of)
+/* The first contact that pulls, or whose friction is outside of its cone, in the present modes at a state, by more than
+ * a part of the rates; EVENT_CONTACTS if contacts contradict each other, -1: none. */
+static int find_outside(const event_step *step, const contact_terms *of, real part)
 {
   const contact_problem in = {.of = of, .right = of->second};
   contact_mode mode[EVENT_CONTACTS];
   real force[CONTACT_ROWS], after[CONTACT_ROWS];
-  int possible;
+  int first;
   modes_at(of, step->watch->mode, mode);
-  possible = solve_contacts(of, mode, of->second, force, after, NULL);
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
+  first = solve_contacts(of, mode, of->second, force, after, NULL) ? -1 : EVENT_CONTACTS;
+  for (int k = EVENT_CONTACTS - 1; k >= 0; k--) {
     const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
-    const int row = normal < 0 ? slip : normal;
-    const real small = rounding_at_row(&in, after, row) / of->W[row * (CONTACT_ROWS + 1)];
-    possible &= normal < 0 || force[normal] >= -small;
-    possible &= !mode[k].sticks || length_of(force + slip, slips) <= friction_limit(of, k, 1, force) + small;
+    const int row = normal < 0 ? slip : normal; /* those of open contacts may be undefined */
+    const real small = part / CONTACT_ROUNDING * rounding_at_row(&in, after, row) / of->W[row * (CONTACT_ROWS + 1)];
+    const int pushes = normal < 0 || force[normal] >= -small;
+    if (mode[k].closed &&
+        !(pushes && (!mode[k].sticks || length_of(force + slip, slips) <= friction_limit(of, k, 1, force) + small)))
+      first = k;
   }
-  return possible;
+  return first;
 }
 
 /* Impacts and new modes at a state, which is projected onto their constraints. That may turn slow slips, and modes are
- * chosen again if it makes their forces impossible. */
+ * chosen again if it makes their forces impossible; none that remain so are kept. */
 static int change_modes(const event_step *step, event_sample *at, contact_change *now)
 {
   contact_terms of;
   contact_mode present[EVENT_CONTACTS];
   real force[CONTACT_ROWS];
-  int closed[EVENT_CONTACTS], approach = 0, status = terms_at(step, at, &of);
+  int closed[EVENT_CONTACTS], approach = 0, outside = 0, status = terms_at(step, at, &of);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const contact_mode mode = mode_of(step->watch->mode, k);
     if (status == OK && CONTACTS[k].slips > 0)
@@ -62,14 +65,19 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
     forces_at(at->t, at->q, at->p, step->own, present, force, step->workspace);
   if (status == OK && approach)
     status = collide(step, at, &of, closed, now);
-  for (int pass = 0, possible = 0; status == OK && !possible && pass <= EVENT_CONTACTS; pass++) {
+  for (int pass = 0; status == OK && outside >= 0 && pass <= EVENT_CONTACTS; pass++) {
     status = choose_modes(step, &of, now, force);
     if (status == OK)
       status = satisfy_constraints(step, at->t, at->q, at->p, 1);
     if (status == OK)
       status = terms_at(step, at, &of);
-    possible = status == OK && are_forces_possible(step, &of);
+    if (status == OK)
+      outside = find_outside(step, &of, CONTACT_ROUNDING);
   }
+  if (status == OK && outside >= 0)
+    outside = find_outside(step, &of, CONTACT_OUTSIDE);
+  if (status == OK && outside >= 0 && outside < EVENT_CONTACTS)
+    status = refuse(step, CONTACT_LEAVES_CONE, outside, 0.0);
   return status;
 }
 
@@ -84,7 +92,7 @@ static int renew_slips(const event_step *step, event_sample *at, real *longest)
   int status = follow_slips(step, at, longest);
   if (status == OK && *step->filled > before)
     status = terms_at(step, at, &of);
-  if (status != OK || *step->filled == before || are_forces_possible(step, &of))
+  if (status != OK || *step->filled == before || find_outside(step, &of, CONTACT_ROUNDING) < 0)
     return status;
   memset(&now, 0, sizeof now);
   status = change_modes(step, at, &now);
