@@ -22,7 +22,7 @@ from scvi_codegen.codegen.rendering.events import EventFormulas
 from scvi_codegen.common.errors import EventWarning, StateError
 from scvi_codegen.common.precision import mp
 from scvi_codegen.methods.discretise import is_symplectic
-from scvi_codegen.methods.exact.solution import ExactMotion, Numbers, exact_motion, numbers
+from scvi_codegen.methods.exact.solution import ExactMotion, Numbers, exact_motion, numbers, solved
 from scvi_codegen.runs.results.recomputation import changes_by_events
 from scvi_codegen.runs.results.saved_states import parameters_on_sides
 from scvi_codegen.runs.states.validation import Array
@@ -235,8 +235,9 @@ def _symplecticity(run: Trajectory, changes: list[Change]) -> Finding | None:
 
 
 SAMPLED_STATES, SAMPLED_CHANGES, ROUNDED, DIFFERENCE = 40, 12, 256.0 * EPSILON, mp.mpf(10) ** -30
-LEAST_STEPS, HALVINGS, TRANSITIONS, SLACK, DECIDED = 16, 4, 2, 0.5, 1e-12
-"""Bound on zeros relative to their terms; of runs that measure an order: slack of the order, rounding errors."""
+LEAST_STEPS, HALVINGS, TRANSITIONS, SLACK, DECIDED, OUTSIDE = 16, 4, 2, 0.5, 1e-12, 1e-9
+"""Bound on zeros relative to their terms; of runs that measure an order: slack of the order, rounding errors; part of
+their size by which impulses may leave their cone (contacts.h)."""
 
 
 @dataclass(frozen=True)
@@ -292,6 +293,40 @@ class RunInModes:
         alone = sorted((change for change in changes if times.count(change[0]) == 1), key=lambda change: change[0])
         return alone[:: -(-len(alone) // SAMPLED_CHANGES) or 1]
 
+    @cached_property
+    def impacts(self) -> list[tuple[float, float]]:
+        """Violations of the law of impact, and of the friction cone by the impulse, of contacts that meet alone.
+
+        With friction v_n+ may be less than by the law.
+        """
+        stepper, errors, m = self.run.stepper, list[tuple[float, float]](), self.run.stepper.dimension
+        contacts, first = stepper.interface.contacts, len(self.tested.system.constraints) - stepper.interface.masked
+        for _, k, *ends, (old, new) in self.changes:
+            event, named = stepper.searched[k], stepper.parameters_by_name(old)
+            contact, is_closed = getattr(event, "contact", 0), any(named[c.closed] for c in contacts if c.closed)
+            if getattr(event, "kind", "") != "closes" or is_closed:
+                continue
+            rows, imposed, rates, size = contacts[contact], old.copy(), [], mp.mpf(0)
+            imposed[[stepper.interface.parameters.index(name) for name in (rows.closed, *rows.sticks)]] = 1.0
+            motion, row = self.motion(imposed), first + cast(int, rows.normal)
+            q, t, jump = ends[0][:m], ends[0][-1], (ends[1] - ends[0])[m:-1]
+            laws = Tape(coefficients(self.tested.system), motion.symbols)
+            at_impact = laws([*q, *motion.velocity(q, ends[0][m:-1], t), t, *motion.parameters])
+            friction, _, restitution = at_impact[3 * contact : 3 * contact + 3]
+            for q, p, t in ((x[:m], x[m:-1], x[-1]) for x in ends):
+                v = motion.velocity(q, p, t)
+                normal, _, terms = motion.constraint_terms(q, v, t)
+                rates.append(terms[2][row])
+                size += np.abs(normal[row]) @ np.abs(v) + abs(terms[2][row])
+            excess = rates[1] + (0 if stepper.parameters_by_name(new)[str(rows.closed)] else restitution) * rates[0]
+            excess = max(excess, -rates[1]) if friction else abs(excess)
+            G = normal[[row, *(first + (rows.tangential or 0) + i for i in range(rows.slips))]]
+            pushes, *slips = solved(G @ G.T, G @ jump)
+            outside = max(mp.sqrt(sum(x * x for x in slips)) - friction * pushes, -pushes)
+            outside *= G[0] @ G[0] / (np.abs(G[0]) @ (np.abs(ends[0][m:-1]) + np.abs(ends[1][m:-1])))
+            errors.append((float(excess / size), float(outside)))
+        return errors
+
     def states(self) -> Iterator[tuple[Numbers, Array]]:
         """Yield states x with parameters: some of those of the run, and those before transitions."""
         for t in self.run.t[:: -(-len(self.run) // SAMPLED_STATES)].tolist():
@@ -322,7 +357,9 @@ def transition_checks(tested: SystemUnderTest, run: Trajectory) -> Iterator[Chec
     statement = "continuous; where L jumps p+ - p- = lambda u_q and H+ - H- = -lambda u_t (60 digits)"
     yield from checked("states at kinks", statement, partial(_states_at_kinks, of))
     statement = "v_n+ = -e v_n- of a contact alone, with friction at most; v_n+ = 0 if it closes (60 digits)"
-    yield from checked("impacts of contacts", statement, partial(_impacts_of_contacts, of))
+    yield from checked("impacts of contacts", statement, partial(_impacts_of_contacts, of, 0, ROUNDED))
+    statement = "impulses push, and are in the friction cone (60 digits)"
+    yield from checked("friction of impacts", statement, partial(_impacts_of_contacts, of, 1, OUTSIDE))
     statement = f"order {tested.method.order} in h of the end of a run, and of its balance H - W"
     yield from checked("order across transitions", statement, partial(_order, of))
 
@@ -357,27 +394,9 @@ def _states_at_kinks(of: RunInModes) -> Finding | None:
     return Finding(max(errors), ROUNDED, f"relative, {len(errors)} crossings") if errors else None
 
 
-def _impacts_of_contacts(of: RunInModes) -> Finding | None:
-    """Return the largest violation of the law of impact of contacts that meet alone; with friction v_n+ may be less."""
-    stepper, errors, m = of.run.stepper, list[float](), of.run.stepper.dimension
-    contacts, first = stepper.interface.contacts, len(of.tested.system.constraints) - stepper.interface.masked
-    for _, k, *ends, (old, new) in of.changes:
-        contact, named = getattr(stepper.searched[k], "contact", 0), stepper.parameters_by_name(old)
-        if getattr(stepper.searched[k], "kind", "") != "closes" or any(named[c.closed] for c in contacts if c.closed):
-            continue
-        closed, imposed, rates, size = str(contacts[contact].closed), old.copy(), [], mp.mpf(0)
-        imposed[stepper.interface.parameters.index(closed)] = 1.0
-        motion, row = of.motion(imposed), first + cast(int, contacts[contact].normal)
-        for q, p, t in ((x[:m], x[m:-1], x[-1]) for x in ends):
-            v = motion.velocity(q, p, t)
-            normal, _, terms = motion.constraint_terms(q, v, t)
-            rates.append(terms[2][row])
-            size += np.abs(normal[row]) @ np.abs(v) + abs(terms[2][row])
-        laws = Tape(coefficients(of.tested.system), motion.symbols)([*q, *v, t, *motion.parameters])
-        friction, _, restitution = laws[3 * contact : 3 * contact + 3]
-        excess = rates[1] + (0 if stepper.parameters_by_name(new)[closed] else restitution) * rates[0]
-        errors.append(float((max(excess, -rates[1]) if friction else abs(excess)) / size))
-    return Finding(max(errors), ROUNDED, f"relative to its terms, {len(errors)} impacts") if errors else None
+def _impacts_of_contacts(of: RunInModes, which: int, bound: float) -> Finding | None:
+    errors = [pair[which] for pair in of.impacts]
+    return Finding(max(errors), bound, f"relative to its terms, {len(errors)} impacts") if errors else None
 
 
 def _order(of: RunInModes) -> Finding:
