@@ -26,7 +26,7 @@ from scvi_codegen.runs.results.joining import joined
 from scvi_codegen.runs.results.output import Output
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import Array, check_left_to_inputs, no_input
-from scvi_codegen.runs.states.words import exact_product, low_words, split, with_low
+from scvi_codegen.runs.states.words import exact_product, exact_sum, low_words, split, with_low
 from scvi_codegen.runs.stepping.features import refusal
 from scvi_codegen.runs.stepping.memory import Memory
 from scvi_codegen.runs.stepping.step_plan import Adaptive, Fixed, FixedSteps, StepPlan, ending_at
@@ -394,7 +394,7 @@ def planned_segments(t: float, t_end: float, h: float, inputs: Mapping[str, Inpu
 
 def time_after_steps(now: tuple[float, float], h: float, steps: int) -> tuple[float, float]:
     """Return the double-double time after ``steps`` steps of h."""
-    high, low = map(float, times_after(now[0], h, steps))
+    high, low = map(float, exact_sum(now[0], h) if steps == 1 else times_after(now[0], h, steps))
     total = high + (low + now[1])
     return total, (low + now[1]) - (total - high)
 

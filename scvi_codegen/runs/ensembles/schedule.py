@@ -123,14 +123,16 @@ class CommonSteps:
 
     def times(self, *, tau: bool) -> Array:
         """Return the (n,) times of the saved states, of one or two words; tau from 0 in transformed time."""
-        times, lows = np.empty((2, len(self.numbers)))
-        for k, (rows, segment) in enumerate(self.spans()):
-            start, low = (0.0, 0.0) if tau else segment.start
-            high, rest = times_after(start, segment.h, self.numbers[rows] - self._first(k))
-            times[rows] = high + (rest + low)
-            lows[rows] = (high - times[rows]) + (rest + low)
+        rows = np.diff([0, *map(self.row, self.ends)])
+        columns = [(*segment.start, segment.h, self._first(k)) for k, segment in enumerate(self.segments)]
+        start, low, h, first = np.repeat(np.array(columns).T, rows, axis=1)
+        high, rest = times_after(0.0 * start if tau else start, h, self.numbers - first)
+        rest += 0.0 if tau else low
+        times = high + rest
+        lows = (high - times) + rest
+        for end, segment in zip(self.ends, self.segments, strict=True):
             if self.words > 1 and segment.end is not None:
-                times[rows.stop - 1], lows[rows.stop - 1] = segment.end, 0.0
+                times[self.row(end) - 1], lows[self.row(end) - 1] = segment.end, 0.0
         return times if self.words == 1 else with_low(times, lows)
 
     def spans(self) -> Iterator[tuple[slice, Segment]]:

@@ -1,6 +1,5 @@
 """Double-double times t + n h of runs; numbers of steps that make up a span."""
 
-import math
 from fractions import Fraction
 
 import numpy as np
@@ -17,9 +16,9 @@ MOST_STEPS = 10**9
 """Largest number of steps accepted; more indicate a mistyped step size."""
 
 
-def times_after(t: float, h: float, steps: ArrayLike) -> tuple[Array, Array]:
+def times_after(t: float | Array, h: float | Array, steps: ArrayLike) -> tuple[Array, Array]:
     """Return t + n h after n < 2^53 steps as double-double numbers, correctly rounded but for near ties."""
-    mantissa, exponent = math.frexp(h)
+    mantissa, exponent = np.frexp(h)
     numbers = np.asarray(steps, dtype=np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
         high, low = (np.ldexp(piece, exponent) for piece in exact_product(numbers, mantissa))

@@ -363,7 +363,7 @@ def exact_product(x: Array, y: Array | float) -> tuple[Array, Array]:
     return product, ((x_high * y_high - product) + x_high * y_low + x_low * y_high) + x_low * y_low
 
 
-def exact_sum(x: Array | float, y: Array) -> tuple[Array, Array]:
+def exact_sum(x: Array | float, y: Any) -> tuple[Any, Any]:
     """Return x + y without rounding error as a double-double number (Knuth's sum)."""
     total = x + y
     part = total - x

@@ -61,21 +61,16 @@ static int step_in_halves(const bath_call *call, const state *before, double h, 
   int status = OK;
   memcpy(q, before->q, sizeof before->q);
   memcpy(p, before->p, sizeof before->p);
-  for (int done = 0, size = MOST_PARTS / 2; done < MOST_PARTS; size = status == OK ? done & -done : size / 2) {
+  for (int done = 0, size = MOST_PARTS / 2; done < MOST_PARTS && size; size = status == OK ? done & -done : size / 2) {
     const double part = h / MOST_PARTS;
-    double q0[M], p0[M];
-    memcpy(q0, q, sizeof q0);
-    memcpy(p0, p, sizeof p0);
-    status = NAME(step)(before->t + done * part, size * part, q0, p0, call->parameters, call->options, q, p,
+    double q1[M], p1[M];
+    status = NAME(step)(before->t + done * part, size * part, q, p, call->parameters, call->options, q1, p1,
         call->report, call->workspace);
-    status = status == OK && size > 1 ? status_of_root(call, before, q0, p0, q, p) : status;
-    if (status == OK)
+    status = status == OK && size > 1 ? status_of_root(call, before, q, p, q1, p1) : status;
+    if (status == OK) {
       done += size;
-    else if (size == 1)
-      break;
-    else {
-      memcpy(q, q0, sizeof q0);
-      memcpy(p, p0, sizeof p0);
+      memcpy(q, q1, sizeof q1);
+      memcpy(p, p1, sizeof p1);
     }
   }
   return status;
