@@ -32,6 +32,17 @@ def test_action_is_the_sum_of_discrete_lagrangians(stepper):
     assert abs(every_tenth.action() - run.action()) < 1e-15
 
 
+def test_discrete_legendre_transforms_of_explicit_steps_clear_the_report():
+    spring = lagrange("spring", "x", "x_dot**2/2 - x**2/2")
+    binding = sc.compile_stepper(spring, "stoermer-verlet").binding.with_function("discrete_legendre")
+    report, numbers = binding.new("report *"), np.array([[0.0], [0.1], [0.0], [0.0], [0.0]])
+    report.iterations = 7
+    q0, q1, *results = map(binding.pointer, numbers)
+    arguments = q0, q1, binding.null, binding.null, *results, report, binding.workspace()
+    assert (binding.function("discrete_legendre")(0.0, 0.1, *arguments), report.iterations) == (0, 0)
+    assert numbers[2:4, 0] == pytest.approx([1.0, 0.995])  # p0 = v + h/2 q0, p1 = v - h/2 q1
+
+
 def test_variation_of_the_action_is_that_of_the_ends(stepper):
     """dS = p1 . dq1 - p0 . dq0 - sum E_d dh with E_d = -dL_d/dh at fixed ends."""
 
