@@ -159,6 +159,11 @@ ROD = PLAIN | {
     "constraints": ["x**2 + y**2 = 1"],
     "damping": "g",
 }
+SPHERICAL = ROD | {
+    "coordinates": ["x", "y", "z"],
+    "lagrangian": "(x_dot**2 + y_dot**2 + z_dot**2)/2 - z",
+    "constraints": ["x**2 + y**2 + z**2 = 1"],
+}
 LAGRANGIAN_OF_BODY = "(omega_1**2 + 2*omega_2**2 + 5*omega_3**2/2)/2 + 2*R_33"
 DIPOLE = PLAIN | {"rotations": {"R": "omega"}, "lagrangian": LAGRANGIAN_OF_BODY, "damping": "g"}
 
@@ -328,6 +333,18 @@ def test_failed_steps_are_repeated_in_halves():
     well = compiled("svi:1", "edge", **{**WELL, "lagrangian": "x_dot**2/2 + sqrt(x)"})
     with pytest.raises(sc.StepFailedError):  # at the edge of the domain of L
         well.integrate([1.0], [-100.0], h=1.0, steps=1, parameters={"kT": 0, "g": 0})
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("arguments", [SPHERICAL, DIPOLE], ids=["rod", "dipole"])
+def test_noise_is_a_continuous_function_of_the_state(arguments):
+    """Of equal frictions, whose eigenvectors are arbitrary."""
+    stepper = compiled("svi:2", **arguments)
+    q = np.eye(stepper.dimension)[0]
+    p = np.eye(stepper.dimension)[1]
+    for seed in range(4):
+        first, second = (stepper.integrate(q, p * x, h=0.05, steps=60, seed=seed) for x in (1.0, 1.0 + 1e-10))
+        assert 0 < np.abs(first.p - second.p).max() < 1e-7
 
 
 @pytest.mark.second

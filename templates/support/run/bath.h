@@ -3,7 +3,8 @@
 
 /* Heat bath at frozen positions: the exact step of dp = -R M^-1 (p - A) dt + sqrt(2 kT) R^(1/2) dW + sigma dW' over a
  * time tau. With M = L L^T and S = L^-1 R L^-T = U diag(k) U^T, y = V (p - A), V = U^T L^-1, are independent
- * processes of Ornstein and Uhlenbeck, y <- e^(-k tau) y + sqrt(kT (1 - e^(-2 k tau))) xi, and p = A + W y, W = L U.
+ * processes of Ornstein and Uhlenbeck, y <- e^(-k tau) y + sqrt(kT (1 - e^(-2 k tau))) U^T xi, and p = A + W y,
+ * W = L U. U^T makes the noise a function of S that is continuous where eigenvalues k are equal and U is arbitrary.
  * Momenta along the normals G^T of constraints do not change: S is projected on their complement, where k = 0. The
  * kinetic energy is |y|^2 / 2. Requires: the kernel bath_terms, and block, row and column of its entries. */
 
@@ -11,11 +12,11 @@
 #define NO_FRICTION 1e-14 /* relative to the largest k: it is 0 but for rounding */
 #define JACOBI_SWEEPS 30
 
-/* W and V of each block, n rows of n numbers, the decay e^(-k tau) - 1 and the strength of the noise of each y, and the
- * root of tau: of a trajectory, or of those in SIMD lanes. */
-#define FACTORS_OF(number)                                                                   \
-  struct {                                                                                   \
-    number terms[BATH_TERMS], w[BATH_FACTORS], v[BATH_FACTORS], decay[M], strength[M], root; \
+/* W, V and U^T of each block, n rows of n numbers, the decay e^(-k tau) - 1 and the strength of the noise of each y,
+ * and the root of tau: of a trajectory, or of those in SIMD lanes. */
+#define FACTORS_OF(number)                                                                                       \
+  struct {                                                                                                       \
+    number terms[BATH_TERMS], w[BATH_FACTORS], v[BATH_FACTORS], turn[BATH_FACTORS], decay[M], strength[M], root; \
   }
 typedef FACTORS_OF(double) bath_factors;
 #ifdef MANY_TRAJECTORIES
@@ -33,9 +34,12 @@ static inline void rotate(double *x, double *y, double c, double s)
   *y = s * first + c * *y;
 }
 
-/* Makes S diagonal by cyclic Jacobi rotations (Golub & Van Loan, sec. 8.5), which also act on W = L and V = L^-1. */
-static inline void diagonalise(int n, double *s, double *w, double *v)
+/* Makes S diagonal by cyclic Jacobi rotations (Golub & Van Loan, sec. 8.5), which also act on W = L, V = L^-1 and 1,
+ * which becomes U^T. */
+static inline void diagonalise(int n, double *s, double *w, double *v, double *turn)
 {
+  for (int i = 0; i < n; i++)
+    turn[i * n + i] = 1;
   for (int sweep = 0, rotated = LARGEST_BLOCK > 1; sweep < JACOBI_SWEEPS && rotated; sweep++) {
     rotated = 0;
     for (int i = 0; i < n; i++)
@@ -50,6 +54,7 @@ static inline void diagonalise(int n, double *s, double *w, double *v)
           rotate(&s[k * n + i], &s[k * n + j], c, tangent * c);
           rotate(&w[k * n + i], &w[k * n + j], c, tangent * c);
           rotate(&v[i * n + k], &v[j * n + k], c, tangent * c);
+          rotate(&turn[i * n + k], &turn[j * n + k], c, tangent * c);
         }
         for (int k = 0; k < n; k++)
           rotate(&s[i * n + k], &s[j * n + k], c, tangent * c);
@@ -123,12 +128,13 @@ static int prepare_bath(bath_factors *bath, double t, double h, const double *q,
 {
   const double temperature = (bath_terms(q, t, parameters, bath->terms), bath->terms[0]);
   const double *mass = bath->terms + 1 + M, *friction = mass + BATH_MASS_ENTRIES;
-  double *w = bath->w, *v = bath->v;
+  double *w = bath->w, *v = bath->v, *turn = bath->turn;
   memset(w, 0, sizeof bath->w);
   memset(v, 0, sizeof bath->v);
+  memset(turn, 0, sizeof bath->turn);
   const double tau = fabs(h) / 2;
   bath->root = sqrt(tau);
-  for (int b = 0, first = 0, n; b < BLOCKS; b++, w += n * n, v += n * n, first += n) {
+  for (int b = 0, first = 0, n; b < BLOCKS; b++, w += n * n, v += n * n, turn += n * n, first += n) {
     double s[LARGEST_BLOCK * LARGEST_BLOCK] = {0}, largest = 0;
     n = BLOCK_SIZE[b];
     for (int e = 0; e < BATH_MASS_ENTRIES; e++)
@@ -143,7 +149,7 @@ static int prepare_bath(bath_factors *bath, double t, double h, const double *q,
         s[k] += friction[e] * (x[i] * y[j] + (i != j ? x[j] * y[i] : 0));
       }
     project_on_tangents(b, n, friction + BATH_FRICTION_ENTRIES, v, s);
-    diagonalise(n, s, w, v);
+    diagonalise(n, s, w, v, turn);
     for (int i = 0; i < n; i++)
       largest = fmax(largest, fabs(s[i * n + i]));
     for (int i = 0; i < n; i++) {
@@ -167,20 +173,22 @@ static inline bath_number product(int n, const bath_number *x, const bath_number
 static inline bath_number exchange_heat(const present_factors *bath, const bath_number *normals, bath_number *p,
     bath_number *carry)
 {
-  const bath_number *w = bath->w, *v = bath->v, *mean = bath->terms + 1, *sigma = bath->terms + BATH_TERMS - STRENGTHS;
+  const bath_number *w = bath->w, *v = bath->v, *turn = bath->turn;
+  const bath_number *mean = bath->terms + 1, *sigma = bath->terms + BATH_TERMS - STRENGTHS;
   bath_number heat = {0};
-  for (int b = 0, first = 0, n; b < BLOCKS; b++, w += n * n, v += n * n, first += n) {
+  for (int b = 0, first = 0, n; b < BLOCKS; b++, w += n * n, v += n * n, turn += n * n, first += n) {
     const int *at = BLOCK_COORDINATE + first;
-    bath_number x[LARGEST_BLOCK], noise[LARGEST_BLOCK], change[LARGEST_BLOCK];
+    bath_number x[LARGEST_BLOCK], xi[LARGEST_BLOCK], noise[LARGEST_BLOCK], change[LARGEST_BLOCK];
     n = BLOCK_SIZE[b];
     for (int i = 0; i < n; i++) {
       x[i] = (p[at[i]] - mean[at[i]]) + carry[at[i]];
+      xi[i] = normals[at[i]];
       if (STRENGTHS)
         noise[i] = bath->root * sigma[at[i]] * normals[M + at[i]];
     }
     for (int i = 0; i < n; i++) {
       const bath_number y = product(n, v + i * n, x);
-      change[i] = bath->decay[first + i] * y + bath->strength[first + i] * normals[at[i]];
+      change[i] = bath->decay[first + i] * y + bath->strength[first + i] * product(n, turn + i * n, xi);
       if (STRENGTHS)
         change[i] += product(n, v + i * n, noise);
       heat += change[i] * (y + change[i] / 2);
