@@ -385,6 +385,7 @@ def render_ensemble_in_pairs(program: Program, derivatives: PointDerivatives | N
         "tangents": 0,
         "cut": is_divided((*kernels, *beside)),
         "needs_velocities": False,
+        "line_velocities": False,
         "hot": "static",
         "two_words": {
             **({"derivatives": derivatives.count, "anchor": _anchor(program)} if derivatives else {}),

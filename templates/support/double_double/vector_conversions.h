@@ -1,4 +1,4 @@
-/* Vectors of pairs from words and from numbers. */
+/* Vectors of pairs from words, from numbers, and from the array of parameters. */
 static inline ddl ddl_of(dd x)
 {
   const ddl result = {lanes_of(x.high), lanes_of(x.low)};
@@ -10,6 +10,8 @@ static inline ddl ddl_of_words(lanes high, lanes low)
   const ddl result = {high, low};
   return result;
 }
+
+#define PARAMETER_OF_LANES(i) ddl_of_words(parameters[i], parameters[PARAMETERS + (i)])
 
 /* Lane j. */
 static inline double lane_of(const lanes *x, int j)
