@@ -13,7 +13,7 @@ from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.driver.segments import Input, Segment, planned_segments, time_after_steps
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import Array
-from scvi_codegen.runs.states.words import low_words, with_low
+from scvi_codegen.runs.states.words import exact_sum, low_words, with_low
 
 
 class StepChunk(NamedTuple):
@@ -123,17 +123,15 @@ class CommonSteps:
 
     def times(self, *, tau: bool) -> Array:
         """Return the (n,) times of the saved states, of one or two words; tau from 0 in transformed time."""
-        rows = np.diff([0, *map(self.row, self.ends)])
         columns = [(*segment.start, segment.h, self._first(k)) for k, segment in enumerate(self.segments)]
-        start, low, h, first = np.repeat(np.array(columns).T, rows, axis=1)
+        start, low, h, first = np.repeat(np.array(columns).T, np.diff([0, *map(self.row, self.ends)]), axis=1)
         high, rest = times_after(0.0 * start if tau else start, h, self.numbers - first)
         rest += 0.0 if tau else low
-        times = high + rest
-        lows = (high - times) + rest
+        times, lows = exact_sum(high, rest)
         for end, segment in zip(self.ends, self.segments, strict=True):
             if self.words > 1 and segment.end is not None:
                 times[self.row(end) - 1], lows[self.row(end) - 1] = segment.end, 0.0
-        return times if self.words == 1 else with_low(times, lows)
+        return with_low(times, lows) if self.words > 1 else np.asarray(times)
 
     def spans(self) -> Iterator[tuple[slice, Segment]]:
         """Yield the saved states of each segment; a breakpoint belongs to the earlier one."""
