@@ -155,6 +155,17 @@ def test_a_table_on_four_legs_slips_at_the_sum_of_the_limits(direction: tuple[fl
         assert run.contact_forces()[0, :, 0] == pytest.approx([G / 4] * 4)
 
 
+def test_a_leg_at_its_limit_carries_it_while_the_others_stick() -> None:
+    """Pushed and turned, the table rests; the friction of the second leg, in space, is at its limit."""
+    start = {"velocity": np.zeros(6), "h": 0.05, "t_end": 1.15, "parameters": {"F": 1.0, "E": 1.5, "K": 0.6}}
+    run = table(0.3).integrate([0, 0, TOP, 0, 0, 0], **start)
+    with pytest.warns(sc.EventWarning, match="not unique"):
+        force = run.contact_forces()[-1]
+    assert run.contact_modes == [(0.0, ("stick",) * 4)]
+    assert force.sum(axis=0) == pytest.approx([G, -1.15, -1.725])
+    assert np.hypot(force[:, 1], force[:, 2])[1] == pytest.approx(0.3 * force[1, 0], rel=1e-9)
+
+
 def test_a_table_on_four_legs_tips() -> None:
     start = {"velocity": np.zeros(6), "h": 0.05, "t_end": 1.1, "parameters": {"F": G * 0.5 / TOP / 0.97}}
     run = table(1.5).integrate([0, 0, TOP, 0, 0, 0], **start)
