@@ -82,7 +82,8 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
 }
 
 #ifdef CONTACTS_IN_SPACE
-/* Follows slips in space from a state; new modes where their new directions make forces impossible. */
+/* Follows slips in space from a state; new modes where their new directions make forces impossible. Those of dependent
+ * contacts only differ in the rates by the rounding of directions while slips begin. */
 static int renew_slips(const event_step *step, event_sample *at, real *longest)
 {
   const long long before = *step->filled;
@@ -92,7 +93,8 @@ static int renew_slips(const event_step *step, event_sample *at, real *longest)
   int status = follow_slips(step, at, longest);
   if (status == OK && *step->filled > before)
     status = terms_at(step, at, &of);
-  if (status != OK || *step->filled == before || find_outside(step, &of, CONTACT_ROUNDING) < 0)
+  const int outside = status == OK && *step->filled > before ? find_outside(step, &of, CONTACT_ROUNDING) : -1;
+  if (outside < 0 || outside == EVENT_CONTACTS)
     return status;
   memset(&now, 0, sizeof now);
   status = change_modes(step, at, &now);
