@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from typing import Any, Self
 
@@ -123,10 +123,12 @@ class TimeSpan(RunOptions):
                 )
 
     def _run_section(self) -> dict[str, Any]:
-        section = {option.key: getattr(self, option.field) for option in options_of("run")}
+        defaults = {field.name: field.default for field in fields(self)}
+        values = {option: getattr(self, option.field) for option in options_of("run")}
+        section = {option.key: value for option, value in values.items() if value != defaults[option.field]}
         if self.time_transformation is not None and self.controller is None:
             section["controller"] = default_controller(in_tau=True)
-        return {key: value for key, value in section.items() if value is not None and value is not False}
+        return {key: value for key, value in section.items() if value is not None}
 
     @property
     def _control(self) -> dict[str, Any]:

@@ -192,13 +192,13 @@ PASS end_increments increments_of(const step_points *w, long long i)
 
 /* Adds the square of a change. For many coordinates with names the sum of the rounding errors would stay above the
  * tolerance: there it is the largest. A NaN is detected later, by the increments. */
-static inline lanes with_change(lanes change, lanes moved, double weight)
+static inline lanes with_change(lanes change, lanes moved, double share)
 {
 #ifndef ARRAYS
   if (M > FEW)
     return larger_lanes(change, moved * moved);
 #endif
-  return change + weight * (moved * moved);
+  return change + share * (moved * moved);
 }
 
 /* Updates the points of a range of coordinates from the forces; returns the sum of the squared relative changes. */
