@@ -14,7 +14,7 @@ from motions import MOTIONS, recorded
 from notation import lagrange
 
 import scvi_codegen as sc
-from scvi_codegen.runs.accuracy.global_error import SAFETY, SAFETY_OF_ROUNDING, SAFETY_OF_TWO, _alternative
+from scvi_codegen.runs.accuracy.global_error import SAFETY, SAFETY_OF_ROUNDING, SAFETY_OF_TWO, _alternative, _Samples
 from scvi_codegen.runs.driver import segments
 from scvi_codegen.runs.driver.run import Run
 from scvi_codegen.runs.results import dense_output
@@ -508,3 +508,17 @@ def test_a_rod_that_hardly_swings_is_confirmed_in_few_steps(precision):
         assert run.steps < 200
         u = angle.integrate([swing], [0.0], t_end=3.0, tolerance=1e-14).q[-1, 0]
         assert abs(float(run.q[-1, 0]) - math.sin(u)) < 1e-8 * swing
+
+
+def test_the_other_branch_of_a_constraint_is_an_error():
+    """Mirrored motions of a free rod have equal x and p_x; the constraint determines y but for its sign."""
+    rod = sc.compile_stepper(
+        lagrange("free", "x y", "(x_dot**2 + y_dot**2)/2", constraints=["x**2 + y**2 - 1"]), "svi:2"
+    )
+    y = math.sqrt(0.99)
+    run, mirrored = (rod.integrate([0.1, k * y], velocity=[-y, k * 0.1], h=0.01, steps=5) for k in (1, -1))
+    assert np.allclose(run.q[:, 0], mirrored.q[:, 0], rtol=0, atol=1e-15)
+    samples = _Samples(run, 0.0, rod.interface)
+    assert not samples.independent[:, 1].any()
+    samples.compare(mirrored)
+    assert samples.largest() > 1.0

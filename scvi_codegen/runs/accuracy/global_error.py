@@ -97,7 +97,7 @@ class GlobalError:
         t: (n,) times at which the runs were compared: at most 512 of the saved states, where the motion is fast.
         differences: (n,) the largest difference of a position relative to the range of that coordinate over the run, or
             of a momentum relative to its own or that of its velocity (:mod:`scvi_codegen.runs.accuracy.size`); not of
-            coordinates that constraints determine from others at that time.
+            coordinates that constraints determine from others at that time, where their positions differ by rounding.
         safety: factor of the estimate: 3; where rounding may dominate the error, 12 for two comparisons, 4 for three.
         estimate: this factor times the largest difference, at least ten roundings and the tolerance; meaningless above
             about 0.1, where runs are uncorrelated.
@@ -377,7 +377,7 @@ class Runs:
         size = longest_piece(run, self.motion.end - self.start) * FINER_PIECES**self.examinations
         self.examinations += 1
         apart = np.array([differences_in_pieces(compared, size) for compared in (run, *further)]).max(axis=0)
-        apart[np.isfinite(apart) & ~samples.independent.any(axis=0)] = 0.0
+        apart[:, ~samples.independent.any(axis=0) & samples.is_rounding(apart[0]).any(axis=0)] = 0.0
         differences = relative(apart, samples.sizes(len(samples.t), apart)).max()
         if differences <= max(PART_OF_ERROR * self.requested, ROUNDINGS * samples.epsilon):
             return False
@@ -518,7 +518,7 @@ class _Samples:
         kinetic: (k, m) momenta of velocities.
         independent: (k, m) whether constraints do not determine a coordinate, and its momentum, from others.
         errors: (2, k, m) largest differences from other runs, at least the rounding errors of the states; 0 of
-            coordinates that constraints determine.
+            coordinates that constraints determine, where their positions differ by rounding.
         steps_of_run: (n,) initial time, and times of all saved states.
         end: last time.
     """
@@ -571,10 +571,14 @@ class _Samples:
             if some.any():
                 states = other._states_at(self.t[some])
                 differences[:, some] = [abs(x - y[some]) for x, y in zip(states, self.states, strict=True)]
-        differences[:, some] *= self.independent[some]
+        differences[:, ~self.independent & self.is_rounding(differences[0])] = 0.0
         np.maximum(self.errors, differences, out=self.errors)
         self.motion = Motion(np.asarray(other.t), other.q, other.p, self.firsts, self.epsilon, self.absolute)
         return bool(np.isfinite(differences).all())
+
+    def is_rounding(self, apart: Array) -> NDArray[np.bool_]:
+        """Return (k, m) whether differences of positions are those of rounding, and not of another branch."""
+        return np.asarray(apart <= ROUNDINGS * self.epsilon * np.abs(np.asarray(self.states[0])))
 
     def lose(self) -> None:
         """Record that a run for comparison has not ended."""
