@@ -205,7 +205,8 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         if type(save_every) is not int or save_every != 1:
             save_every = checked_count(save_every, "save_every", least=1)
         stepper = self if events is None and not action else self._for_run(events, action=action)
-        interface, noise = self.interface, Noise.checked(stepper, seed, metropolis, inputs=inputs)
+        interface = self.interface
+        noise = Noise.checked(stepper, seed, metropolis, inputs=inputs) if seed or metropolis else DEFAULT_NOISE
         if not (inputs is None and t_eval is None and observe is None and tables is None and threads is None):
             self._check_not_of_run(tables, threads)
             stride = None if save_every == 1 else save_every

@@ -7,7 +7,7 @@ from itertools import chain
 
 import numpy as np
 import pytest
-from counting import TooMuchWorkError, at_most
+from counting import TooMuchWorkError, at_most, visited
 
 import scvi_codegen as sc
 
@@ -30,6 +30,16 @@ def test_a_call_takes_few_function_calls(stepper, convert, plan, calls):
         stepper.integrate(q, p, **plan)
     with pytest.raises(TooMuchWorkError), at_most(calls // 2):
         stepper.integrate(q, p, **plan)
+
+
+@pytest.mark.parametrize("plan", [FIXED, ADAPTIVE, {"t_end": 0.05}])
+def test_a_repeated_call_visits_few_functions_and_files(stepper, plan):
+    stepper.integrate(Q, P, **plan)
+    with visited() as functions:
+        stepper.integrate(Q, P, **plan)
+    files = {file for file, _ in functions if "scvi_codegen" in file}
+    assert 5 <= len(files) <= 8
+    assert 8 <= len(functions) <= 20
 
 
 def test_one_step_of_a_run_takes_few_function_calls(stepper):

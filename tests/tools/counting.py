@@ -11,6 +11,22 @@ class TooMuchWorkError(BaseException):
 
 
 @contextmanager
+def visited() -> Iterator[set[tuple[str, str]]]:
+    """Collect the functions of Python that are called, as pairs of file and name."""
+    functions: set[tuple[str, str]] = set()
+
+    def look(frame: FrameType, event: str, argument: object) -> None:
+        if event == "call":
+            functions.add((frame.f_code.co_filename, frame.f_code.co_name))
+
+    sys.setprofile(look)
+    try:
+        yield functions
+    finally:
+        sys.setprofile(None)
+
+
+@contextmanager
 def at_most(calls: int) -> Iterator[None]:
     """Raise :class:`TooMuchWorkError` where more functions, of Python or C, are called."""
     count = 0

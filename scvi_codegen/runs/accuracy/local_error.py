@@ -72,12 +72,12 @@ def warn_of_energy_error(trajectory: SavedStates, run: Memory) -> None:
         has_estimate = trajectory.step_error == trajectory.step_error
         if not isinstance(plan, FixedSteps) or has_estimate or not stepper.interface.layout.coordinates:
             return
-    if not stepper.interface.conserves_energy or energy_reason(stepper) or not warnings_wanted():
+    if not stepper.interface.conserves_energy or not warnings_wanted():
         return
     ends = run._end_energies(trajectory.t, trajectory.q, trajectory.p)
     if ends is None or not abs(ends[1] - ends[0]) > 0.5 * TOLERABLE_ERROR * max(abs(ends[0]), abs(ends[1])):
         return
-    if energies := _changed_energies(trajectory):
+    if not energy_reason(stepper) and (energies := _changed_energies(trajectory)):
         if is_adaptive:
             warn_of_energies(*energies)
         else:

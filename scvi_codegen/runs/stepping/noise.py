@@ -121,8 +121,6 @@ class Noise(NamedTuple):
         cls, stepper: Any, seed: int, metropolis: bool, trajectory: int = 0, inputs: Mapping[str, Any] | None = None
     ) -> Noise:
         """Return the stream of these arguments of a run; raise an error for those that the stepper excludes."""
-        if type(seed) is int and seed == 0 and not metropolis and not trajectory:
-            return DEFAULT_NOISE
         interface = stepper.interface
         coloured = any(isinstance(value, ColouredNoise) for value in (inputs or {}).values())
         if interface.temperature is None and ((seed != 0 and not coloured) or metropolis):
