@@ -73,7 +73,7 @@ from scvi_codegen.codegen.variants import (
 )
 from scvi_codegen.common.errors import MethodError, SizesRequiredError, SystemDefinitionError
 from scvi_codegen.common.validation import checks_arguments
-from scvi_codegen.methods import as_method
+from scvi_codegen.methods import as_method, sliding
 from scvi_codegen.methods.controllers import controller_named
 from scvi_codegen.methods.discretise import discretise, discretised_form
 from scvi_codegen.methods.method import Method
@@ -635,6 +635,8 @@ def generate_source(
             events are combined with ``embedded="single"``.
     """
     method = as_method(method, system)
+    if kinks == "located" and not embedded and time_transformation is None and controller is None:
+        system = sliding(system, method)
     original, rows = system, cast("tuple[ContactRows, ...]", ())
     if system.has_contacts:
         system, rows = bound_contacts(system, system.contacts)

@@ -23,6 +23,7 @@ from scvi_codegen.methods.runge_kutta import (
     SpectralCollocation,
 )
 from scvi_codegen.methods.shooting import SCVI
+from scvi_codegen.systems.contacts.dry_friction import with_dry_friction
 from scvi_codegen.systems.system import MechanicalSystem
 
 __all__ = [
@@ -49,6 +50,7 @@ __all__ = [
     "method_from_specification",
     "size_of",
     "sized",
+    "sliding",
     "specification_of",
 ]
 
@@ -111,10 +113,18 @@ def default_method(system: MechanicalSystem) -> Method:
 
 def fitted(specification: Specification, system: MechanicalSystem | None) -> Specification:
     """Add the default quadrature of an SVI for constraints: Gauss-Lobatto points, one more than the degree."""
-    wants = system is not None and system.constrained_at_nodes and specification.get("method") == "svi"
-    if not wants or "quadrature" in specification or "degree" not in specification:
+    is_open = specification.get("method") == "svi" and "degree" in specification and "quadrature" not in specification
+    if system is None or not is_open or not (system.constrained_at_nodes or with_dry_friction(system) is not system):
         return specification
     return {**specification, "quadrature": f"gauss-lobatto:{int(str(specification['degree'])) + 1}"}
+
+
+def sliding(system: MechanicalSystem, method: Method | str) -> MechanicalSystem:
+    """Return the system with contacts in place of the dry friction in its forces, if the method has constraints."""
+    method = as_method(method, system)
+    if not isinstance(method, SVI) or not method.curves.nodal:
+        return system
+    return with_dry_friction(system) if method.rule.name == f"gauss-lobatto:{method.degree + 1}" else system
 
 
 def specification_of(name: str) -> dict[str, Any]:

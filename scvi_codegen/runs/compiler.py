@@ -29,7 +29,7 @@ from scvi_codegen.codegen.variants import KINKS, SUMS, Derivatives, Kinks, Sums,
 from scvi_codegen.common.cache import cached_source, key_of
 from scvi_codegen.common.errors import MethodError, SizesRequiredError
 from scvi_codegen.common.validation import TEXTS, OfRunTimeSizes, check_kind, checks_arguments
-from scvi_codegen.methods import SVI, StoermerVerlet, as_method, default_method
+from scvi_codegen.methods import SVI, StoermerVerlet, as_method, default_method, sliding
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
 from scvi_codegen.runs.stepping.compiled_method import Variants
@@ -120,7 +120,7 @@ def compile_stepper(
     if kinks not in KINKS:
         raise MethodError(f"unknown kinks {kinks!r}: use {' or '.join(map(repr, KINKS))}")
     others = {"precision": precision, "sizes": sizes, "tables": tables, "controller": controller}
-    system, rows = _with_contacts(system, contacts, **others, time_transformation=time_transformation)
+    system, rows = _with_contacts(system, method, kinks, contacts, **others, time_transformation=time_transformation)
     common: dict[str, Any] = {
         "solver": solver,
         "flags": flags,
@@ -171,12 +171,15 @@ def _check_symmetries(symmetries: Any) -> None:
 
 
 def _with_contacts(
-    system: MechanicalSystem, contacts: Sequence[ContactLike], **others: Any
+    system: MechanicalSystem, method: Method | str, kinks: Kinks, contacts: Sequence[ContactLike], **others: Any
 ) -> tuple[MechanicalSystem, tuple[ContactRows, ...]]:
     """Return the system with the modes of its contacts as parameters, and their places; ``others`` exclude contacts."""
+    passed = [name for name, value in others.items() if value not in (None, "auto", "double")]
+    if kinks == "located" and not passed:
+        system = sliding(system, method)
     if not any((*contacts, system.has_contacts)):
         return system, ()
-    if passed := [name for name, value in others.items() if value not in (None, "auto", "double")]:
+    if passed:
         raise MethodError(f"{passed[0]}={others[passed[0]]!r} is not available with contacts: omit it")
     from scvi_codegen.systems.contacts.modes import bound_contacts
 

@@ -8,7 +8,7 @@
 | constraints have no corners; their kinks keep the order | refusals, test_continuity, test_tables; here |
 | kinks in velocities: in forces only; masses with kinks | refusals, test_kinks (drag); here |
 | two surfaces at once, starts on a surface | test_jumps (corners), test_contacts (joint at its limit); here |
-| forces that point to a surface: sliding named, relays accumulate | test_kinks (sliding); here |
+| forces that point to a surface: dry friction, sliding named, relays accumulate | test_kinks (sliding); here |
 | two crossings in a step, grazing, chattering | here; test_kinks (short visits), test_jumps, test_mode_changes |
 | arrays: number of functions, lists; multiples of one function | test_mode_changes, test_many_contacts; here |
 | zeros of functions of time | test_mode_changes |
@@ -120,6 +120,46 @@ def test_a_relay_accumulates_and_its_equilibrium_is_named(steps: dict[str, float
     assert abs(relay.integrate([1.0], [0.0], t_end=15.0, **steps).q[-1, 0]) < 0.05
     with pytest.raises(sc.EventError, match="slides on 'x' = 0 at t = 0"):
         relay.integrate([0.0], [0.0], t_end=1.0, **steps)
+
+
+DRY: dict[str, tuple[str, dict[str, str], list[sc.Friction]]] = {
+    "coulomb": ("x", {"x": "-d*sign(x_dot)"}, [sc.friction("x_dot", limit="d")]),
+    "stribeck": (
+        "x",
+        {"x": "-(d + exp(-5*abs(x_dot - 1/5))/5)*sign(x_dot - 1/5)"},
+        [sc.friction("x_dot - 1/5", limit="d + exp(-5*abs(x_dot - 1/5))/5")],
+    ),
+    "two-sided": ("x", {"x": "where(x_dot < 0, 2*d, -d)"}, [sc.friction("x_dot", limit="3*d/2")]),
+    "drag": ("x", {"x": "-d*sign(2*x_dot) - x_dot*abs(x_dot)/9"}, [sc.friction("x_dot", limit="d + x_dot**2/9")]),
+    "between": (
+        "x y",
+        {"x": "d*sign(y_dot - x_dot)", "y": "-d*sign(y_dot - x_dot) - d*sign(y_dot)/2"},
+        [sc.friction("x_dot - y_dot", limit="d"), sc.friction("y_dot", limit="d/2")],
+    ),
+}
+"""Coordinates, forces with steps of slips, and the friction that they are."""
+
+
+@STEPS
+@pytest.mark.parametrize("name", DRY)
+def test_forces_that_jump_along_a_slip_are_dry_friction(name: str, steps: dict[str, float]) -> None:
+    names, forces, contacts = DRY[name]
+    text, bias = " + ".join(f"({x}_dot**2 - {x}**2)/2" for x in names.split()), name == "two-sided"
+    states = [1.0, 0.0][: len(names.split())], [0.0] * len(names.split())
+    stated = made(text, names, forces=forces, d=0.15).integrate(*states, t=1.0, t_end=14.0, **steps)
+    friction = made(text + " + d*x/2" * bias, names, contacts=contacts, d=0.15)
+    assert stated.contact_modes
+    expected = friction.integrate(*states, t=1.0, t_end=14.0, **steps)
+    assert stated.q[-1] == pytest.approx(expected.q[-1], abs=1e-13)
+    assert [modes for _, modes in stated.contact_modes] == [modes for _, modes in expected.contact_modes]
+    if name == "coulomb":
+        assert stated.q[-1] == pytest.approx([-0.1], abs=1e-9)  # amplitudes 1, .7, .4, .1
+
+
+@pytest.mark.parametrize("force", ["d*sign(x_dot)", "-d*x_dot*abs(x_dot)", "-d*sign(x) - x_dot"])
+def test_other_jumps_are_no_friction(force: str) -> None:
+    """Forces that supply energy, that are continuous at rest, and of positions alone."""
+    assert not made("x_dot**2/2 - x**2/2", forces={"x": force}, d=0.15).interface.contacts
 
 
 @STEPS

@@ -33,7 +33,7 @@ from scvi_codegen.analysis.verification.variable_steps import VariableSteps, at_
 from scvi_codegen.codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.common.validation import checks_arguments
-from scvi_codegen.methods import as_method
+from scvi_codegen.methods import as_method, sliding
 from scvi_codegen.methods.discretise import discretised_form
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
@@ -115,6 +115,8 @@ def verify(
         of_known_sizes = partial(verify, solver=solver, tolerance=tolerance)
         of_run |= {"of_known_sizes": of_known_sizes, "tolerance": tolerance}
         return verify_arrays(system, method, stepper, (q, p, cast(float, h), t), began, **of_run)
+    if stepper is None or stepper.interface.contacts:
+        system = sliding(system, method)
     form = discretised_form(in_all_modes(system), method)
     located, kinks = located_kinks(form)
     stepper = stepper or compile_stepper(system, method, solver=solver, kinks="located" if kinks else "as formulas")
