@@ -121,6 +121,7 @@ def compile_stepper(
         raise MethodError(f"unknown kinks {kinks!r}: use {' or '.join(map(repr, KINKS))}")
     others = {"precision": precision, "sizes": sizes, "tables": tables, "controller": controller}
     system, rows = _with_contacts(system, method, kinks, contacts, **others, time_transformation=time_transformation)
+    precision = "double" if rows else precision  # contacts have no second precision for "auto"
     common: dict[str, Any] = {
         "solver": solver,
         "flags": flags,

@@ -156,6 +156,13 @@ def test_forces_that_jump_along_a_slip_are_dry_friction(name: str, steps: dict[s
         assert stated.q[-1] == pytest.approx([-0.1], abs=1e-9)  # amplitudes 1, .7, .4, .1
 
 
+@pytest.mark.parametrize("contacts", [[], [sc.friction("x_dot", limit=0.15)]], ids=["force", "contact"])
+def test_friction_is_part_of_steppers_of_either_precision(contacts: list[sc.Friction]) -> None:
+    system = lagrange("rule", "x", "x_dot**2/2 - x**2/2", forces={} if contacts else {"x": "-0.15*sign(x_dot)"})
+    stepper = sc.compile_stepper(system, "svi:3", flags=QUICK_FLAGS, contacts=contacts, precision="auto")
+    assert stepper.integrate([1.0], [0.0], t_end=13.0, error=1e-8).q[-1] == pytest.approx([-0.1], abs=1e-8)
+
+
 @pytest.mark.parametrize("force", ["d*sign(x_dot)", "-d*x_dot*abs(x_dot)", "-d*sign(x) - x_dot"])
 def test_other_jumps_are_no_friction(force: str) -> None:
     """Forces that supply energy, that are continuous at rest, and of positions alone."""
