@@ -11,16 +11,20 @@ function writeAddress() {
   writing = setTimeout(() => { try { history.replaceState(null, "", address(false)); } catch { /* a frame without an address */ } }, 300);
 }
 
-/** Starts the motion again, and finds the frame of the drawing by running ahead for a moment. */
+/** Starts the motion again, and finds the frame of the drawing by running ahead for a moment, or along an orbit. */
 function restart() {
   start();
   if (!fault && !shape.mesh && m <= 400) {
-    const states = [pointsOf(memory_q, memory_p, code.time())], span = 10 * settings.speed;
-    scheduled.begin(frames ? 4 : 40); // longer when the page begins, and its code is compiled
-    scheduled.perform(() => (fault || Math.abs(code.time() - about.t) >= span || states.length >= 4000 ? 0 : 64), (now) => {
-      fault = code.advance(now, 4);
+    const states = [pointsOf(memory_q, memory_p, code.time())], span = family ? family.orbits[present].period : 10 * settings.speed;
+    scheduled.begin(frames && !family ? 4 : 40); // longer when the page begins, and its code is compiled
+    scheduled.perform(() => (fault || Math.abs(code.time() - about.t) >= span || states.length >= 4000 ? 0 : family ? 1 : 64), (now) => {
+      if (family) single(); else fault = code.advance(now, 4);
       for (let k = 0; k < code.stored() && !fault; k++) states.push(pointsOf(stored_q.subarray(k * m, (k + 1) * m), stored_p.subarray(k * m, (k + 1) * m), stored_t[k]));
     });
+    if (family) {
+      picture.curves = trails; // the orbit
+      states.push(...family.orbits.map(({ q, p }) => pointsOf(q, p, about.t))); // one frame for all
+    }
     const shown = states.filter((points) => points.flat().every(Number.isFinite));
     start();
     picture.ahead(shown);
@@ -40,10 +44,10 @@ function group(title) {
   by("controls").append(box);
   return (groups[title] = box);
 }
-function addSlider(title, label, name, { low, high, log = false, hard = true, get, set: put }) {
+function addSlider(title, label, name, { low, high, step = 0.001, log = false, hard = true, get, set: put }) {
   const row = document.createElement("div"), id = "c" + sliders.length, text = document.createElement("label"), range = document.createElement("input"), number = document.createElement("input");
   row.className = "row"; text.htmlFor = range.id = id; text.append(label); text.title = name;
-  Object.assign(range, { type: "range", min: 0, max: 1, step: 0.001 }); range.setAttribute("aria-label", name);
+  Object.assign(range, { type: "range", min: 0, max: 1, step }); range.setAttribute("aria-label", name);
   Object.assign(number, { type: "number", step: "any" }); number.setAttribute("aria-label", `${name}, value`);
   row.append(text, range, number);
   const share = (x) => clamped(log ? Math.log(x / low) / Math.log(high / low) : (x - low) / (high - low), 0, 1);
@@ -67,6 +71,10 @@ function addSlider(title, label, name, { low, high, log = false, hard = true, ge
   sliders.push(show);
 }
 const showSliders = () => sliders.forEach((show) => show());
+if (family) addSlider("Family", "Orbit", "Orbit", {
+  low: 0, high: family.orbits.length - 1, step: 1 / (family.orbits.length - 1), get: () => present,
+  set: (k) => { const { q, v, parameters } = family.orbits[Math.round(k)]; Object.assign(settings, { q, v }); Object.assign(settings.parameters, parameters); restart(); },
+});
 addSlider("Time", "Speed", "Speed", { ...about.speed, log: true, get: () => settings.speed, set: (x) => { settings.speed = x; } });
 const { adaptive } = about.step; // of unknown durations
 addSlider("Time", about.step.label.replace(" in tau", ""), about.step.label, { ...about.step, log: true, get: () => settings.step, set: (x) => { settings.step = x; restart(); } });

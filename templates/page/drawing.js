@@ -200,6 +200,7 @@ const marked = () => {
       shape.trails.forEach((which, k) => {
         const past = [];
         for (const point of trails[k]) if (!((point.t - t) * sign > 0)) past.push(view.to(point.at));
+        line(pen, (this.curves?.[k] ?? []).map((point) => view.to(point.at)), colors.muted, 1, 0.8);
         trail(pen, [...past, at[which]], colors[trailColor(k)]);
       });
       const largest = heaviest();

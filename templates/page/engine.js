@@ -1,7 +1,7 @@
 // The compiled integrator, its settings, the address, and the states that plots and trails show.
 const by = (id) => document.getElementById(id);
 const about = JSON.parse(by("description").textContent);
-const { m } = about, count = about.quantities.length;
+const { m, family } = about, count = about.quantities.length;
 /** Returns the WebAssembly in the page, which is compressed. */
 async function inflated() {
   const bytes = Uint8Array.from(atob(by("wasm").textContent.trim()), (c) => c.charCodeAt(0));
@@ -46,7 +46,9 @@ const initial = {
   step: about.step.value, speed: about.speed.value, q: about.q, v: about.v,
   parameters: Object.fromEntries(about.parameters.map(({ name, value }) => [name, value])),
 };
+Object.assign(initial.parameters, family?.orbits[0].parameters);
 let settings = structuredClone(initial);
+let present = 0; // number of the orbit of a family
 let legs = [0]; // numbers of steps, "r" where the direction of time is reversed, and new values of inputs
 const value = (given) => (typeof given === "string" ? settings.parameters[given] : given);
 const ranges = byName(about.parameters.map(({ name, low, high }) => [name, [low, high]]));
@@ -109,6 +111,8 @@ const ROW = { t: 0, energy: 1, quantities: 2, q: 2 + count, p: 2 + count + probe
 /** Starts from the initial values. */
 function start() {
   Object.assign(settings.parameters, held);
+  const own = family ? family.orbits.findIndex(({ q, v, parameters }) => String([q, v]) === String([settings.q, settings.v]) && Object.entries(parameters).every(([name, x]) => settings.parameters[name] === x)) : -1;
+  if (own >= 0) present = own;
   about.parameters.forEach(({ name, place }) => (memory_parameters[place] = settings.parameters[name]));
   if (about.initial) {
     code.initial();

@@ -50,6 +50,21 @@ function addPanel(title, draw) {
   panels.push(panel);
   return panel;
 }
+/** Adds a panel of curves over the family, with its bifurcations and the present orbit; `told` is the text of this. */
+function addFamilyPanel(title, heights, told) {
+  const { orbits } = family;
+  addPanel(`${title} over ${spelled(family.value)}`, ({ canvas, output }) => {
+    const columns = heights(orbits[0]).map((_, k) => orbits.map((orbit) => heights(orbit)[k])), xs = orbits.map((orbit) => orbit.value);
+    const { px, py, pen } = plot(canvas, columns.flatMap(() => [...xs, NaN]), columns.flatMap((ys) => [...ys, NaN]), colors.c0);
+    orbits.forEach((orbit, k) => heights(orbit).forEach((y) => { if (orbit.bifurcation || k === present) { pen.beginPath(); pen.arc(px(orbit.value), py(y), 3.5, 0, TAU); pen.fillStyle = k === present ? colors.c1 : colors.muted; pen.fill(); } }));
+    output.textContent = told(orbits[present]);
+  });
+}
+if (family) {
+  addFamilyPanel("Period", ({ period }) => [period], ({ period, value }) => `${short(period, 6)} at ${short(value, 6)}`);
+  if (family.value !== "energy") addFamilyPanel("Energy", ({ energy }) => [energy], ({ energy }) => short(energy, 6));
+  addFamilyPanel(`log₁₀ ${family.sizes}`, ({ sizes }) => sizes.map(Math.log10), ({ kind, sizes }) => [...sizes.slice(0, 3).map((x) => short(x, 4)), kind].join(", "));
+}
 const [solid] = shape.solids;
 const defaults = about.plots.length ? about.plots : [solid && m <= WHOLE && about.coordinates.length ? [`${solid.name}.y`, `${solid.name}.x`] : m <= WHOLE && about.coordinates.length ? ((k) => (k < 0 ? [about.coordinates[0], "t"] : [about.momenta[k] || "t", about.coordinates[k]]))(about.coordinates.findIndex((_, k) => !about.rotations.some(({ columns }) => columns.includes(k)))) : [`q.${probes[0]}`, "t"]];
 for (const [y, x] of defaults) {
@@ -116,7 +131,7 @@ function plot(canvas, xs, ys, color, { symmetric = false, periods = [0, 0] } = {
   for (const [mark, text] of marked(x0, x1, clamped(width / 75, 2, 5))) { const half = pen.measureText(text).width / 2; if (px(mark) + half < width) pen.fillText(text, px(mark), height - bottom + 4); }
   pen.beginPath();
   for (let k = 0; k < xs.length; k++) {
-    const jump = k && periods.some((period, axis) => period && Math.abs((axis ? ys : xs)[k] - (axis ? ys : xs)[k - 1]) > period / 2);
+    const jump = k && (Number.isNaN(ys[k - 1]) || periods.some((period, axis) => period && Math.abs((axis ? ys : xs)[k] - (axis ? ys : xs)[k - 1]) > period / 2));
     if (!k || jump) pen.moveTo(px(xs[k]), py(ys[k])); else pen.lineTo(px(xs[k]), py(ys[k]));
   }
   pen.strokeStyle = color; pen.lineWidth = 1.2; pen.stroke();

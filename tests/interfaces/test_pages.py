@@ -267,6 +267,28 @@ def test_mistakes_in_the_section_page_are_errors(tmp_path, old, new, message):
 
 
 @pytest.mark.rotated
+@pytest.mark.rotated
+@pytest.mark.usefixtures("without_compiler")
+def test_a_family_has_its_orbits_bifurcations_and_range_and_belongs_to_its_system():
+    formula, period = "x_dot**2/2 - x**2/2 - x**4/20 + F*x*cos(1.15*t)", 2 * np.pi / 1.15
+    system = lagrange("driven oscillator", "x", formula, F=0.1, dissipation="x_dot**2/40")
+    stepper = sc.compile_stepper(system, "svi:4")
+    start = sc.periodic_orbit(stepper, [0.7109], [1.5385], period=period, fixed_period=True)
+    family = sc.family(stepper, start, parameter="F", fixed_period=True, step=0.5, count=4, backward=True)
+    about = described(sc.page(system, family=family).html)
+    shown, (fold,) = about["family"], family.bifurcations
+    assert (shown["value"], shown["sizes"]) == ("F", "|multiplier|")
+    assert [orbit["kind"] == "fold" for orbit in shown["orbits"]] == [k == fold.after + 1 for k in range(5)]
+    values = [orbit["value"] for orbit in shown["orbits"]]
+    assert values == [*family.values[: fold.after + 1], family.value_of(fold.orbit), *family.values[fold.after + 1 :]]
+    assert [about["q"], about["v"]] == [family[0].q.tolist(), family[0].p.tolist()]
+    (slider,) = about["parameters"]
+    assert [slider["low"], slider["high"]] == [min(family.values), max(family.values)]
+    other = lagrange("pendulum", "x", "x_dot**2/2 + cos(x)")
+    with pytest.raises(sc.StateError, match="is one of 'driven oscillator', not of 'pendulum'"):
+        sc.page(other, family=family)
+
+
 @pytest.mark.usefixtures("without_compiler")
 def test_a_system_with_its_motion_has_a_page(tmp_path):
     model = sc.load_model(written(tmp_path))

@@ -234,6 +234,28 @@ def test_a_page_in_a_frame_without_address_shows_its_link(view, pages):
     assert view.messages == []
 
 
+@pytest.mark.rotated
+def test_a_slider_moves_along_a_family_whose_orbits_close(view, tmp_path):
+    pytest.importorskip("ziglang", reason="pages are compiled by the extra compiler")
+    system, path = sc.problem("planar-pendulum").system, tmp_path / "family.html"
+    stepper = sc.compile_stepper(system, "svi:4")
+    family = sc.family(stepper, sc.equilibrium(stepper, [0.0]), amplitude=0.5, step=0.3, count=5)
+    sc.page(system, family=family, h=family[3].period / 64).save(path)
+    opened(view, path)
+    slider = view.locator("input[aria-label='Orbit']")
+    for _ in range(3):
+        slider.press("ArrowRight")
+    view.evaluate("page.advance(64)")
+    state, address = view.evaluate("[page.state(), page.address()]")
+    assert state["energy"] == pytest.approx(family[3].energy, abs=1e-12)
+    assert [*state["q"], *state["p"]] == pytest.approx([*family[3].q, *family[3].p], abs=1e-9)
+    opened(view, path, address, 64)
+    view.wait_for_timeout(100)
+    assert slider.get_attribute("aria-valuetext") == "3"
+    assert f"{family[3].period:.6g} at" in view.inner_text("#plots")
+    assert view.messages == []
+
+
 @pytest.mark.parametrize("width", [360, 800, 1600])
 def test_a_page_fits_the_screen_is_readable_and_named(browser, pages, width):
     for name, scheme in (("figure_eight", "light"), ("kinks", "dark")):

@@ -61,7 +61,8 @@ def tangents_along(
         if trajectory.t[-1] < ends[-1] - 0.5 * length:
             raise EventError(f"events end the run at t = {trajectory.t[-1]:g}, before its last time {ends[-1]:g}")
         rows = np.searchsorted(trajectory.t, ends + SAME_STEP_SIZE * length, side="right") - 1
-        part, tangents = forward(trajectory, tangents)
         states[first + 1 : last + 1] = np.concatenate([trajectory.q, trajectory.p], axis=1)[rows]
-        vectors[first + 1 : last + 1] = part[rows].transpose(0, 2, 1)
+        if len(tangents):  # derivatives of changes of the state are dear
+            part, tangents = forward(trajectory, tangents)
+            vectors[first + 1 : last + 1] = part[rows].transpose(0, 2, 1)
     return states, vectors, tangents

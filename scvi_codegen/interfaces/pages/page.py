@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import sympy
 
+from scvi_codegen.analysis.orbits.family import Family
 from scvi_codegen.codegen.rendering.environment import template_environment
 from scvi_codegen.codegen.rendering.source import Interface, Source
 from scvi_codegen.common.atomic import write_text
@@ -41,6 +42,7 @@ from scvi_codegen.interfaces.models.model_files.page_section import (
 from scvi_codegen.interfaces.models.options import FURTHER
 from scvi_codegen.interfaces.models.packages.example import absolute_tolerances_of, check_example
 from scvi_codegen.interfaces.models.packages.package import integrator_of
+from scvi_codegen.interfaces.pages.orbits import begun_at, described
 from scvi_codegen.interfaces.pages.webassembly import LICENCES, check_compiler, webassembly
 from scvi_codegen.interfaces.pictures.recognition import shape_of
 from scvi_codegen.interfaces.pictures.shape import DrawnSystem, shape_of_picture
@@ -98,6 +100,7 @@ def page(
     speed: float | None = None,
     plots: Sequence[tuple[str, str]] | None = None,
     picture: Mapping[str, Any] | None = None,
+    family: Family | None = None,
     **motion: Any,
 ) -> Page:
     """Return a page that computes the motion of a model in the browser, with sliders and plots.
@@ -119,6 +122,8 @@ def page(
             coordinates, momenta, parameters, entries of rotations and t; ``rods``, ``springs`` and ``walls``, lists of
             points; ``bodies``, points that are drawn and dragged, by default those that move; ``trails``, points whose
             paths are drawn, by default those of the bodies.
+        family: periodic orbits of the system, along which a slider moves; the page has their periods, energies and
+            stability indices, and begins at the first one, by default with steps of the tolerance 1e-9.
         motion: of a system, the arguments of :class:`Model`: ``q``, ``velocity`` or ``p``, ``h`` or ``tolerance``, and
             also ``method`` (default SVI(8)) and others; default of ``span``: 30, or 1000 steps of
             a size below 0.001 or above 1.
@@ -128,7 +133,8 @@ def page(
 
     Raises:
         MethodError: without a step size or tolerance, and for inputs that are tables instead of numbers.
-        StateError: for a range of a parameter that does not contain its value, and an unknown variable of a plot.
+        StateError: for a range of a parameter that does not contain its value, an unknown variable of a plot, and a
+            family of another system.
         ModelFileError: for an invalid model file, unknown sliders and values of the wrong form.
         ArgumentError: for unknown arguments, and those of a motion beside a model.
         BuildError: without the extra ``compiler``, or if compilation fails.
@@ -136,12 +142,13 @@ def page(
     arguments = {"ranges": ranges, "speed": speed, "plots": plots, "picture": picture}
     settings = {name: value for name, value in arguments.items() if value is not None}
     if SYSTEM_OR_ARRAYS.accepts(model):
-        model = _model_of(model, motion)
+        first = {} if family is None else {"q": family[0].q, "p": family[0].p}
+        model = _model_of(model, first | motion)
     elif motion:
         raise ArgumentError(f"page() takes {', '.join(motion)} for a system alone: change them in the model")
     if isinstance(model, Model):
-        return page_of(model, document_of(model), settings)
-    return page_of(load_model(model), document_in(model), settings)
+        return page_of(model, document_of(model), settings, family)
+    return page_of(load_model(model), document_in(model), settings, family)
 
 
 def _model_of(system: Any, motion: Mapping[str, Any]) -> Model:
@@ -159,15 +166,20 @@ def _model_of(system: Any, motion: Mapping[str, Any]) -> Model:
     return Model(**arguments)
 
 
-def page_of(model: Model, document: Mapping[str, Any], settings: Mapping[str, Any]) -> Page:
+def page_of(
+    model: Model, document: Mapping[str, Any], settings: Mapping[str, Any], family: Family | None = None
+) -> Page:
     """Return the page of a model whose formulas are those of a document. Raises as :func:`page`.
 
     Args:
         model: with the settings of its file.
         document: sections of the file.
         settings: ranges, speed, plots and the picture, which replace those of the file.
+        family: periodic orbits along which a slider moves.
     """
     settings = dict(settings)
+    if family is not None:
+        model = begun_at(model, family)
     model = replace(model, picture=settings.pop("picture", model.picture))
     ranges = {**model.page.get("ranges", {}), **settings.get("ranges", {})}
     model = replace(model, page={**model.page, **settings, "ranges": ranges})
@@ -178,7 +190,7 @@ def page_of(model: Model, document: Mapping[str, Any], settings: Mapping[str, An
     acting = tuple(event for event in model.events if event.changes_state or event.terminal)
     model = replace(model, events=acting)  # others do not affect the motion
     of_fixed_sizes = adaptive or acting or model.system.has_contacts
-    result = Page(model.with_known_sizes() if of_fixed_sizes else model, document, adaptive=adaptive)
+    result = Page(model.with_known_sizes() if of_fixed_sizes else model, document, adaptive=adaptive, family=family)
     result.html  # noqa: B018  (reports errors here)
     return result
 
@@ -210,11 +222,13 @@ class Page:
         model: system, method, initial state, step size, and the settings of the page.
         document: sections of its model file.
         adaptive: whether the step size is adaptive.
+        family: periodic orbits along which a slider moves.
     """
 
     model: Model
     document: Mapping[str, Any] = field(repr=False)
     adaptive: bool = False
+    family: Family | None = field(default=None, repr=False)
 
     __repr__ = summary("model")
 
@@ -376,7 +390,8 @@ def _description(shown: Page, interface: Interface, *, initial: bool) -> dict[st
     """Return what the scripts of the page read."""
     model, adaptive = shown.model, shown.adaptive
     ranges = model.page.get("ranges", {})
-    q, v = _flat(model.q), _rates(model)
+    orbits = None if shown.family is None else described(shown.family, from_momenta=starts_from_momenta(model))
+    q, v = (orbits["orbits"][0][name] for name in "qv") if orbits else (_flat(model.q), _rates(model))
     system = _drawn_system(model, interface)
     shape = (shape_of_picture(system, model.picture) if model.picture else shape_of(system)).to_data()
     span = abs(float(model.end - model.t))
@@ -401,7 +416,7 @@ def _description(shown: Page, interface: Interface, *, initial: bool) -> dict[st
         "energy": {"label": "Energy", "conserved": bool(interface.conserves_energy) and conserved}, "plots": plots,
         "causes": CAUSES, "events": [str(event.function) for event in interface.searched(model.events)],
         "from_momenta": starts_from_momenta(model), "values": len(interface.parameters),
-        "initial": initial, "whole": WHOLE,
+        "initial": initial, "whole": WHOLE, "family": orbits,
         "step": {"adaptive": adaptive or model.has_time_transformation, **_step_slider(model)},
         "speed": {"value": speed, "low": speed / 50, "high": speed * 20},
         "ranges": sliders, "shape": shape,

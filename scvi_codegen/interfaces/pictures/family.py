@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -44,7 +45,7 @@ def plot_family(family: Family, path: str | os.PathLike[str] | None = None) -> F
             motion.plot(run.q[:, 0], across, color=_color(orbit), linewidth=0.8)
         names = [*family[0].stepper.coordinates, f"p_{coordinate}"]
         motion.set(xlabel=names[0], ylabel=names[1], title="orbits, blue where stable")
-        kind, sizes = _sizes(family)
+        kind, sizes = sizes_of(family.orbits)
         for k, column in enumerate(sizes.T):
             indices.plot(family.values, column, ".-", color=color(k), markersize=3, linewidth=0.8)
         indices.axhline(1.0, color="black", linewidth=0.6)
@@ -66,9 +67,9 @@ def _color(orbit: PeriodicOrbit) -> str:
     return COLORS[0] if orbit.stable else COLORS[-1]
 
 
-def _sizes(family: Family) -> tuple[str, Array]:
+def sizes_of(orbits: Sequence[PeriodicOrbit]) -> tuple[str, Array]:
     """Return the moduli of the stability indices, or of the multipliers where these do not exist."""
     try:
-        return "|stability index|", np.abs(family.stability_indices)
+        return "|stability index|", np.abs([orbit.stability_indices for orbit in orbits])
     except MethodError:
-        return "|multiplier|", np.abs([orbit.multipliers for orbit in family])
+        return "|multiplier|", np.abs([orbit.multipliers for orbit in orbits])

@@ -68,7 +68,7 @@ PROPERTIES: dict[str, Callable[[Any], bool]] = {
     "with nonholonomic constraints": lambda stepper: any(
         name in formula
         for name in ("_dot", *(f"{rate}_" for text in stepper.interface.rotations for rate in text.split()[2:]))
-        for formula in stepper.interface.constraints
+        for formula in stepper.interface.constraints[: len(stepper.interface.constraints) - stepper.interface.masked]
     ),
     "with constraints of arrays": lambda stepper: bool(stepper.interface.layout.constraints),
     "with constraints of arrays by a composition": lambda stepper: bool(

@@ -17,7 +17,9 @@ from scvi_codegen.interfaces.cli.command_group import check_writable, reporting,
 from scvi_codegen.interfaces.cli.model_options import model_arguments, read_model, with_known_sizes
 from scvi_codegen.interfaces.cli.supervision import progress_bar
 from scvi_codegen.interfaces.models.model import Model
+from scvi_codegen.interfaces.models.model_files.document import document_of
 from scvi_codegen.interfaces.models.options import options_of
+from scvi_codegen.interfaces.pages.page import page_of
 from scvi_codegen.interfaces.pictures.canvas import PICTURES, check_plot_path
 from scvi_codegen.runs.stepper import Stepper
 
@@ -31,8 +33,11 @@ NAMES, COUNT = {"vary": "parameter", "stride": "step"}, 50
 @click.option("--resume", type=click.Path(), metavar="FILE", help="Continue a family that -o wrote.")
 @click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Orbits: .npz.")
 @click.option("--plot", type=click.Path(), metavar="FILE", help="Plot (.png, .svg, .pdf).")
+@click.option("--page", type=click.Path(), metavar="FILE", help="Page with a slider along the family (.html).")
 @reporting
-def family(model_name: str, resume: str | None, output: str | None, plot: str | None, **choices: Any) -> None:
+def family(
+    model_name: str, resume: str | None, output: str | None, plot: str | None, page: str | None, **choices: Any
+) -> None:
     """Continue a family of periodic orbits of MODEL, and locate its bifurcations.
 
     The family begins at an orbit near the initial state of MODEL (--period), or at the equilibrium near its positions
@@ -43,9 +48,9 @@ def family(model_name: str, resume: str | None, output: str | None, plot: str | 
       scvi-codegen family planar-pendulum --q 0 --amplitude 0.1 --count 20 --plot pendulum.png
       scvi-codegen family henon-heiles --q 0,0.9 --amplitude 0.01 --until 'energy > 0.2' -o family.npz
     """
-    for target in (output, plot):
+    for target in (output, plot, page):
         if target is not None:
-            check_writable(Path(target), "'-o', '--plot'")
+            check_writable(Path(target), "'-o', '--plot', '--page'")
     if output is not None and Path(output).suffix != ".npz":
         raise ModelFileError(f"orbits of a family are saved as .npz, not as '{output}'")
     if plot is not None:
@@ -54,11 +59,12 @@ def family(model_name: str, resume: str | None, output: str | None, plot: str | 
     with progress_bar(model.family.get("count", COUNT), "orbits") as progress:
         members = _members(model, resume, progress)
     tell(_described(members), **_numbers(members))
-    for target, write in ((output, members.save), (plot, members.plot)):
+    writers = members.save, members.plot, lambda path: page_of(model, document_of(model), {}, members).save(path)
+    for target, write in zip((output, plot, page), writers, strict=True):
         if target is not None:
             write(target)
             tell(f"wrote {target}")
-    if written := [target for target in (output, plot) if target]:
+    if written := [target for target in (output, plot, page) if target]:
         tell(written=written)
 
 
