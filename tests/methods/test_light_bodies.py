@@ -53,6 +53,24 @@ def test_the_default_solver_has_the_digits_of_newtons_method(pendulum, angle, m)
         assert run.steps <= 1.1 * other.steps + 2
 
 
+@pytest.mark.second
+def test_rods_in_line_throw_a_light_body():
+    """A double pendulum in x, y: constraints of light bodies round by more than their own lengths."""
+    text = "(m*(x_dot**2 + y_dot**2) + X_dot**2 + Y_dot**2)/2 - 9.81*(m*y + Y)"
+    constraints = ["x**2 + y**2 = 1", "(X - x)**2 + (Y - y)**2 = 1"]
+    stepper = sc.compile_stepper(lagrange("rods", ["x", "y", "X", "Y"], text, constraints=constraints, m=1.0), "svi:8")
+    of_angles = "m*a_dot**2/2 + (a_dot**2 + b_dot**2)/2 + a_dot*b_dot*cos(a - b) + 9.81*((m + 1)*cos(a) + cos(b))"
+    angles = sc.compile_stepper(lagrange("angles", "a b", of_angles, m=1.0), "svi:8", precision="double-double")
+    rods = np.exp(1j * np.array([0.5, 0.6])).cumsum() / 1j
+    exact = angles.integrate([0.5, 0.6], [0.0] * 2, parameters={"m": 1e-5}, t_end=0.05, tolerance=1e-18).q[-1]
+    exact = np.exp(1j * exact.astype(float)).cumsum() / 1j
+    for m, digits in ((1e-5, 1e-12), (1e-6, 1e-11), (1e-7, 1e-10)):
+        run = stepper.integrate(rods.view(float), [0.0] * 4, parameters={"m": m}, t_end=0.05)
+        assert np.abs(run.energy_error()).max() < digits
+        assert run.steps < 200
+        assert m < 1e-5 or np.abs(run.q[-1] - exact.view(float)).max() < 1e-12
+
+
 def test_masses_of_zero_that_nothing_replaces_are_refused_by_name(pendulum):
     with pytest.raises(sc.StateError, match=r"x, y, a have no kinetic energy there.*with_parameters\(m=0\)"):
         pendulum[0].integrate(POSITION, [0.0] * 5, parameters={"m": 0.0, "M": 1.0}, h=0.005, steps=10)

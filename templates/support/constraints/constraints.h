@@ -195,20 +195,32 @@ static SELDOM real size_by_constraints(const step_data *step)
   return largest_of(size) + displacement_by_reactions(step, last_unknowns(step));
 }
 
-/* Largest displacement that changes one constraint by the size of its terms, and that by reactions: relative to it
- * positions on constraints are rounded, whatever they are. Unlike add_constraint_sizes it is bounded where the
- * constraints become dependent: errors grow there, and are not to be taken for rounding. */
-static SELDOM real length_of_constraints(const step_data *step)
+/* Displacements relative to which positions on constraints are rounded, whatever they are: those by reactions, the
+ * largest one d that changes one constraint by the size of its terms r_k, and, as light bodies yield, X_k r_k, which is
+ * at most d sqrt(M / m_i) with the heaviest mass M. Unlike X_k alone they are bounded where the constraints become
+ * dependent: errors grow there, and are not to be taken for rounding. */
+static SELDOM void lengths_of_constraints(const step_data *step, real *lengths)
 {
   real g[CONSTRAINTS], rounding[CONSTRAINTS], steepest[CONSTRAINTS] = {0}, derivative[CONSTRAINT_ENTRIES], length = 0;
-  constraints(step->q0, step->t, step->parameters, g, derivative);
-  constraint_rounding(step->q0, step->t, step->parameters, rounding);
+  real u[2 * M] = {0}, p[M], mass[MASS_ENTRIES], lightest[M] = {0}, yields[M] = {0};
+  const real by_reactions = displacement_by_reactions(step, last_unknowns(step));
+  memcpy(u, step->q0, sizeof(real) * M);
+  legendre(u, step->t, step->parameters, p, mass);
+  constraints(u, step->t, step->parameters, g, derivative);
+  constraint_rounding(u, step->t, step->parameters, rounding);
+  for (int e = 0; e < MASS_ENTRIES; e++)
+    if (MASS_ENTRY[e][0] == MASS_ENTRY[e][1])
+      lightest[MASS_ENTRY[e][0]] = MATH(fabs)(mass[e]);
   for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
     steepest[CONSTRAINT_ENTRY[e][0]] = larger(steepest[CONSTRAINT_ENTRY[e][0]], MATH(fabs)(derivative[e]));
   for (int k = 0; k < CONSTRAINTS; k++)
     if (steepest[k] > 0)
       length = larger(length, rounding[k] / steepest[k]);
-  return length + displacement_by_reactions(step, last_unknowns(step));
+  add_constraint_sizes(step->t, step->q0, step->parameters, saddle_in(step->scratch), yields);
+  for (int i = 0; i < M; i++) {
+    const real most = length * MATH(sqrt)(largest_of(lightest) / lightest[i]); /* infinite without a mass */
+    lengths[i] = by_reactions + larger(length, yields[i] < most ? yields[i] : most);
+  }
 }
 #endif
 

@@ -62,7 +62,7 @@ static inline real rounding_of_displacement(real largest_displacement)
 /* Sizes of positions that round as constraints do: there are none. */
 #define size_by_constraints(step) 0
 
-#define length_of_constraints(step) 0
+#define lengths_of_constraints(step, lengths) (void)memset(lengths, 0, sizeof lengths)
 #endif
 
 #ifdef ARRAYS

@@ -70,8 +70,13 @@ static real stage_error(const step_data *step, const real *z, const real *dq, re
     of.largest = larger(of.largest, of.size[i]);
   enlarge_to_arrays(of.size);
   error = error_beyond(step, z, &of, SITES > M ? farthest : fastest, share, decay, least);
-  if (SITES > M && error > doubtful)
-    error = error_beyond(step, z, &of, farthest + length_of_constraints(step), share, decay, least);
+  if (SITES > M && error > doubtful) {
+    real lengths[M];
+    lengths_of_constraints(step, lengths);
+    for (int i = 0; i < M; i++)
+      of.rounding[i] = larger(of.rounding[i], rounding_of_displacement(farthest + lengths[i]));
+    error = error_beyond(step, z, &of, farthest, share, decay, least);
+  }
   return error;
 }
 
