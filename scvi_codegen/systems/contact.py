@@ -23,10 +23,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from scvi_codegen.common.errors import SystemDefinitionError, closest
+from scvi_codegen.systems.contacts.rows import Impacts
 from scvi_codegen.systems.event import Formula, conditions_of
 
 if TYPE_CHECKING:
     from sympy import Basic, Expr, Symbol
+
+
+WORDS = ("name", "impacts")
+"""Arguments that are no formulas."""
 
 
 def _number(formula: Formula) -> float | None:
@@ -63,6 +68,8 @@ class Contact:
             state is behind its surface, it is open.
         of: coordinates by whose gradient the gap is divided, so that it is a distance to first order.
         name: name in messages; by default the formula of the gap.
+        impacts: their law beside those of others, ``"sequential"`` or ``"simultaneous"``
+            (:class:`~scvi_codegen.systems.contacts.rows.Impacts`).
 
     Raises:
         SystemDefinitionError: for friction without slip or slip without friction, and invalid coefficients.
@@ -76,6 +83,7 @@ class Contact:
     where: str | Basic | tuple[str | Basic, ...] | None = None
     of: tuple[str | Symbol, ...] = ()
     name: str = ""
+    impacts: str = Impacts.SEQUENTIAL
 
     @property
     def conditions(self) -> tuple[Formula, ...]:
@@ -103,6 +111,9 @@ class Contact:
         e = _number(self.restitution)
         if e is not None and not 0.0 <= e <= 1.0:
             raise SystemDefinitionError(f"restitution={self.restitution!r} of {shown} is invalid: give 0 to 1")
+        if self.impacts not in [*Impacts]:
+            laws = " or ".join(f"'{law}'" for law in Impacts)
+            raise SystemDefinitionError(f"impacts={self.impacts!r} of {shown} is unknown: give {laws}")
         for name in ("where", "of"):
             if isinstance(getattr(self, name), list):
                 object.__setattr__(self, name, tuple(getattr(self, name)))
@@ -165,7 +176,7 @@ def _table(item: Any) -> dict[str, Any]:
         if value is not None
     }
     named = {"surface" if name == "gap" and plain.get("of") else name: value for name, value in plain.items()}
-    defaults: dict[str, Any] = {"restitution": 0.0, "of": [], "name": ""}
+    defaults: dict[str, Any] = {"restitution": 0.0, "of": [], "name": "", "impacts": Impacts.SEQUENTIAL}
     return {name: value for name, value in named.items() if name not in defaults or value != defaults[name]}
 
 
@@ -191,7 +202,7 @@ def contacts_of(tables: Sequence[Mapping[str, Any]]) -> tuple[ContactLike, ...]:
 
 def names_in(tables: Iterable[Mapping[str, Any]]) -> set[str]:
     """Return the names in the formulas of contacts, by the tables of these."""
-    formulas = (str(value) for table in tables for key, value in table.items() if key != "name")
+    formulas = (str(value) for table in tables for key, value in table.items() if key not in WORDS)
     return set(re.findall(r"[A-Za-z_]\w*", " ".join(formulas)))
 
 
@@ -206,6 +217,7 @@ def contact(
     restitution: Formula = 0.0,
     where: str | Basic | Sequence[str | Basic] | None = None,
     name: str = "",
+    impacts: str = Impacts.SEQUENTIAL,
 ) -> Contact:
     """Return a unilateral contact of a system: gap >= 0 with normal force and Coulomb friction.
 
@@ -224,6 +236,9 @@ def contact(
         where: condition of the places and times where the contact exists, ``"x < 1"`` of a table with an edge, or a
             list of them. It opens where one fails; what is behind its surface passes freely.
         name: name in messages; by default the formula of the gap.
+        impacts: with other contacts at the same time: ``"sequential"``, one after another until none approaches, or
+            ``"simultaneous"``, by Newton's law for all of this kind that touch, refused where that would create
+            kinetic energy by friction.
 
     >>> contact("y - r", slip="x_dot - r*a_dot", friction=0.3).friction
     0.3
@@ -231,7 +246,8 @@ def contact(
     if (gap is None) == (surface is None) or (surface is None) == bool(of):
         raise SystemDefinitionError("give a contact either its gap=, a distance, or surface= and the coordinates of=")
     distance = cast("Formula", surface if gap is None else gap)
-    return Contact(distance, cast(Any, slip), friction, static_friction, restitution, cast(Any, where), tuple(of), name)
+    further = cast(Any, where), tuple(of), name, impacts
+    return Contact(distance, cast(Any, slip), friction, static_friction, restitution, *further)
 
 
 def friction(

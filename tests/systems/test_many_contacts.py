@@ -1,5 +1,6 @@
 """Many and redundant contacts: boxes on two corners, stacks, tables on four legs, balls, chains."""
 
+import itertools
 from functools import cache
 from typing import Any
 
@@ -186,11 +187,84 @@ def test_balls_close_at_once_by_one_formula() -> None:
     assert run.q[-1, :12] == pytest.approx(np.sqrt(2 / G) + v**2 / (2 * mu * G), abs=1e-12)
 
 
-def test_five_balls_of_a_cradle_at_rest_contact() -> None:
-    contacts = [sc.contact("x[i+1] - x[i] - 1 for i in 4", restitution=1)]
-    system = sc.LagrangianSystem.from_text("cradle", ["x[5]"], "sum(i in 5, x_dot[i]**2)/2", contacts=contacts)
-    run = sc.compile_stepper(system, "svi:2").integrate([-1, 1, 2, 3, 4], velocity=[1, 0, 0, 0, 0], h=0.1, t_end=2)
-    assert run.velocity[-1] == pytest.approx([0, 0, 0, 0, 1], abs=1e-14)
+@pytest.mark.parametrize(
+    ("law", "after"), [("sequential", [0, 0, 0, 0, 1]), ("simultaneous", [-0.6, 0.4, 0.4, 0.4, 0.4])]
+)
+@pytest.mark.parametrize("unit", [1.0, 1e-9])
+def test_five_balls_of_a_cradle_at_rest_contact(law: str, after: list[float], unit: float) -> None:
+    contacts = [sc.contact("x[i+1] - x[i] - d for i in 4", restitution=1, impacts=law)]
+    text, options = "sum(i in 5, x_dot[i]**2)/2", {"t_end": 2, "parameters": {"d": unit}}
+    system = sc.LagrangianSystem.from_text("cradle", ["x[5]"], text, contacts=contacts, parameters={"d": 1.0})
+    stepper, q, v = sc.compile_stepper(system, "svi:2"), unit * np.array([-1, 1, 2, 3, 4]), [unit, 0, 0, 0, 0]
+    run = stepper.integrate(q, velocity=v, **options)
+    for made in (run, stepper.integrate_ensemble([q], velocity=[v], h=0.1, **options)[0]):
+        assert made.velocity[-1] / unit == pytest.approx(after, abs=1e-14)
+    with pytest.raises(sc.StateError, match=r"several impacts|tangent"):
+        run.sensitivity()
+
+
+def test_a_box_that_falls_flat_does_not_turn_by_simultaneous_impacts(tmp_path: Any) -> None:
+    """Both corners leave with e v; it slides on by v_x - mu (1 + e) v, or sticks."""
+    system = sc.LagrangianSystem.from_text(
+        "box",
+        ["x", "y", "a"],
+        f"(x_dot**2 + y_dot**2)/2 + {INERTIA}*a_dot**2/2 - {G}*y",
+        parameters={"mu": 0.3},
+        contacts=corners(friction="mu", restitution=0.5, impacts="simultaneous"),
+    )
+    sc.save_model(
+        sc.Model(system=system, method="svi:2", q=(0, 1, 0), p=(4, 0, 0), h=0.05, span=0.6), tmp_path / "box.toml"
+    )
+    stepper, v = sc.compile_stepper(sc.load_model(tmp_path / "box.toml").system, "svi:2"), np.sqrt(2 * G * (1 - HEIGHT))
+    for mu, after in ((0.3, 4 - 0.3 * 1.5 * v), (1.0, 0.0)):
+        run = stepper.integrate([0, 1, 0], velocity=[4, 0, 0], h=0.05, t_end=0.6, parameters={"mu": mu})
+        assert run.velocity[-1] == pytest.approx([after, 1.5 * v - G * 0.6, 0], abs=1e-13)
+
+
+def newton(inverse: Any, rate: Any, e: Any) -> Any:
+    """Return the rates after Newton's law for contacts that do not separate, by trial of all that have impulses."""
+    while rate.min() < -1e-12:
+        touching = np.flatnonzero(rate <= 1e-12)
+        for numbers in itertools.product((0, 1), repeat=len(touching)):
+            pushes, impulse = touching[np.array(numbers, bool)], np.zeros(3)
+            impulse[pushes] = np.linalg.solve(inverse[np.ix_(pushes, pushes)], -((1 + e) * rate)[pushes])
+            after = rate + inverse @ impulse
+            if impulse.min() >= 0 and (after + e * rate)[touching].min() > -1e-12:
+                break
+        rate = after
+    return rate
+
+
+def test_simultaneous_impacts_in_corners_are_those_of_a_trial_of_all() -> None:
+    """A point in corners of three walls, not orthogonal, with three restitutions: energy never grows."""
+    names = {f"{n}{i}": 0.0 for i in range(3) for n in ("e", "x", "y", "z")}
+    walls = [sc.contact(f"x{i}*x + y{i}*y + z{i}*z", restitution=f"e{i}", impacts="simultaneous") for i in range(3)]
+    system = sc.LagrangianSystem.from_text(
+        "corner", ["x", "y", "z"], "(x_dot**2 + y_dot**2 + z_dot**2)/2", contacts=walls, parameters=names
+    )
+    stepper, random = sc.compile_stepper(system, "svi:2"), np.random.default_rng(5)
+    for _ in range(40):
+        n, e, v = np.eye(3) + random.normal(size=(3, 3)) / 5, random.uniform(size=3), random.normal(size=3)
+        n /= np.linalg.norm(n, axis=1)[:, np.newaxis]
+        values = {f"{name}{i}": x for name, row in zip("xyze", (*n.T, e), strict=True) for i, x in enumerate(row)}
+        after = newton(n @ n.T, n @ v, e)
+        run = stepper.integrate([0, 0, 0], velocity=v, h=0.1, steps=1, parameters=values)
+        assert n @ run.velocity[0] == pytest.approx(after, abs=1e-9)
+        assert np.linalg.norm(run.velocity[0]) < np.linalg.norm(v) + 1e-14
+
+
+def test_laws_of_impact_are_named_and_refused_where_they_create_energy() -> None:
+    with pytest.raises(sc.SystemDefinitionError, match=r"impacts='at once' .* give 'sequential' or 'simultaneous'"):
+        sc.contact("x", impacts="at once")
+    law = {"friction": 1, "restitution": 1, "impacts": "simultaneous"}
+    rods = [sc.contact(f"y{k} - cos(a{k})", slip=f"x{k}_dot + cos(a{k})*a{k}_dot", **law) for k in range(2)]
+    energy = " + ".join(f"(x{k}_dot**2 + y{k}_dot**2)/2 + a{k}_dot**2/6" for k in range(2))
+    system = sc.LagrangianSystem.from_text("rods", ["x0", "y0", "a0", "x1", "y1", "a1"], energy, contacts=rods)
+    stepper, one = sc.compile_stepper(system, "svi:2"), [0, np.cos(1), 1]
+    with pytest.raises(sc.ContactError, match=r"would create kinetic energy by Newton.s law at t = 0, contact 1"):
+        stepper.integrate(2 * one, velocity=2 * [-0.44, -2.49, -1.46], h=0.01, steps=1)
+    with pytest.warns(sc.EventWarning, match="Poisson's law"):  # alone
+        stepper.integrate([*one, 0, 3, 0], velocity=[-0.44, -2.49, -1.46, 0, 0, 0], h=0.01, steps=1)
 
 
 def test_loops_are_checked() -> None:

@@ -42,7 +42,7 @@ from scvi_codegen.codegen.rendering.source import Interface, Source
 from scvi_codegen.common.errors import EventError, ScviCodegenError, SystemDefinitionError, closest
 from scvi_codegen.common.precision import mp
 from scvi_codegen.methods.tables.nodes import chebyshev_lobatto, to_unit
-from scvi_codegen.systems.contacts.rows import ContactRows
+from scvi_codegen.systems.contacts.rows import ContactRows, Impacts
 from scvi_codegen.systems.event import Kink, Refraction, Transition, modes_of
 from scvi_codegen.systems.formulas.array_statements import (
     EntryRules,
@@ -387,14 +387,15 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controll
 
 
 def _places(modes: Sequence[str], contact: ContactRows) -> tuple[int, ...]:
-    """Return the rows of a contact, the number of slips, and the places of its mode; -1 for what it does not have."""
+    """Return the rows of a contact, number of slips, places of its mode, law of impacts; -1: it does not have this."""
     rows = (-1 if row is None else row for row in (contact.normal, contact.tangential))
     masks = (
         contact.closed,
         *(names[0] if names else None for names in (contact.sticks, contact.directions)),
         contact.held,
     )
-    return *rows, contact.slips, *(-1 if name is None else modes.index(name) for name in masks)
+    places = (-1 if name is None else modes.index(name) for name in masks)
+    return *rows, contact.slips, *places, [*Impacts].index(Impacts(contact.impacts))
 
 
 def _kind_in_time(g: Expr, moving: Iterable[Symbol]) -> int:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from scvi_codegen.codegen.rendering.own_names import with_exported_names, with_own_names
 from scvi_codegen.codegen.rendering.preprocessor import preprocessed
 from scvi_codegen.codegen.rendering.reachable import readable
-from scvi_codegen.systems.contacts.rows import ContactRows
+from scvi_codegen.systems.contacts.rows import ContactRows, Impacts
 from scvi_codegen.systems.event import Event, Kink, Refraction, Transition
 from scvi_codegen.systems.formulas.indices import Access, ArrayDeclarations, ArrayMap, Loop
 from scvi_codegen.version import __version__
@@ -62,6 +62,7 @@ def _contact_of(row: Sequence[Any]) -> ContactRows:
         and all(map(KINDS["str | None"], (contact.closed, contact.held)))
         and all(map(KINDS["tuple[str, ...]"], (contact.sticks, (*contact.directions, contact.title))))
         and KINDS["tuple[tuple[str, ...], ...]"](contact.transitions)
+        and contact.impacts in [*Impacts]
     ):
         raise ValueError(f"contacts contain {contact!r:.60}: these are not the places of a contact")
     return contact

@@ -115,7 +115,7 @@ def change_at(
         modes: parameters with the modes before and after.
 
     Raises:
-        StateError: if the impulses are those of several impacts, one after another.
+        StateError: if the impulses are those of impacts of several contacts.
     """
     q, p = np.split(before, 2)
     start = Rows.at(stepper, before, t, modes[0])
@@ -160,7 +160,7 @@ def change_at(
     *errors, impulse, momentum = (float(np.abs(difference / roots).max()) for difference in differences)
     if not min(errors) <= SAME_IMPULSE * impulse + SAME_MOMENTUM * momentum:
         raise StateError(
-            f"{event.title} at t = {t:.17g} with several impacts, one after another, or by "
+            f"{event.title} at t = {t:.17g} with several impacts, at once or one after another, or by "
             "Poisson's law: derivatives through them are not available"
         )
     return changes[int(np.argmin(errors))]

@@ -21,6 +21,8 @@ REFUSALS = {
     "nor at rest above static friction; restitution must be 0 to 1",
     6: "contact {k} pulls, or exceeds its friction, at t = {t:.17g} in each mode that was tried: limit the steps by "
     "max_step= (or h=), or reduce its friction",
+    7: "simultaneous impacts with friction would create kinetic energy by Newton's law at t = {t:.17g}, contact {k}: "
+    'reduce their friction, or use impacts="sequential"',
     4: "the impacts at t = {t:.17g} do not end: contacts close a corner; set a restitution to 0",
 }
 """Messages by the reasons of contacts.h."""

@@ -14,8 +14,8 @@ from itertools import repeat
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.systems.contact import Contact, ContactLike, Friction, slips_of, static_limit
-from scvi_codegen.systems.contacts.rows import ContactRows
+from scvi_codegen.systems.contact import WORDS, Contact, ContactLike, Friction, slips_of, static_limit
+from scvi_codegen.systems.contacts.rows import ContactRows, Impacts
 from scvi_codegen.systems.event import LOOPS, Formula
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
 from scvi_codegen.systems.formulas.indices import Array, Size
@@ -166,7 +166,7 @@ class _Binding:
             term = parse_constraint(value if value == first else value + loops, entries, self.names | self.functions)
             return [term.formula.xreplace(rule) for _, rule in rules.rules(term)]
 
-        fields = {name: getattr(item, name) for name in item.__dataclass_fields__ if name != "name"}
+        fields = {name: getattr(item, name) for name in item.__dataclass_fields__ if name not in WORDS}
         if fields.get("where") is not None:
             fields["where"] = tuple(map(str, cast("Contact", item).conditions))  # formulas that are >= 0
         elements = [
@@ -293,7 +293,8 @@ class _Binding:
         )
         shown = " and ".join(map(self.system.text_of, (item.gap,) if of_gap else slips))
         title = item.name or f"{'gap' if of_gap else 'slip'} '{shown}'"
-        return ContactRows(normal, tangential, len(slips), *names, title, functions)
+        law = getattr(item, "impacts", Impacts.SEQUENTIAL)
+        return ContactRows(normal, tangential, len(slips), *names, title, functions, law)
 
     def _slipping(self, number: int, slips: Sequence[Expr]) -> Slipping:
         """Return the direction of a slip w: a parameter d in a plane, else that of (ahead.w) w + start."""
@@ -320,5 +321,5 @@ def mapped(item: ContactLike, function: Callable[[Any, str], Any]) -> Any:
             else function(formulas, role)
         )
 
-    fields = {name: getattr(item, name) for name in item.__dataclass_fields__ if name not in ("where", "name")}
+    fields = {name: getattr(item, name) for name in item.__dataclass_fields__ if name not in ("where", *WORDS)}
     return replace(cast("Any", item), **{name: of(value, name) for name, value in fields.items() if value is not None})

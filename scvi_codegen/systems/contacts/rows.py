@@ -2,7 +2,20 @@
 
 from __future__ import annotations
 
+from enum import StrEnum, auto
 from typing import NamedTuple
+
+
+class Impacts(StrEnum):
+    """Law of the impacts of a contact beside those of others that it meets at the same time.
+
+    One contact after another until none approaches, as the balls of a cradle: the last one alone leaves. Or all that
+    touch at once by Newton's law, 0 <= v_n+ + e v_n-, 0 <= Lambda, of which one is 0 (C. Glocker, *Set-Valued Force
+    Laws*, 2001): -1/3, 2/3, 2/3 of three balls, and a box that falls flat does not turn.
+    """
+
+    SEQUENTIAL = auto()
+    SIMULTANEOUS = auto()
 
 
 class ContactRows(NamedTuple):
@@ -17,6 +30,7 @@ class ContactRows(NamedTuple):
         title: its name or formula, for messages.
         transitions: kinds, functions and conditions of its transitions
             (:class:`~scvi_codegen.systems.event.Transition`).
+        impacts: their law.
     """
 
     normal: int | None
@@ -28,6 +42,7 @@ class ContactRows(NamedTuple):
     held: str
     title: str
     transitions: tuple[tuple[str, ...], ...]
+    impacts: str = Impacts.SEQUENTIAL
 
     @property
     def masks(self) -> tuple[str, ...]:

@@ -19,21 +19,23 @@ enum {
 #define CONTACT_RESIDUALS 16.0 /* residuals of its located zero below which a rebound ends */
 #define CONTACT_GAIN 1e-9 /* part of the work of an impact by which energy may grow */
 
-/* Impulses of a contact that approaches with the given rates, and of those that are closed, in consistent modes; 0 if
- * there are none. */
-static int impulses_of(const contact_terms *of, int contact, const int *closed, real restitution, const real *rate,
+/* Impulses of contacts that meet with the given rates, by Newton's law or without restitution, and of those that are
+ * closed, in consistent modes; 0 if there are none. */
+static int impulses_of(const contact_terms *of, const int *meets, const int *closed, int law, const real *rate,
     real *impulse)
 {
   real right[CONTACT_ROWS], after[CONTACT_ROWS], scale[CONTACT_ROWS];
   contact_problem in = {.of = of, .scale = scale};
   contact_mode mode[EVENT_CONTACTS];
   memcpy(right, rate, sizeof right);
-  right[CONTACTS[contact].normal] *= 1.0 + restitution;
   in.right = right;
   for (int r = 0; r < CONTACT_ROWS; r++)
     scale[r] = CONTACT_SLIGHT * of->speed[r];
   for (int k = 0; k < EVENT_CONTACTS; k++) {
-    in.is_free[k] = CONTACTS[k].normal < 0 || !(k == contact || closed[k]);
+    const int normal = CONTACTS[k].normal;
+    in.is_free[k] = normal < 0 || !(meets[k] || closed[k]);
+    if (meets[k] && law == CONTACT_NEWTON)
+      right[normal] *= 1.0 + of->coefficient[3 * k + 2];
     in.rests[k] = !in.is_free[k] && CONTACTS[k].slips > 0;
     in.role[k] = in.is_free[k] ? CONTACT_IS_OPEN : in.rests[k] ? CONTACT_STICKS
                                                                : CONTACT_SLIPS;
@@ -45,7 +47,8 @@ static int impulses_of(const contact_terms *of, int contact, const int *closed, 
 /* Adds to the impulses of a compression those of a restitution, with e times its normal impulse in the friction cone
  * (C. Glocker & F. Pfeiffer, Nonlinear Dyn. 7, 1995): as those of a contact that approaches with a rate, which follows
  * by secants. */
-static int restitute(const contact_terms *of, int contact, const int *closed, const real *rate, real *impulse)
+static int restitute(const contact_terms *of, int contact, const int *meets, const int *closed, const real *rate,
+    real *impulse)
 {
   const int normal = CONTACTS[contact].normal;
   const real goal = of->coefficient[3 * contact + 2] * impulse[normal];
@@ -59,7 +62,7 @@ static int restitute(const contact_terms *of, int contact, const int *closed, co
   }
   for (int k = 0; exists && differs && k < CONTACT_SECANTS; k++) {
     after[normal] = -high;
-    exists = impulses_of(of, contact, closed, 0.0, after, added);
+    exists = impulses_of(of, meets, closed, CONTACT_PLASTIC, after, added);
     const real slope = (added[normal] - of_low) / (high - low);
     low = high;
     of_low = added[normal];
@@ -72,24 +75,32 @@ static int restitute(const contact_terms *of, int contact, const int *closed, co
 }
 
 /* Impulses of the rows of contacts that approach, one after another, until none does, by a law of restitution, in the
- * friction cone. Closed contacts take part with e = 0. */
+ * friction cone; simultaneous ones with those that touch and do not separate, by Newton's law, which creates no energy
+ * without friction: T+ - T- = sum of (1 - e) Lambda v_n- / 2. Closed contacts take part with e = 0. */
 static int find_impulses(const event_step *step, const contact_terms *of, const int *approaches, const int *closed,
     int law, real *total)
 {
   memset(total, 0, BYTES(CONTACT_ROWS));
   for (int round = 0; round < CONTACT_IMPACTS * EVENT_CONTACTS; round++) {
     real rate[CONTACT_ROWS], impulse[CONTACT_ROWS];
-    int meets = -1;
+    int meets[EVENT_CONTACTS], first = -1, several = 0;
     for (int r = 0; r < CONTACT_ROWS; r++)
       rate[r] = rate_after(of, of->rate, total, r);
     for (int k = EVENT_CONTACTS - 1; k >= 0; k--)
       if (approaches[k] && rate[CONTACTS[k].normal] < -CONTACT_ROUNDING * of->speed[CONTACTS[k].normal])
-        meets = k;
-    if (meets < 0)
+        first = k;
+    if (first < 0)
       return OK;
-    if (!impulses_of(of, meets, closed, law == CONTACT_NEWTON ? of->coefficient[3 * meets + 2] : 0.0, rate, impulse) ||
-        (law == CONTACT_POISSON && !restitute(of, meets, closed, rate, impulse)))
-      return refuse(step, CONTACT_WITHOUT_IMPULSE, meets, 0.0);
+    for (int k = 0; k < EVENT_CONTACTS; k++) {
+      const int together = CONTACTS[k].impacts == CONTACT_SIMULTANEOUS && CONTACTS[first].impacts == CONTACTS[k].impacts;
+      meets[k] = k == first || (together && approaches[k] && rate[CONTACTS[k].normal] <= CONTACT_ROUNDING * of->speed[CONTACTS[k].normal]);
+      several |= k != first && meets[k];
+    }
+    if (several && law != CONTACT_NEWTON)
+      return refuse(step, CONTACT_GAINS_ENERGY, first, 0.0);
+    if (!impulses_of(of, meets, closed, law, rate, impulse) ||
+        (law == CONTACT_POISSON && !restitute(of, first, meets, closed, rate, impulse)))
+      return refuse(step, CONTACT_WITHOUT_IMPULSE, first, 0.0);
     for (int r = 0; r < CONTACT_ROWS; r++)
       total[r] += impulse[r];
   }

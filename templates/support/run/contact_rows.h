@@ -14,7 +14,8 @@ enum {
   CONTACT_WITHOUT_IMPULSE,
   CONTACT_IN_CORNER,
   CONTACT_IMPOSSIBLE, /* coefficients */
-  CONTACT_LEAVES_CONE
+  CONTACT_LEAVES_CONE,
+  CONTACT_GAINS_ENERGY
 };
 
 /* A contact without gap is always closed; one without friction does not stick, and has direction 0. Slip in space that
