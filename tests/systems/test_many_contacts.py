@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from planted import planted
 from scipy.integrate import solve_ivp
 
 import scvi_codegen as sc
@@ -265,6 +266,21 @@ def test_laws_of_impact_are_named_and_refused_where_they_create_energy() -> None
         stepper.integrate(2 * one, velocity=2 * [-0.44, -2.49, -1.46], h=0.01, steps=1)
     with pytest.warns(sc.EventWarning, match="Poisson's law"):  # alone
         stepper.integrate([*one, 0, 3, 0], velocity=[-0.44, -2.49, -1.46, 0, 0, 0], h=0.01, steps=1)
+
+
+def test_contacts_that_contradict_each_other_are_refused_or_slip() -> None:
+    """A block on two belts, one of which accelerates: the stronger one carries it, w = t/10, the other slips."""
+    belts = [sc.friction("x_dot", limit=1), sc.friction("x_dot - t/10", limit=2)]
+    system = sc.LagrangianSystem.from_text("belts", ["x"], "x_dot**2/2", contacts=belts)
+    own = sc.compile_stepper(system, "svi:2", flags=("-O0",))
+    run = own.integrate([0], velocity=[0], h=0.1, t_end=1)
+    assert (run.contact_modes, run.q[-1, 0]) == ([(0.0, ("slip", "stick"))], pytest.approx(0.05, abs=1e-14))
+    assert run.contact_forces()[-1, :, 1] == pytest.approx([-1, 1.1])
+    unnoticed = "solve_contacts(of, mode, in->right, force, after, NULL) > CONTACT_ROUNDING"
+    with pytest.raises(sc.ContactError, match=r"at t = 0: the contacts contradict each other"):
+        planted(own, unnoticed, "solve_contacts(of, mode, in->right, force, after, NULL) < 0").integrate(
+            [0], velocity=[0], h=0.1, t_end=1
+        )
 
 
 def test_loops_are_checked() -> None:

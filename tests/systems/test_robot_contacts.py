@@ -1,16 +1,13 @@
 """Contacts of robots from MJCF and URDF: limits and dry friction of joints, spheres on planes; motions to rest."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from planted import planted
 from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
-from scvi_codegen.codegen.variants import WithEvents
 from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning
 from scvi_codegen.interfaces.models.model_files.model_file import parse_model
-from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.systems.formulas.expressions import evaluate
 
 FLOOR = '<geom name="floor" type="plane" size="1 1 1" pos=".1 .2 .3" euler="10 20 30" friction=".3"/>'
@@ -170,11 +167,7 @@ def test_modes_with_forces_outside_of_their_cones_are_refused(tmp_path):
     """Without the passes that choose modes anew where a projection turns slow slips."""
     (tmp_path / "stool.xml").write_text(STOOL)
     own = sc.compile_stepper(sc.LagrangianSystem.from_mjcf(tmp_path / "stool.xml", contacts="planes"), "svi:2")
-    texts = [(name, text.replace("pass <= EVENT_CONTACTS", "pass < 1")) for name, text in own.source.beside.support]
-    faulty = replace(own.source, beside=replace(own.source.beside, support=tuple(texts)))
-    stepper = sc.Stepper(
-        own.source, own.interface, flags=("-O0",), variants=Variants({WithEvents(own.searched): faulty})
-    )
+    stepper = planted(own, "pass <= EVENT_CONTACTS", "pass < 1")
     velocity = {"x_seat": 0.3, "y_seat": 0.1, "z_seat": 0.0, "omega_seat": np.random.default_rng(1).normal(size=3) / 2}
     start = {"x_seat": 0, "y_seat": 0, "z_seat": 0.3, "R_seat": [1, 0, 0, 0]}
     with pytest.raises(sc.ContactError, match=r"contact 4 .* pulls, or exceeds its friction, at t = 0\.22 "):

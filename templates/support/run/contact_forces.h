@@ -2,6 +2,9 @@
 
 /* Forces of contacts in their modes: W f = -b for the imposed rows of r'' = b + W f (contacts.h). */
 #define CONTACT_ROUNDING 1e-10 /* part of their size below which gaps, rates and forces count as 0 */
+/* The same for modes that a run keeps, whose slips have turned since: directions of those as slow as CONTACT_SLOW, below
+ * which they are kept, have rounding errors of DBL_EPSILON / CONTACT_SLOW (.6 of that is the largest that was seen). */
+#define CONTACT_OUTSIDE (4.0 * DBL_EPSILON / CONTACT_SLOW)
 #define CONTACT_DEPENDENT 1e-12 /* part of a column below which a pivot counts as 0 */
 
 /* Reduces the rows (A, b) by elimination with the pivots on the diagonal that are independent of those before but for
@@ -115,33 +118,25 @@ static int reduce_equations(const contact_terms *of, const contact_unknowns *in,
   return eliminate(matrix, in->count, independent);
 }
 
-/* Whether rates are rounding errors of right + W f. */
-static int are_small(const contact_terms *of, const real *rates, const real *right, const real *force)
+/* Largest of some rates, and of those by moved forces, relative to the terms of right + W f. */
+static real discord_of(const contact_terms *of, const real *rates, const real *moved, const real *right,
+    const real *force)
 {
+  const real still[CONTACT_ROWS] = {0.0};
+  real largest = 0.0;
   for (int r = 0; r < CONTACT_ROWS; r++) {
     real size = fabs(right[r]);
     for (int j = 0; j < CONTACT_ROWS; j++)
       size += fabs(of->W[r * CONTACT_ROWS + j] * force[j]);
-    if (fabs(rates[r]) > CONTACT_ROUNDING * size)
-      return 0;
+    largest = fmax(largest, fmax(fabs(rates[r]), fabs(rate_after(of, still, moved, r))) / fmax(size, DBL_MIN));
   }
-  return 1;
-}
-
-/* Whether forces change no rate but by rounding errors of right + W f. */
-static int leave_rates(const contact_terms *of, const real *moved, const real *right, const real *force)
-{
-  const real still[CONTACT_ROWS] = {0.0};
-  real rates[CONTACT_ROWS];
-  for (int r = 0; r < CONTACT_ROWS; r++)
-    rates[r] = rate_after(of, still, moved, r);
-  return are_small(of, rates, right, force);
+  return largest;
 }
 
 /* Solves for the forces of the rows in given modes with after = right + W f = 0 in imposed rows, those of least norm,
- * friction relative to its limit, if these are dependent; returns 0 if they contradict each other, or such forces
- * differ in the rates. If `imposed` is not NULL, it becomes 1 for rows to impose, which are independent. */
-static int solve_contacts(const contact_terms *of, const contact_mode *mode, const real *right, real *force,
+ * friction relative to its limit, if these are dependent; returns by how much they contradict each other, or such
+ * forces differ in the rates, relative to these. If `imposed` is not NULL, it becomes 1 for rows to impose, which are independent. */
+static real solve_contacts(const contact_terms *of, const contact_mode *mode, const real *right, real *force,
     real *after, int *imposed)
 {
   contact_unknowns in;
@@ -178,7 +173,7 @@ static int solve_contacts(const contact_terms *of, const contact_mode *mode, con
     imposed[in.row[i]] = independent[i];
   for (int i = 0; i < count; i++)
     left[in.row[i]] = after[in.row[i]];
-  return !dependent || (leave_rates(of, moved, right, force) && are_small(of, left, right, force));
+  return dependent ? discord_of(of, left, moved, right, force) : 0.0;
 }
 
 /* Present modes, with the directions of slips at a state, in space of (ahead.w) w + start. */
@@ -205,7 +200,7 @@ static int forces_at(real t, const real *q, const real *p, const real *parameter
   for (int k = 0; k < EVENT_MODES; k++)
     modes[k] = parameters[MODE_PLACE[k]];
   modes_at(&of, modes, mode);
-  if (status != OK || !solve_contacts(&of, mode, of.second, force, after, NULL))
+  if (status != OK || solve_contacts(&of, mode, of.second, force, after, NULL) > CONTACT_OUTSIDE)
     memset(force, 0, BYTES(CONTACT_ROWS));
   return status;
 }

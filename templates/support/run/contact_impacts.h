@@ -151,7 +151,8 @@ static int settle(const event_step *step, event_sample *at, contact_terms *of, c
     if (CONTACTS[k].normal >= 0 && !now->touches[k])
       mode[k] = CONTACT_IS_OPEN;
   }
-  return solve_contacts(of, mode, of->rate, impulse, after, NULL) ? push(step, at, of, impulse) : OK;
+  const real discord = solve_contacts(of, mode, of->rate, impulse, after, NULL);
+  return discord > CONTACT_ROUNDING ? OK : push(step, at, of, impulse);
 }
 
 /* Impulses of all contacts that meet at a state, by the first law that creates no kinetic energy, and which contacts

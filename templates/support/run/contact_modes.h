@@ -61,7 +61,7 @@ static real rounding_at_row(const contact_problem *in, const real *after, int ro
 static int is_consistent(const contact_problem *in, const contact_mode *mode, real *force, real *after)
 {
   const contact_terms *const of = in->of;
-  if (!solve_contacts(of, mode, in->right, force, after, NULL))
+  if (solve_contacts(of, mode, in->right, force, after, NULL) > CONTACT_ROUNDING)
     return 0;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
@@ -177,7 +177,7 @@ static int unload(contact_problem *in, const contact_mode *mode, const real *for
     for (int i = 0; i < unknown.count && !independent[d]; i++)
       for (int r = 0; r < CONTACT_ROWS; r++)
         moved[r] += unknown.column[i][r] * (independent[i] ? -line[i][d] / line[i][i] : i == d);
-    for (int k = 0; k < EVENT_CONTACTS && !leave_rates(of, moved, still, moved); k++) {
+    for (int k = 0; k < EVENT_CONTACTS && discord_of(of, still, moved, still, moved) > CONTACT_ROUNDING; k++) {
       const int normal = CONTACTS[k].normal;
       if (normal < 0 || !mode[k].closed || !(fabs(force[normal]) < least * fabs(moved[normal])))
         continue;

@@ -57,7 +57,7 @@ static int slips_at(const event_step *step, const event_sample *at, contact_term
   if (!slips || *status != OK)
     return 0;
   modes_at(of, modes, mode);
-  return solve_contacts(of, mode, of->second, force, second, NULL);
+  return solve_contacts(of, mode, of->second, force, second, NULL) <= CONTACT_OUTSIDE;
 }
 
 /* Directions in a part of a step of slips that begin, by the midpoint rule: friction is opposite to w + (part/2) w', w'

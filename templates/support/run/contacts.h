@@ -10,7 +10,6 @@
  * (P. Painleve, C. R. Acad. Sci. 121, 1895; F. Genot & B. Brogliato, Eur. J. Mech. A 18, 1999) or several may be.
  * Impacts obey the same conditions for impulses and velocities (C. Glocker, Set-Valued Force Laws, 2001). Requires:
  * parts/contacts.c.jinja. */
-#define CONTACT_OUTSIDE 1e-9 /* part of its size by which a force may leave its cone: more than CONTACT_ROUNDING */
 #define CONTACT_START 0x1p-40 /* part of a step after its start at which such a mode ends */
 #define CONTACT_MISSED 128.0 /* effects of rounding beyond which a negative gap shows a missed transition */
 
@@ -30,7 +29,7 @@ static int find_outside(const event_step *step, const contact_terms *of, real pa
   real force[CONTACT_ROWS], after[CONTACT_ROWS];
   int first;
   modes_at(of, step->watch->mode, mode);
-  first = solve_contacts(of, mode, of->second, force, after, NULL) ? -1 : EVENT_CONTACTS;
+  first = solve_contacts(of, mode, of->second, force, after, NULL) > CONTACT_OUTSIDE ? EVENT_CONTACTS : -1;
   for (int k = EVENT_CONTACTS - 1; k >= 0; k--) {
     const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
     const int row = normal < 0 ? slip : normal; /* those of open contacts may be undefined */
@@ -76,14 +75,15 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
   }
   if (status == OK && outside >= 0)
     outside = find_outside(step, &of, CONTACT_OUTSIDE);
-  if (status == OK && outside >= 0 && outside < EVENT_CONTACTS)
+  if (status == OK && outside == EVENT_CONTACTS)
+    status = refuse(step, CONTACT_WITHOUT_MODE, -1, 0.0);
+  else if (status == OK && outside >= 0)
     status = refuse(step, CONTACT_LEAVES_CONE, outside, 0.0);
   return status;
 }
 
 #ifdef CONTACTS_IN_SPACE
-/* Follows slips in space from a state; new modes where their new directions make forces impossible. Those of dependent
- * contacts only differ in the rates by the rounding of directions while slips begin. */
+/* Follows slips in space from a state; new modes where their new directions make forces impossible. */
 static int renew_slips(const event_step *step, event_sample *at, real *longest)
 {
   const long long before = *step->filled;
@@ -93,8 +93,7 @@ static int renew_slips(const event_step *step, event_sample *at, real *longest)
   int status = follow_slips(step, at, longest);
   if (status == OK && *step->filled > before)
     status = terms_at(step, at, &of);
-  const int outside = status == OK && *step->filled > before ? find_outside(step, &of, CONTACT_ROUNDING) : -1;
-  if (outside < 0 || outside == EVENT_CONTACTS)
+  if (status != OK || *step->filled == before || find_outside(step, &of, CONTACT_ROUNDING) < 0)
     return status;
   memset(&now, 0, sizeof now);
   status = change_modes(step, at, &now);
