@@ -11,7 +11,7 @@ from scvi_codegen.common.errors import ContactError, EventWarning, MethodError, 
 from scvi_codegen.runs.results.saved_states import Array, SavedStates, parameters_on_sides
 from scvi_codegen.runs.states.validation import Parameters, States
 from scvi_codegen.runs.stepping.integrator import Integrator
-from scvi_codegen.systems.contacts.rows import ContactRows
+from scvi_codegen.systems.contacts.rows import ContactMode
 
 REFUSALS = {
     1: "the run starts at t = {t:.17g} with the gap of contact {k} at {value:.6g}, which must not be negative: correct "
@@ -26,8 +26,6 @@ REFUSALS = {
     4: "the impacts at t = {t:.17g} do not end: contacts close a corner; set a restitution to 0",
 }
 """Messages by the reasons of contacts.h."""
-HELD, LOADED = 1, 2
-"""Bits of the mask of contacts whose rows other contacts determine (contacts.h)."""
 PARADOX = (
     "no mode of the contacts is consistent at t = {t:.17g}: Painleve's paradox, rigid bodies with this friction have "
     "no motion. G M^-1 (G - mu d T)^T = {value:.3g} of contact {k} must be positive: reduce its friction, or change "
@@ -53,8 +51,8 @@ def modes_in_failure(stepper: Integrator, watch: Any) -> str:
     """Return a sentence on the closed contacts in which a step failed, empty without any."""
     contacts = stepper.interface.contacts
     named = dict(zip(stepper.modes, list(watch.mode), strict=False)) if contacts and watch.begun else {}
-    names = enumerate(mode_names(contacts, named) if named else ())
-    closed = [f"contact {k + 1} ({contacts[k].title}): {name}" for k, name in names if name != "open"]
+    modes = [(k, contact, contact.mode(named)) for k, contact in enumerate(contacts, 1) if named]
+    closed = [f"contact {k} ({of.title}): {mode}" for k, of, mode in modes if mode is not ContactMode.OPEN]
     return f". Modes of contacts: {', '.join(closed)}" if closed else ""
 
 
@@ -99,19 +97,6 @@ def in_first_modes(stepper: Integrator, q: States, p: States, t: float, paramete
     return q1, p1
 
 
-def mode_names(contacts: tuple[ContactRows, ...], parameters: dict[str, Any]) -> tuple[str, ...]:
-    """Return ``"open"``, ``"stick"`` or ``"slip"`` of each contact; one without friction that is closed slips."""
-    names = []
-    for contact in contacts:
-        held = int(parameters[contact.held])
-        if contact.closed is not None and not parameters[contact.closed] and not held & LOADED:
-            names.append("open")
-        else:
-            slides = not contact.slips or any(parameters[name] for name in contact.directions)
-            names.append("slip" if slides and not held & HELD else "stick")
-    return tuple(names)
-
-
 def contact_modes(states: Any) -> list[tuple[float, tuple[str, ...]]]:
     """Return the times from which contacts have modes, and these."""
     stepper: Any = _with_contacts(states)
@@ -119,7 +104,7 @@ def contact_modes(states: Any) -> list[tuple[float, tuple[str, ...]]]:
     result: list[tuple[float, tuple[str, ...]]] = []
     for t in starts:
         named = stepper.parameters_by_name(parameters_on_sides(states, t))
-        names = mode_names(stepper.interface.contacts, named)
+        names = tuple(contact.mode(named).value for contact in stepper.interface.contacts)
         if not result or result[-1][1] != names:
             result.append((t, names))
     return result

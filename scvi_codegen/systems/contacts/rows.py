@@ -2,8 +2,25 @@
 
 from __future__ import annotations
 
-from enum import StrEnum, auto
+from collections.abc import Mapping
+from enum import IntFlag, StrEnum, auto
 from typing import NamedTuple
+
+
+class ContactMode(StrEnum):
+    """Mode of a contact; one without friction that is closed slips."""
+
+    OPEN = auto()
+    STICK = auto()
+    SLIP = auto()
+
+
+class Dependence(IntFlag):
+    """Rows that other contacts impose, in the mask ``held`` of a contact (contacts.h)."""
+
+    HELD = 1
+    LOADED = 2
+    STUCK = 4
 
 
 class Impacts(StrEnum):
@@ -26,7 +43,7 @@ class ContactRows(NamedTuple):
         slips: number of slips: 1 in a plane, 2 in space, 0 without friction.
         closed, sticks: names of the masks of its mode, of each slip.
         directions: of slip: d in a plane; in space whether it slips, and vectors of two components each (contacts.h).
-        held: name of the mask that is 1 where the gap or slip stays 0 by other contacts, and has no transitions.
+        held: name of the mask whose bits are its :class:`Dependence`; its gap or slip stays 0 without transitions.
         title: its name or formula, for messages.
         transitions: kinds, functions and conditions of its transitions
             (:class:`~scvi_codegen.systems.event.Transition`).
@@ -43,6 +60,14 @@ class ContactRows(NamedTuple):
     title: str
     transitions: tuple[tuple[str, ...], ...]
     impacts: str = Impacts.SEQUENTIAL
+
+    def mode(self, parameters: Mapping[str, float]) -> ContactMode:
+        """Return its mode by the values of its masks."""
+        depends = Dependence(int(parameters[self.held]))
+        if self.closed and not (parameters[self.closed] or Dependence.LOADED in depends):
+            return ContactMode.OPEN
+        slides = not self.slips or any(parameters[name] for name in self.directions)
+        return ContactMode.SLIP if slides and Dependence.HELD not in depends else ContactMode.STICK
 
     @property
     def masks(self) -> tuple[str, ...]:
