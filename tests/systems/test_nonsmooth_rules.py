@@ -136,6 +136,11 @@ DRY: dict[str, tuple[str, dict[str, str], list[sc.Friction]]] = {
         {"x": "d*sign(y_dot - x_dot)", "y": "-d*sign(y_dot - x_dot) - d*sign(y_dot)/2"},
         [sc.friction("x_dot - y_dot", limit="d"), sc.friction("y_dot", limit="d/2")],
     ),
+    "in space": (
+        "x y",
+        {x: f"-d*({x}_dot - v)/sqrt((x_dot - v)**2 + (y_dot - v)**2) - {x}/9" for x in "xy"},
+        [sc.friction(["x_dot - v", "y_dot - v"], limit="d")],
+    ),
 }
 """Coordinates, forces with steps of slips, and the friction that they are."""
 
@@ -146,8 +151,9 @@ def test_forces_that_jump_along_a_slip_are_dry_friction(name: str, steps: dict[s
     names, forces, contacts = DRY[name]
     text, bias = " + ".join(f"({x}_dot**2 - {x}**2)/2" for x in names.split()), name == "two-sided"
     states = [1.0, 0.0][: len(names.split())], [0.0] * len(names.split())
-    stated = made(text, names, forces=forces, d=0.15).integrate(*states, t=1.0, t_end=14.0, **steps)
-    friction = made(text + " + d*x/2" * bias, names, contacts=contacts, d=0.15)
+    stated = made(text, names, forces=forces, d=0.15, v=0.1).integrate(*states, t=1.0, t_end=14.0, **steps)
+    smooth = " + d*x/2" * bias + " - (x**2 + y**2)/18" * (name == "in space")
+    friction = made(text + smooth, names, contacts=contacts, d=0.15, v=0.1)
     assert stated.contact_modes
     expected = friction.integrate(*states, t=1.0, t_end=14.0, **steps)
     assert stated.q[-1] == pytest.approx(expected.q[-1], abs=1e-13)

@@ -4,15 +4,18 @@ Let the forces f(q, v, t, s) contain the step s of a slip w = T(q, t) v + b(q, t
 
     f(s = 1) - f(s = 0) = -2 F T^T,     F(q, v, t) > 0,
 
-motions may slide on w = 0 with the forces (f(1) + f(0))/2 + T^T tau, |tau| <= F (A. F. Filippov, *Differential
-Equations with Discontinuous Righthand Sides*, 1988). That is friction of the limit F without a gap; jumps along other
-directions, and friction that would supply energy, stay as they are.
+motions may slide on w = 0 with the forces (f(1) + f(0))/2 + T^T tau, abs(tau) <= F (A. F. Filippov, *Differential
+Equations with Discontinuous Righthand Sides*, 1988). That is friction of the limit F without a gap, as are in space
+forces -F T^T w/sqrt(w_1^2 + w_2^2) of two slips. Jumps along other directions, and friction that would supply energy,
+stay as they are.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.systems.contact import Friction
@@ -22,10 +25,10 @@ from scvi_codegen.systems.lagrangian import LagrangianSystem
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from sympy import Expr, Symbol
+    from sympy import Expr
 
-STEPS = re.compile(r"\b(sign|[aA]bs|where|unit_step|Heaviside|Piecewise|[mM]in|[mM]ax)\b")
-"""Functions of formulas that consist of steps."""
+STEPS = re.compile(r"\b(sign|sqrt|[aA]bs|where|unit_step|Heaviside|Piecewise|[mM]in|[mM]ax)\b")
+"""Functions of formulas that consist of steps, and the length of a slip."""
 
 
 def with_dry_friction(system: Any) -> Any:
@@ -33,19 +36,41 @@ def with_dry_friction(system: Any) -> Any:
     is_smooth = system._text is not None and not STEPS.search(system._text)
     if is_smooth or not isinstance(system, LagrangianSystem) or system.clock or system.gauge != 0 or system.rotations:
         return system
+    forces, contacts = system.forces, []
+    for slip, divided in _slips(system):
+        directions = [[part.diff(rate) for rate in system.velocities] for part in slip]
+        rows = [row for direction in directions for row in direction]
+        is_linear = all(map(any, directions)) and not any(row.free_symbols & {*system.velocities} for row in rows)
+        if is_linear:
+            pushes, others = zip(*map(divided, forces), strict=True)
+            if limit := _limit(system, slip, directions, pushes):
+                forces = others
+                contacts.append(Friction(slip if len(slip) > 1 else slip[0], limit))
+    return replace(system, forces=forces, contacts=(*system.contacts, *contacts)) if contacts else system
+
+
+def _slips(system: LagrangianSystem) -> Iterator[tuple[tuple[Expr, ...], Callable[[Expr], tuple[Expr, Expr]]]]:
+    """Yield the slips of steps and of inverse lengths in forces, and what divides a force by sign(w) or 1/abs(w)."""
+    from sympy import Pow, Rational
+
     from scvi_codegen.systems.formulas.kinks import switching_function, unit_step
 
-    slips = {switching_function(step.args[0])[0] for step in parts_of_type(unit_step, *system.forces)}
-    forces, contacts = system.forces, []
-    for slip in sorted(slips, key=str):
-        direction = [slip.diff(rate) for rate in system.velocities]
-        is_linear = any(direction) and not any(row.free_symbols & {*system.velocities} for row in direction)
-        if is_linear:
-            pushes, others = zip(*(_divided(force, slip) for force in forces), strict=True)
-            if limit := _limit(system, slip, direction, pushes):
-                forces = others
-                contacts.append(Friction(slip, limit))
-    return replace(system, forces=forces, contacts=(*system.contacts, *contacts)) if contacts else system
+    steps = {switching_function(step.args[0])[0] for step in parts_of_type(unit_step, *system.forces)}
+    for slip in sorted(steps, key=str):
+        yield (slip,), partial(_divided, slip=slip)
+    for length in sorted(parts_of_type(Pow, *system.forces), key=str):
+        squares = length.base.args if length.exp == Rational(-1, 2) and length.base.is_Add else ()
+        if len(squares) == 2 and all(square.is_Pow and square.exp == 2 for square in squares):
+            yield tuple(square.base for square in squares), partial(_divided_by_length, inverse=length)
+
+
+def _divided_by_length(force: Expr, inverse: Expr) -> tuple[Expr, Expr]:
+    """Return the factor of 1/abs(w) in a force, and the other terms."""
+    from sympy import Dummy, S
+
+    marked = force.xreplace({inverse: (factor := Dummy("inverse"))})
+    push = marked.diff(factor)
+    return push.xreplace({factor: inverse}), marked.xreplace({factor: S.Zero})
 
 
 def _divided(force: Expr, slip: Expr) -> tuple[Expr, Expr]:
@@ -57,7 +82,9 @@ def _divided(force: Expr, slip: Expr) -> tuple[Expr, Expr]:
     side, push, other = Dummy("sign"), S.Zero, S.Zero
     steps = {part: switching_function(part.args[0]) for part in force.atoms(unit_step)}
     own = {part: (1 + orientation * side) / 2 for part, (u, orientation) in steps.items() if u == slip}
-    for term in Add.make_args(force.xreplace(own)):
+    if not own:
+        return push, force
+    for term in Add.make_args(force.xreplace(own).xreplace({1 / side: side})):
         slope = term.diff(side)
         if not slope.has(side):
             push, other = push + slope, other + term.xreplace({side: S.Zero})
@@ -68,19 +95,31 @@ def _divided(force: Expr, slip: Expr) -> tuple[Expr, Expr]:
     return push.xreplace({side: sign(slip)}), other.xreplace({side: sign(slip)})
 
 
-def _limit(system: LagrangianSystem, slip: Expr, direction: Sequence[Expr], pushes: Sequence[Expr]) -> Expr | None:
-    """Return F of forces -F T^T sign(w) if they are so, with one positive F at w = 0; else ``None``."""
-    from sympy import S, simplify, solve
+def _limit(
+    system: LagrangianSystem, slip: Sequence[Expr], directions: Sequence[Sequence[Expr]], pushes: Sequence[Expr]
+) -> Expr | None:
+    """Return F of forces -F T^T w/abs(w) if they are so, with one positive F at w = 0; else ``None``."""
+    from sympy import Add, S, cancel, solve
 
     from scvi_codegen.systems.formulas.kinks import switching_function, unit_step
 
-    limit = next(-push / row for push, row in zip(pushes, direction, strict=True) if row)
-    if any(simplify(push + limit * row) for push, row in zip(pushes, direction, strict=True)):
+    along = slip if len(slip) > 1 else (S.One,)
+    rows = [Add(*(row * w for row, w in zip(column, along, strict=True))) for column in zip(*directions, strict=True)]
+    limit = cancel(next(-push / row for push, row in zip(pushes, rows, strict=True) if row))
+    if not all(_vanishes(push + limit * row) for push, row in zip(pushes, rows, strict=True)):
         return None
-    velocity: Symbol = next(rate for rate, row in zip(system.velocities, direction, strict=True) if row)
-    at_rest = {velocity: solve(slip, velocity)[0]}
-    own = [part for part in limit.atoms(unit_step) if switching_function(part.args[0])[0] == slip]
+    velocities = [
+        rate for rate, column in zip(system.velocities, zip(*directions, strict=True), strict=True) if any(column)
+    ]
+    at_rest = solve(slip, velocities, dict=True)[0]
+    own = [part for part in limit.atoms(unit_step) if switching_function(part.args[0])[0] in slip]
     above, below = (limit.xreplace(dict.fromkeys(own, side)).subs(at_rest) for side in (S.One, S.Zero))
     value = above.subs(dict(zip(system.parameters, system.defaults, strict=True)))
-    is_continuous, is_positive = simplify(above - below) == 0, value.free_symbols or value > 0
+    is_continuous, is_positive = _vanishes(above - below), value.free_symbols or (value.is_finite and value > 0)
     return limit if is_continuous and is_positive and above != 0 else None
+
+
+def _vanishes(expression: Expr) -> bool:
+    from sympy import simplify
+
+    return bool(expression == 0 or expression.expand() == 0 or simplify(expression) == 0)
