@@ -293,13 +293,6 @@ def test_painleve_is_named_where_rigid_bodies_have_no_motion(tangent: float, con
             stepper.integrate([0, np.cos(a), a], **start)
 
 
-def test_the_balls_of_a_cradle_at_rest_contact() -> None:
-    contacts = [sc.contact("b - a - 1", restitution=1), sc.contact("c - b - 1", restitution=1)]
-    stepper = of("(a_dot**2 + b_dot**2 + c_dot**2)/2", "a b c", contacts, "svi:2")
-    run = stepper.integrate([-1, 1, 2], velocity=[1, 0, 0], h=0.1, t_end=2)
-    assert np.allclose(run.velocity[-1], [0, 0, 1], atol=1e-14)
-
-
 SHAKEN = "0.2*t*cos(5*t)", "0.3*t*sin(5*t)"
 
 

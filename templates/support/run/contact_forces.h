@@ -2,8 +2,8 @@
 
 /* Forces of contacts in their modes: W f = -b for the imposed rows of r'' = b + W f (contacts.h). */
 #define CONTACT_ROUNDING 1e-10 /* part of their size below which gaps, rates and forces count as 0 */
-/* The same for modes that a run keeps, whose slips have turned since: directions of those as slow as CONTACT_SLOW, below
- * which they are kept, have rounding errors of DBL_EPSILON / CONTACT_SLOW (.6 of that is the largest that was seen). */
+/* The same for modes that a run keeps, whose slips have turned since: directions of those as slow as CONTACT_SLOW, from
+ * which on they are kept, have rounding errors of DBL_EPSILON / CONTACT_SLOW (measured: .6 of that). */
 #define CONTACT_OUTSIDE (4.0 * DBL_EPSILON / CONTACT_SLOW)
 #define CONTACT_DEPENDENT 1e-12 /* part of a column below which a pivot counts as 0 */
 
@@ -135,7 +135,8 @@ static real discord_of(const contact_terms *of, const real *rates, const real *m
 
 /* Solves for the forces of the rows in given modes with after = right + W f = 0 in imposed rows, those of least norm,
  * friction relative to its limit, if these are dependent; returns by how much they contradict each other, or such
- * forces differ in the rates, relative to these. If `imposed` is not NULL, it becomes 1 for rows to impose, which are independent. */
+ * forces differ in the rates, relative to these. If `imposed` is not NULL, it becomes 1 for rows to impose, which are
+ * independent. */
 static real solve_contacts(const contact_terms *of, const contact_mode *mode, const real *right, real *force,
     real *after, int *imposed)
 {

@@ -92,8 +92,9 @@ static int find_impulses(const event_step *step, const contact_terms *of, const 
     if (first < 0)
       return OK;
     for (int k = 0; k < EVENT_CONTACTS; k++) {
-      const int together = CONTACTS[k].impacts == CONTACT_SIMULTANEOUS && CONTACTS[first].impacts == CONTACTS[k].impacts;
-      meets[k] = k == first || (together && approaches[k] && rate[CONTACTS[k].normal] <= CONTACT_ROUNDING * of->speed[CONTACTS[k].normal]);
+      const int normal = CONTACTS[k].normal, law = CONTACTS[k].impacts;
+      const int together = law == CONTACT_SIMULTANEOUS && law == CONTACTS[first].impacts && approaches[k];
+      meets[k] = k == first || (together && rate[normal] <= CONTACT_ROUNDING * of->speed[normal]);
       several |= k != first && meets[k];
     }
     if (several && law != CONTACT_NEWTON)

@@ -10,7 +10,9 @@ enum {
 #define CONTACT_GROWS 0.2 /* .. to that from its beginning .. */
 #define CONTACT_RELAXES 2.0 /* .. and to the relaxation of its direction, for which iterations on stages converge .. */
 #define CONTACT_SHORT 3e-4 /* .. once that is longer than this part of a step */
-#define CONTACT_PACE 0x1p-6 /* least size of an adaptive step for this, relative to the largest so far */
+/* Least size of an adaptive step for this, relative to the largest so far: the energy of a stool that falls on its feet
+ * grows without bound for 0, and by 1e-8, 7e-11, 3e-12, 8e-13, 8e-13 for 2^-12, 2^-9, 2^-6, 2^-3, 1. */
+#define CONTACT_PACE 0x1p-6
 #define CONTACT_UNSOLVED 0x1p-30 /* relative to that: smaller steps with unsolved parts are not divided further */
 #define CONTACT_TURN 0.866 /* cosine of an angle after which a direction is renewed */
 
@@ -57,7 +59,7 @@ static int slips_at(const event_step *step, const event_sample *at, contact_term
   if (!slips || *status != OK)
     return 0;
   modes_at(of, modes, mode);
-  return solve_contacts(of, mode, of->second, force, second, NULL) <= CONTACT_OUTSIDE;
+  return solve_contacts(of, mode, of->second, force, second, NULL) <= CONTACT_ROUNDING;
 }
 
 /* Directions in a part of a step of slips that begin, by the midpoint rule: friction is opposite to w + (part/2) w', w'

@@ -20,9 +20,9 @@ static int stops_at(const event_step *step, const contact_terms *of, int k)
   return CONTACTS[k].slips == 1 || length_of(of->rate + CONTACTS[k].tangential, 2) <= CONTACT_SLOW * speed;
 }
 
-/* The first contact that pulls, or whose friction is outside of its cone, in the present modes at a state, by more than
- * a part of the rates; EVENT_CONTACTS if contacts contradict each other, -1: none. */
-static int find_outside(const event_step *step, const contact_terms *of, real part)
+/* Marks contacts that pull, or whose friction is outside of its cone, in the present modes at a state, by more than a
+ * part of the rates. Returns the first; EVENT_CONTACTS if contacts contradict each other, -1: none. */
+static int find_outside(const event_step *step, const contact_terms *of, real part, int *outside)
 {
   const contact_problem in = {.of = of, .right = of->second};
   contact_mode mode[EVENT_CONTACTS];
@@ -35,9 +35,9 @@ static int find_outside(const event_step *step, const contact_terms *of, real pa
     const int row = normal < 0 ? slip : normal; /* those of open contacts may be undefined */
     const real small = part / CONTACT_ROUNDING * rounding_at_row(&in, after, row) / of->W[row * (CONTACT_ROWS + 1)];
     const int pushes = normal < 0 || force[normal] >= -small;
-    if (mode[k].closed &&
-        !(pushes && (!mode[k].sticks || length_of(force + slip, slips) <= friction_limit(of, k, 1, force) + small)))
-      first = k;
+    outside[k] = mode[k].closed &&
+        !(pushes && (!mode[k].sticks || length_of(force + slip, slips) <= friction_limit(of, k, 1, force) + small));
+    first = outside[k] ? k : first;
   }
   return first;
 }
@@ -49,7 +49,7 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
   contact_terms of;
   contact_mode present[EVENT_CONTACTS];
   real force[CONTACT_ROWS];
-  int closed[EVENT_CONTACTS], approach = 0, outside = 0, status = terms_at(step, at, &of);
+  int closed[EVENT_CONTACTS], outside[EVENT_CONTACTS], approach = 0, first = 0, status = terms_at(step, at, &of);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const contact_mode mode = mode_of(step->watch->mode, k);
     if (status == OK && CONTACTS[k].slips > 0)
@@ -64,36 +64,39 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
     forces_at(at->t, at->q, at->p, step->own, present, force, step->workspace);
   if (status == OK && approach)
     status = collide(step, at, &of, closed, now);
-  for (int pass = 0; status == OK && outside >= 0 && pass <= EVENT_CONTACTS; pass++) {
+  for (int pass = 0; status == OK && first >= 0 && pass <= EVENT_CONTACTS; pass++) {
     status = choose_modes(step, &of, now, force);
     if (status == OK)
       status = satisfy_constraints(step, at->t, at->q, at->p, 1);
     if (status == OK)
       status = terms_at(step, at, &of);
     if (status == OK)
-      outside = find_outside(step, &of, CONTACT_ROUNDING);
+      first = find_outside(step, &of, CONTACT_ROUNDING, outside);
   }
-  if (status == OK && outside >= 0)
-    outside = find_outside(step, &of, CONTACT_OUTSIDE);
-  if (status == OK && outside == EVENT_CONTACTS)
+  if (status == OK && first >= 0)
+    first = find_outside(step, &of, CONTACT_OUTSIDE, outside);
+  if (status == OK && first == EVENT_CONTACTS)
     status = refuse(step, CONTACT_WITHOUT_MODE, -1, 0.0);
-  else if (status == OK && outside >= 0)
-    status = refuse(step, CONTACT_LEAVES_CONE, outside, 0.0);
+  else if (status == OK && first >= 0)
+    status = refuse(step, CONTACT_LEAVES_CONE, first, 0.0);
   return status;
 }
 
 #ifdef CONTACTS_IN_SPACE
-/* Follows slips in space from a state; new modes where their new directions make forces impossible. */
+/* Follows slips in space from a state; new modes where their new directions make forces impossible. Those of dependent
+ * contacts only differ in the rates by the rounding of directions while slips begin. */
 static int renew_slips(const event_step *step, event_sample *at, real *longest)
 {
   const long long before = *step->filled;
   const real most = *longest;
   contact_change now;
   contact_terms of;
-  int status = follow_slips(step, at, longest);
+  int outside[EVENT_CONTACTS], status = follow_slips(step, at, longest);
   if (status == OK && *step->filled > before)
     status = terms_at(step, at, &of);
-  if (status != OK || *step->filled == before || find_outside(step, &of, CONTACT_ROUNDING) < 0)
+  const int first =
+      status == OK && *step->filled > before ? find_outside(step, &of, CONTACT_ROUNDING, outside) : -1;
+  if (first < 0 || first == EVENT_CONTACTS)
     return status;
   memset(&now, 0, sizeof now);
   status = change_modes(step, at, &now);
@@ -167,17 +170,11 @@ static int is_kept(int transition)
   return kind == CONTACT_LEAVES || (kind == CONTACT_CLOSES && !IS_CONDITIONAL[FIRST_TRANSITION + transition]);
 }
 
-/* Whether forces are outside of their cone by the function of a transition, beyond rounding of those that alone cancel
- * the second rates of the contact; without limits on steps, which such forces leave. */
-static int is_outside(const contact_terms *of, int transition, real value)
+/* Whether the function of a transition is that of forces in their cone. */
+static int is_of_forces(int transition)
 {
-  const int k = TRANSITION[transition][0], kind = TRANSITION[transition][1], normal = CONTACTS[k].normal;
-  real size = normal < 0 ? of->coefficient[3 * k + 1] : fabs(of->second[normal] / of->W[normal * (CONTACT_ROWS + 1)]);
-  for (int row = CONTACTS[k].tangential; row >= 0 && row < CONTACTS[k].tangential + CONTACTS[k].slips; row++)
-    size += fabs(of->second[row]) / of->W[row * (CONTACT_ROWS + 1)];
-  size *= CONTACT_OUTSIDE;
-  return kind != CONTACT_CLOSES && kind != CONTACT_LEAVES && kind != CONTACT_STOPS &&
-      value < -(kind == CONTACT_BEGINS ? size * size : size);
+  const int kind = TRANSITION[transition][1];
+  return kind != CONTACT_CLOSES && kind != CONTACT_LEAVES && kind != CONTACT_STOPS;
 }
 
 /* Ends modes at the start of a step whose forces are outside of their cone there within rounding, and more at its end:
@@ -185,17 +182,19 @@ static int is_outside(const contact_terms *of, int transition, real value)
 static int end_modes_at_start(const event_step *step, const event_sample *right)
 {
   contact_terms of;
-  int has_terms = 0, status = OK;
+  int outside[EVENT_CONTACTS], has_terms = 0, status = OK;
   for (int i = 0; status == OK && i < TRANSITIONS; i++) {
     const int e = EVENT_FIRST[FIRST_TRANSITION + i];
     const real before = values_at(step, 0)[e], after = values_at(step, EVENT_DEGREE)[e];
     event_crossing *crossing = step->found + *step->filled;
     event_sample start;
-    if (!(before < 0.0 && after < before))
+    if (!(is_of_forces(i) && before < 0.0 && after < before))
       continue;
     status = has_terms ? OK : terms_at(step, right, &of);
+    if (status == OK && !has_terms)
+      find_outside(step, &of, CONTACT_OUTSIDE, outside);
     has_terms = 1;
-    if (status != OK || !is_outside(&of, i, after))
+    if (status != OK || !outside[TRANSITION[i][0]])
       continue;
     status = take_sample(step, e, CONTACT_START, &start);
     if (status == OK &&
@@ -214,7 +213,7 @@ static int check_gaps(const event_step *step, const event_sample *right)
 {
   contact_terms of;
   real value[EVENTS];
-  int doubtful = 0, status = evaluate_functions(step, right, value);
+  int outside[EVENT_CONTACTS], doubtful = 0, status = evaluate_functions(step, right, value);
   for (int i = 0; i < TRANSITIONS; i++)
     doubtful |= value[EVENT_FIRST[FIRST_TRANSITION + i]] < 0.0;
   if (status != OK || !doubtful)
@@ -223,11 +222,13 @@ static int check_gaps(const event_step *step, const event_sample *right)
   status = rounding_of(step, right);
   if (status == OK)
     status = terms_at(step, right, &of);
+  if (status == OK)
+    find_outside(step, &of, CONTACT_OUTSIDE, outside);
   for (int i = 0; status == OK && i < TRANSITIONS; i++) {
     const int e = EVENT_FIRST[FIRST_TRANSITION + i], row = CONTACTS[TRANSITION[i][0]].normal;
     const real rounding = CONTACT_MISSED * values_at(step, EVENT_DEGREE + 2)[e] + step->watch->history[e].slack +
         (row < 0 ? 0.0 : CONTACT_ROUNDING * of.size[row]);
-    if (is_outside(&of, i, value[e]) || (is_kept(i) && value[e] < -rounding)) {
+    if (value[e] < 0.0 && (is_of_forces(i) ? outside[TRANSITION[i][0]] : is_kept(i) && value[e] < -rounding)) {
       step->watch->through = FIRST_TRANSITION + i + 1;
       return NOT_CONVERGED;
     }
