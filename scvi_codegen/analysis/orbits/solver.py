@@ -217,7 +217,8 @@ FAR = 1.5
 """Factor between the periods, and part of the distance of the guess from the middle of the orbit, beyond which an
 orbit is not the guessed one."""
 RESTORATIONS = 4
-"""Newton iterations, of quadratic convergence, that restore fixed entries after a state is normalised."""
+"""Newton iterations, of quadratic convergence, that restore fixed entries after a state is normalised: 0.1^(2^4) is
+rounding, so that a tenth of the size of the motion is restored."""
 REVERSED = 1e-9
 """Largest distance of a step from one that a reversor reverses, relative to the motion."""
 OTHER = 1.0 / 3.0

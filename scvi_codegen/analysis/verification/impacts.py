@@ -237,7 +237,7 @@ def _symplecticity(run: Trajectory, changes: list[Change]) -> Finding | None:
 SAMPLED_STATES, SAMPLED_CHANGES, ROUNDED, DIFFERENCE = 40, 12, 256.0 * EPSILON, mp.mpf(10) ** -30
 LEAST_STEPS, HALVINGS, TRANSITIONS, SLACK, DECIDED, OUTSIDE = 16, 4, 2, 0.5, 1e-12, 1e-9
 """Bound on zeros relative to their terms; of runs that measure an order: slack of the order, rounding errors; part of
-their size by which impulses may leave their cone (contacts.h)."""
+their size by which impulses may leave their cone, ten times that by which runs choose them (CONTACT_ROUNDING)."""
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,9 @@ GRAZING_IMPACT = 2.0**-36
 TOUCH = GRAZING**2
 """Part of values beside it below which a minimum of abs(g) grazes: g = rate s + s^2/2 has the least value -rate^2/2."""
 SAMPLES, RISES = 17, 4.0
-"""Samples between which a minimum is sought, and least ratio of those beside it: 9 at a graze."""
+"""Samples between which a minimum is sought, and least ratio of the second ones beside it. N intervals of which 4 are
+kept cost N / log(N / 4), least at N = 4 e, and 6 % more at 16, whose places are exact. For g = c + s^2 the ratio is at
+least (c + 9/4) / (c + 1/4) in squared intervals: 9 at a graze, and less than 4 only if c > 5/12, which is seen."""
 SMALL_STEP = 2.0**-15
 """Fraction of a step from which the rate of the flow at a last state is computed."""
 DIFFERENCE = 2.0**-10
