@@ -195,6 +195,36 @@ def test_implicit_steps_in_lanes_have_the_bits_of_single_runs(method, arguments,
 
 
 @pytest.mark.second
+@pytest.mark.parametrize("method", ["stoermer-verlet", "composition:4"])
+def test_lanes_accept_and_reject_as_single_runs(method):
+    """Also steps that are not finite; with the other direction of time, and with one to 33 trajectories."""
+    steep = compiled(method, "steep", **{**WELL, "lagrangian": "x_dot**2/2 - x**16"})
+    assert steep._ensemble_binding.constant("HAS_METROPOLIS")
+    settings = {"h": 0.7, "steps": 60, "seed": 3, "metropolis": True}
+    q, p = np.random.default_rng(2).normal(size=(2, 33, 1))
+    whole = steep.integrate_ensemble(q, p, **settings)
+    single = steep.integrate(q[0], p[0], **settings)
+    assert 0.1 < single.acceptance < 0.9
+    assert (whole.status == "ok").all()
+    for count in (1, 2, 7, 33):
+        runs = steep.integrate_ensemble(q[:count], p[:count], **settings, threads=2)
+        assert np.array_equal(runs.p, whole.p[:, :count])
+        assert np.array_equal(runs.q[:, 0], single.q)
+    seen = steep.integrate_ensemble(q, p, **settings, observe="extremes").observed
+    assert np.array_equal(seen[1, :, 0], whole.q[..., 0].max(axis=0))
+
+
+@pytest.mark.rotated
+def test_observed_ensembles_with_metropolis_have_the_bits_of_single_runs():
+    stiff, q = compiled("svi:1", "folded", **STIFF), np.ones((3, 1))
+    settings = {"h": 0.6, "steps": 40, "seed": 3, "metropolis": True}
+    seen = stiff.integrate_ensemble(q, 0 * q, **settings, observe="extremes")
+    single = stiff.integrate(q[0], 0 * q[0], **settings)
+    assert np.array_equal(seen.q[:, 0], single.q)
+    assert seen.observed[1, 0, 0] == single.q.max()
+
+
+@pytest.mark.second
 def test_zero_temperature_is_plain_damping_and_heat_balances_the_energy():
     well = compiled("composition:4", "well", **WELL)
     cold = [well.integrate([1.0], [0.3], h=0.01, steps=300, seed=seed, parameters={"kT": 0}) for seed in (1, 2)]
@@ -360,6 +390,8 @@ def test_steps_to_spurious_roots_are_repeated_in_halves():
     )
     for seed in range(8):  # P(energy > 40) < 1e-7 for the two degrees of freedom, of potential energies from -3 to 3
         assert pendulum.integrate([0.3, 0.2], [0.0, 0.0], h=0.3, steps=300, seed=seed).energy().max() < 40
+    q = np.tile([0.3, 0.2], (16, 1))
+    assert pendulum.integrate_ensemble(q, 0 * q, h=0.3, steps=300, seed=0).energy().max() < 40
     jumps = 0
     for q, p in np.random.default_rng(0).normal(size=(400, 2, 2)) * [[[3.0], [2.5]]]:
         run = pendulum.integrate(q, p, h=0.3, steps=1, parameters={"g": 0.0})

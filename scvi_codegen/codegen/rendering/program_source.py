@@ -568,7 +568,8 @@ def render_ensemble(
         return None
     prefix, by_masses = f"{program.prefix}_ensemble", bool(program.rattle and program.rattle.lower_masses)
     velocities = by_masses or (fixed_point is not None and fixed_point.kept is StoredValues.VELOCITIES)
-    between = bath.kernel if bath else None, program.quantities.legendre, program.quantities.inverse_legendre
+    quantities = program.quantities
+    between = bath.kernel if bath else None, quantities.legendre, quantities.inverse_legendre, quantities.energy
     context = {
         "program": program,
         "points": points,
@@ -577,6 +578,8 @@ def render_ensemble(
         "counts": counts,
         "tangents": tangents,
         "cut": is_divided((*kernels, *((observed,) if observed else ()))),
+        "diagonal_masses": _diagonal_masses(program),
+        "metropolis": bool(bath and split and not any(bath.kernel.formulas[1 : 1 + program.dimension])),  # L is even
         "needs_velocities": velocities and not bath,
         "line_velocities": velocities and bath,
         "hot": "static",

@@ -109,13 +109,13 @@ class CommonRuns:
         binding = None
         if observation is not None:
             binding = observation.binding
-        elif not (constrained and (self.ensemble.inputs or stepper.sums_action)) and not self.ensemble.noise.metropolis:
+        elif not (constrained and (self.ensemble.inputs or stepper.sums_action)):
             binding = stepper._ensemble_binding
-        if binding is not None:
+        if binding is not None and not (self.ensemble.noise.metropolis and not binding.constant("HAS_METROPOLIS")):
             lanes = LaneRuns(binding, self.ensemble, self._fields(), common=self)
             self.done = lanes.done
             return lanes
-        if not stepper.binding.reusable or (self.ensemble.inputs and constrained):
+        if observation is not None or not stepper.binding.reusable or (self.ensemble.inputs and constrained):
             return None
         return SuccessiveRuns(self.ensemble, self._store)
 

@@ -11,6 +11,7 @@
 #define DEPENDENT_NORMAL 1e-12 /* squared rest of a normal relative to its square: it depends on the others */
 #define NO_FRICTION 1e-14 /* relative to the largest k: it is 0 but for rounding */
 #define JACOBI_SWEEPS 30
+#define FEW_ITERATIONS 7 /* of a step: to a root near the initial guess */
 
 /* W, V and U^T of each block, n rows of n numbers, the decay e^(-k tau) - 1 and the strength of the noise of each y,
  * and the root of tau: of a trajectory, or of those in SIMD lanes. */

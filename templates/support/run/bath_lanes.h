@@ -7,11 +7,12 @@ enum {
   STEPS_DRAWN = DRAWN * LANES < NORMALS_AT_ONCE ? NORMALS_AT_ONCE / (DRAWN * LANES) : 1 /* at once */
 };
 
-/* Factors and normals of half steps of the trajectories of a block, and their states before a step. */
+/* Factors and normals of half steps of the trajectories of a block, their states before a step and after its first half
+ * in the bath. */
 typedef struct {
   present_factors factors;
   lanes first[STEPS_DRAWN][DRAWN], second[STEPS_DRAWN][DRAWN];
-  state before;
+  state before, heated;
 } block_bath;
 
 /* State and parameters of a lane. */
@@ -57,6 +58,64 @@ static void forget_curve(block_memory *block, const state *now, lanes (*memory)[
 #endif
 }
 
+/* Replaces the states of lanes where `stays` is 0. */
+static inline void select_states(lanes stays, state *now, const state *others)
+{
+  for (size_t i = 0; i < sizeof *now / sizeof(lanes); i++)
+    ((lanes *)now)[i] = lanes_selected(stays, ((lanes *)now)[i], ((const lanes *)others)[i]);
+}
+
+/* Changes of the energies in a step, with forces at t. */
+static void find_energy_changes(const block_bath *bath, const block_memory *block, double t, const state *now,
+    double *change)
+{
+  for (int j = 0; j < LANES; j++) {
+    double q[M], p[M], parameters[P + 1], energy[2] = {NAN, NAN}, scratch[SCRATCH];
+    for (int k = 0; k < 2; k++) {
+      read_lane(block, k ? now : &bath->heated, j, q, p, parameters);
+      NAME(energy)(t, q, p, parameters, &energy[k], scratch);
+    }
+    change[j] = energy[1] - energy[0];
+  }
+}
+
+#ifdef METROPOLIS_IN_LANES
+/* Phi_-h is Phi_h of reversed momenta, bit by bit, as L is even in velocities. */
+static inline void reverse_momenta(const block_memory *block, state *now)
+{
+  for (int j = 0; j < LANES; j++)
+    for (int i = 0; i < M && block->reversed[j] > 0.0; i++)
+      now->p[i][j] = -now->p[i][j], now->carry_p[i][j] = -now->carry_p[i][j];
+}
+
+/* Returns lanes to the state before the step where it is rejected, as by is_accepted. */
+static void accept_or_reject(const block_bath *bath, block_memory *block, double t, state *now)
+{
+  double chance[LANES], change[LANES];
+  lane_view accepted;
+  reverse_momenta(block, now);
+  find_energy_changes(bath, block, t, now, change);
+  uniform_numbers(block->seed, (uint64_t)block->step - 1, ACCEPTANCE, (uint32_t)block->trajectory, LANES, chance);
+  for (int j = 0; j < LANES; j++) {
+    accepted.lane[j] = log(chance[j]) <= -change[j] / bath->factors.terms[0][j];
+    block->reversed[j] = accepted.lane[j] > 0.0 ? block->reversed[j] : 1.0 - block->reversed[j];
+  }
+  select_states(accepted.all, now, &bath->heated);
+  block->guess = 0;
+}
+#endif
+
+/* Deactivates lanes in which many iterations change the energy by more than kT: single runs decide (status_of_root). */
+static SELDOM void leave_doubtful_roots(const block_bath *bath, block_memory *block, double t, const state *now)
+{
+  double change[LANES];
+  find_energy_changes(bath, block, t, now, change);
+  for (int j = 0; j < LANES; j++) {
+    const double kT = bath->factors.terms[0][j];
+    block->active[j] = kT == 0 || fabs(change[j]) <= kT ? block->active[j] : 0.0;
+  }
+}
+
 /* The half before step k of a call. */
 static inline void enter_step(block_bath *bath, block_memory *block, long long k, state *now, lanes (*memory)[M])
 {
@@ -65,20 +124,28 @@ static inline void enter_step(block_bath *bath, block_memory *block, long long k
     normals(block->seed, (uint64_t)block->step, STEPS_DRAWN, HEAT, 0, DRAWN, (uint32_t)block->trajectory, LANES,
         (double *)bath->first, (double *)bath->second);
   exchange_heat(&bath->factors, bath->first[k % STEPS_DRAWN], now->p, now->carry_p);
+  bath->heated = *now;
+#ifdef METROPOLIS_IN_LANES
+  reverse_momenta(block, now);
+#endif
   forget_curve(block, now, memory);
 }
 
-/* The half after it; lanes that failed return to the state before both. */
-static inline void leave_step(block_bath *bath, block_memory *block, long long k, state *now)
+/* The half after it, of so many iterations; lanes that failed return to the state before both. */
+static inline void leave_step(block_bath *bath, block_memory *block, long long k, double t, long long iterations,
+    state *now)
 {
-  lanes *states = (lanes *)now;
-  const lanes *before = (const lanes *)&bath->before;
   lane_view active;
+  if (iterations > FEW_ITERATIONS)
+    leave_doubtful_roots(bath, block, t, now);
+#ifdef METROPOLIS_IN_LANES
+  if (block->metropolis)
+    accept_or_reject(bath, block, t, now);
+#endif
 #ifndef CONSTANT_BATH
   prepare_lanes(bath, block, now);
 #endif
   exchange_heat(&bath->factors, bath->second[k % STEPS_DRAWN], now->p, now->carry_p);
   memcpy(&active, block->active, sizeof active);
-  for (size_t i = 0; i < sizeof *now / sizeof(lanes); i++)
-    states[i] = lanes_selected(active.all, states[i], before[i]);
+  select_states(active.all, now, &bath->before);
 }

@@ -5,7 +5,6 @@
  * Computations, 2010, sec. 2.2). Requires: run.h, bath.h, energies.h. */
 
 #define MOST_PARTS 64 /* of a failed step: it is halved six times */
-#define FEW_ITERATIONS 7 /* of a step: to a root near the initial guess */
 #define LARGEST_RETURN_ERROR 1e-8 /* of Phi_-h(Phi_h(q)) relative to |q| and the step: it is reversible */
 #define RETURN_ROUNDING 1e-14 /* relative to the largest coordinate, in which others may round */
 
@@ -79,9 +78,9 @@ static int step_in_halves(const bath_call *call, const state *before, double h, 
 /* Returns 1 if a step of h to the present state is accepted. */
 static int is_accepted(const bath_call *call, const run_memory *run, const state *before, double h, double temperature)
 {
-  const double chance = uniform_number(run->seed, (uint64_t)run->step, ACCEPTANCE, (uint32_t)run->trajectory);
-  double q[M], p[M], size[M], largest = 0;
+  double chance, q[M], p[M], size[M], largest = 0;
   int reversible = 1;
+  uniform_numbers(run->seed, (uint64_t)run->step, ACCEPTANCE, (uint32_t)run->trajectory, 1, &chance);
   if (!(log(chance) <= -energy_change(call, before->t, before->q, before->p, run->q, run->p) / temperature))
     return 0;
 #ifndef EXPLICIT_RUN

@@ -252,7 +252,8 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
 #endif
     step.t = block->t;
 #ifdef HEAT_BATH
-    enter_step(&bath, block, k, &now, memory[0][0]);
+    const long long begun = report.iterations;
+    enter_step(&bath, block, k, &now, memory[0]);
 #endif
 #ifdef DOUBLE_DOUBLE
     step.t_low = block->t_low, step.h_low = block->h_low;
@@ -271,7 +272,10 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
     } while (memcmp(stored_results.active, block->active, sizeof stored_results.active) != 0 && predicted &&
         repeats_failed(&stored_results, past, &block->guess, dq, dp, block->active));
 #endif
-    drop_infinite(&now, dq, dp, block->active);
+#ifdef HEAT_BATH
+    if (!block->metropolis) /* which rejects them */
+#endif
+      drop_infinite(&now, dq, dp, block->active);
 #ifdef RUN_ACTION
     add_actions(block, &step, &data, past);
 #endif
@@ -280,7 +284,7 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
     block->step++;
     add_compensated(&block->t, &block->t_low, block->h, LOW_WORD(block, h));
 #ifdef HEAT_BATH
-    leave_step(&bath, block, k, &now);
+    leave_step(&bath, block, k, step.t, report.iterations - begun, &now);
 #endif
     for (int j = 0; j < count; j++)
       if (block->active[j] > 0.0)
@@ -342,7 +346,7 @@ static void begin_block(NAME(each) * c, int count)
   block_memory *block = c->block;
   NAME(start)(block, c->t, c->segment_h[0]);
 #ifdef HEAT_BATH
-  block->seed = c->seed, block->trajectory = c->trajectory + c->next;
+  block->seed = c->seed, block->trajectory = c->trajectory + c->next, block->metropolis = c->metropolis;
 #endif
 #ifdef DOUBLE_DOUBLE
   block->t_low = c->t_low;

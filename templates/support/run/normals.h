@@ -129,11 +129,15 @@ static inline void normals(uint64_t seed, uint64_t step, int steps, uint32_t pur
   }
 }
 
-/* Uniform in (0, 1] of a purpose in a step. */
-static inline double uniform_number(uint64_t seed, uint64_t step, uint32_t purpose, uint32_t trajectory)
+/* Uniform in (0, 1] of a purpose in a step, of at most NORMALS_AT_ONCE trajectories. */
+static inline void uniform_numbers(uint64_t seed, uint64_t step, uint32_t purpose, uint32_t trajectory, int count,
+    double *chances)
 {
   noise_words x;
-  x.of[0][0] = (uint32_t)step, x.of[1][0] = (uint32_t)(step >> 32), x.of[2][0] = trajectory, x.of[3][0] = purpose << 30;
-  philox(seed, 1, &x);
-  return uniform_of_words((uint32_t)x.of[0][0], (uint32_t)x.of[1][0]);
+  for (int i = 0; i < count; i++)
+    x.of[0][i] = (uint32_t)step, x.of[1][i] = (uint32_t)(step >> 32), x.of[2][i] = trajectory + (uint32_t)i,
+    x.of[3][i] = purpose << 30;
+  philox(seed, count, &x);
+  for (int i = 0; i < count; i++)
+    chances[i] = uniform_of_words((uint32_t)x.of[0][i], (uint32_t)x.of[1][i]);
 }
