@@ -255,6 +255,35 @@ def test_orbits_of_rods_are_those_of_angles():
     assert orbit.symplectic_error < 1e-13
 
 
+@pytest.mark.rotated
+@pytest.mark.parametrize("guess", [{"energy": 0.2}, {"fixed": ["z"]}, {"steps": 30}])
+def test_a_conical_pendulum_is_found_and_has_the_index_of_its_nutation(guess):
+    """Energy and angular momentum have parallel gradients there: w^2 = 1/cos a, nutation w sqrt(1 + 3 cos(a)^2)."""
+    system = ["x", "y", "z"], "(x_dot**2 + y_dot**2 + z_dot**2)/2 - z"
+    pendulum = sc.LagrangianSystem.from_text("pendulum", *system, constraints=["x**2 + y**2 + z**2 = 1"])
+    at = {"velocity": [0.0, np.sin(0.8) / np.sqrt(np.cos(0.8)), 0.0], "period": 5.3}
+    orbit = sc.periodic_orbit(sc.compile_stepper(pendulum, "svi:6"), [0.7225, 0.0, -0.6914], **at, **guess)
+    c = -orbit.q[2]
+    assert orbit.period == pytest.approx(2 * np.pi * np.sqrt(c), rel=1e-11)
+    assert orbit.stability_indices == pytest.approx([1, np.cos(2 * np.pi * np.sqrt(1 + 3 * c**2))], abs=1e-10)
+
+
+@pytest.mark.rotated
+def test_a_body_on_a_pivot_swings_as_a_pendulum():
+    body = sc.LagrangianSystem.from_text(
+        "body",
+        ["x", "y", "z"],
+        "(x_dot**2 + y_dot**2 + z_dot**2)/2 + 0.4*(omega_1**2 + omega_2**2 + omega_3**2)/2 - z",
+        rotations={"R": "omega"},
+        constraints=["x + R_13 = 0", "y + R_23 = 0", "z + R_33 = 0"],
+    )
+    stepper, at = sc.compile_stepper(body, "svi:4"), {"velocity": np.zeros(7), "period": 7.9}
+    start = sc.periodic_orbit(stepper, [0, np.sin(1), -np.cos(1), np.cos(0.5), np.sin(0.5), 0, 0], **at)
+    for orbit in sc.family(stepper, start, fixed=["x"], step=0.3, count=3):
+        assert orbit.period == pytest.approx(4 * ellipk((orbit.energy + 1) / 2) * np.sqrt(1.4), rel=1e-11)
+        assert orbit.stability_indices == pytest.approx(np.ones(3), abs=1e-9)
+
+
 def test_families_with_nonholonomic_constraints_are_refused():
     blade = sc.LagrangianSystem.from_text(
         "blade", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - y", constraints=["x_dot = x*y_dot"]

@@ -606,7 +606,8 @@ class Continuation:
         closing, size, units = linear.closing, search.reduction.size, linear.units
         independent = closing.returning
         if search.reversor is not None:
-            independent = search.independent_equations(start[np.newaxis], closing.segments, closing.sizes)
+            at = start[np.newaxis], closing.segments, closing.sizes, closing.relative_error
+            independent = search.independent_equations(*at)
         kept, strengths, _ = np.linalg.svd(independent * units[:size] / units[:size, np.newaxis])
         gradients = kept[:, strengths < 0.5]
         fields = np.vstack([gradients[size // 2 :], -gradients[: size // 2]])

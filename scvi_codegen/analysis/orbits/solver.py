@@ -200,6 +200,8 @@ CLOSED = 1e-11
 """Largest closing error, relative to the size of the motion and the norm of the monodromy matrix."""
 OPEN = 1e-3
 """Closing error relative to the size of the motion above which no growth of rounding errors makes an orbit closed."""
+IMPLIED = 10.0
+"""Least strength of conserved directions relative to the closing error: equations are then implied up to a tenth."""
 CONSERVED = 1e-3
 """Relative error of the transported gradient of an integral up to which the integral counts as conserved."""
 DIFFERENCE_INCREMENT = 1e-6
@@ -564,7 +566,8 @@ class OrbitSearch:
             sizes.reshape(2, m).max(axis=1) for sizes in (np.ptp(motion.states, axis=0), abs(z - guess)[:-1])
         )
         rounding = RESOLVED * roundoff(1) * np.abs(z[:m]).max()
-        if (ranges < EQUILIBRIUM_MOTION * distances).any() or ranges[0] <= rounding:
+        at_rest = (ranges < EQUILIBRIUM_MOTION * distances).any() and not self.gain.any()  # momenta may be constant
+        if at_rest or ranges[0] <= rounding:
             raise OrbitError(
                 f"the iteration converged to an equilibrium, q = {_listed(z[:m])}, p = {_listed(z[m:-1])}: fix an "
                 "amplitude, fixed=['x', ..], or give a better initial guess"
@@ -792,7 +795,7 @@ class OrbitSearch:
         error, relative_error = float(np.abs(defects).max()), float(np.abs(defects / self.reduced_sizes(sizes)).max())
         monodromy = leaving @ segments[-1].monodromy
         if self.reversor is None:
-            returning = self.independent_equations(starts, segments, sizes)
+            returning = self.independent_equations(starts, segments, sizes, relative_error)
         else:
             monodromy, returning = self.reversor.monodromy(monodromy), self.reversor.odd
         rows[-1], defects[-1] = returning @ rows[-1], returning @ defects[-1]
@@ -872,11 +875,13 @@ class OrbitSearch:
         q, p = (float(np.abs(part).max()) for part in np.split((equations.into @ change)[:-1], 2))
         return max(float(abs(change[-1])) / period, self._size_of(self._whole(states)).error(q, p))
 
-    def independent_equations(self, starts: Array, segments: Sequence[_Segment], sizes: Array) -> Array:
+    def independent_equations(self, starts: Array, segments: Sequence[_Segment], sizes: Array, error: float) -> Array:
         """Return the (size, size) projection onto the equations of return not implied by conserved quantities.
 
         Energy and momentum maps count as conserved if the Jacobian of every segment maps their gradients accordingly,
-        and if events that change the state leave their values at the ends of steps unchanged.
+        and if events that change the state leave their values at the ends of steps unchanged. A return that misses by
+        the relative error e changes J by O(e^2): along a direction of the strength s among unit gradients it is implied
+        up to O(e^2/s), where s is small next to motions along a symmetry (grad H = w grad L of a conical pendulum).
         """
         conserved_masks, units = [], self.reduced_sizes(sizes)
         accepted = CONSERVED if self.stepper.interface.conserves_energy else SAME  # weak damping is no conservation
@@ -897,7 +902,7 @@ class OrbitSearch:
         conserved = begins[0][np.all(conserved_masks, axis=0)]
         conserved /= np.maximum(np.linalg.norm(conserved, axis=1), LEAST_SIZE)[:, np.newaxis]
         directions, strengths, _ = np.linalg.svd(conserved.T, full_matrices=False)
-        directions = directions[:, strengths > CONSERVED * strengths.max(initial=0.0)]
+        directions = directions[:, strengths > max(CONSERVED, IMPLIED * error) * strengths.max(initial=0.0)]
         projection = np.eye(self.reduction.size) - directions @ directions.T
         return np.asarray(units[:, np.newaxis] * projection / units)
 
