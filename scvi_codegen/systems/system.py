@@ -410,8 +410,10 @@ class MechanicalSystem(Deferred, ABC):
 
     @property
     def constraint_texts(self) -> tuple[str, ...]:
-        """Constraints g as text, in the names of the rotations and directions of a Lagrangian."""
-        return tuple(map(self.text_of, self.reduced.constraints if self.reduced else self.constraints))
+        """Constraints g as text, without modes, in the names of the rotations and directions of a Lagrangian."""
+        from scvi_codegen.systems.formulas.kinks import without_modes
+
+        return tuple(self.text_of(without_modes(g)) for g in (self.reduced or self).constraints)
 
     def with_parameters(self, **values: float) -> Self:
         """Return a copy of the system with other default values for the named parameters."""

@@ -4,7 +4,8 @@ Default and given tolerances, output times and dense output, orders of fixed ste
 (``tools/kinks.py``, which prints a table of all); bits of restored runs and of ensembles; derivatives.
 """
 
-from functools import cache
+import re
+from functools import cache, partial
 from itertools import count
 
 import numpy as np
@@ -283,3 +284,22 @@ def test_adaptive_steps_keep_the_tolerance_at_powers_that_are_not_whole(method, 
     assert runs.ends[1][7] == stepper.integrate([heights[7]], [0.0], t_end=ends[7], **plan).q[-1]
     start = stepper.integrate([0.0], [-3.0], t_end=duration_of_contact(3.0) + 0.1, **plan)
     assert abs(start.q[-1, 0] - 0.25) < bound
+
+
+@pytest.mark.parametrize("constraint", ["y = x**2/4", "y = positive_part(x)**2 + x**2/4"])
+def test_derivatives_of_rest_on_a_constraint(constraint):
+    """At rest momenta are rounding of constraint forces; at a kink the derivatives are undefined, by name."""
+    track = lagrange("track", "x y", "(x_dot**2 + y_dot**2)/2 - 9.81*y", constraints=[constraint])
+    stepper, cosine = sc.compile_stepper(track, "svi:8"), np.cos(0.3 * np.sqrt(9.81 / 2))
+    run = stepper.integrate([0.0, 0.0], [0.0, 0.0], h=0.1, steps=3)
+    if "positive" not in constraint:
+        assert run.tangent([1, 0, 0, 0])[-1, 0] == pytest.approx(cosine, abs=1e-12)
+        return
+    for derive in (run.sensitivity, *(partial(sc.equilibrium, stepper, q) for q in ([0.0, 0.0], [0.01, 0.0]))):
+        with pytest.raises(sc.StateError, match=r"rests at a kink of its equations, 'x' = 0"):
+            derive()
+    with pytest.warns(sc.AccuracyWarning, match=re.escape("-x**2*unit_step(x) - x**2/4 + y")):
+        stepper.integrate([1e-3, 0.0], [0.0, 0.0], h=0.1, steps=1)
+    as_formulas = sc.compile_stepper(track, "svi:8", kinks="as formulas")
+    tangent = as_formulas.integrate([0.0, 0.0], [0.0, 0.0], h=0.1, steps=3).tangent([1, 0, 0, 0])
+    assert tangent[-1, 0] == pytest.approx(np.cos(0.3 * np.sqrt(9.81 * 2.5)), abs=1e-9)

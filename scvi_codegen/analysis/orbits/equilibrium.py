@@ -20,6 +20,7 @@ from scvi_codegen.common.errors import OrbitError, StateError, StepFailedError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.runs.accuracy.size import RESOLVED, roundoff
+from scvi_codegen.runs.events.saltation import check_sides
 from scvi_codegen.runs.states.reduction import Reduction
 from scvi_codegen.runs.states.validation import Array, Parameters, check_step_given
 from scvi_codegen.runs.stepper import STEPPER, Stepper
@@ -98,7 +99,7 @@ def equilibrium(stepper: Stepper, q: ArrayLike, *, t: float = 0.0, parameters: P
     Raises:
         OrbitError: if the iteration does not converge.
         MethodError: if the stepper has no derivatives, nonholonomic constraints or transformed time.
-        StateError: if a shape, name or number is invalid.
+        StateError: if a shape, name or number is invalid, or the equilibrium is at a kink, beside which motions differ.
     """
     stepper = stepper.bind(q, parameters)[0]._known_with_events
     require(stepper, "periodic_orbit")
@@ -108,6 +109,7 @@ def equilibrium(stepper: Stepper, q: ArrayLike, *, t: float = 0.0, parameters: P
     momenta = stepper._initial_momenta(positions, None, velocity, t, values)
     state = np.concatenate(stepper._states.pair(positions, momenta))
     reduction = reduction_of(stepper, t, values)
+    guess = state
     state = np.ravel(reduction.normalised(*np.split(state, 2)))
     motion = _Motion(stepper, reduction, t, values)
     motion = motion.of_short_steps(state)
@@ -129,6 +131,7 @@ def equilibrium(stepper: Stepper, q: ArrayLike, *, t: float = 0.0, parameters: P
         begun = begun or strength
         converged = np.abs(np.sort(factors) - np.sort(former)).max() <= SAME * strength
         if converged and at_rest and strength >= FLAT * begun:
+            check_sides(stepper, np.array([guess, state]), (t, t), motion.h, values)
             return motion.at_rest(state)
     raise OrbitError(
         f"no equilibrium of '{stepper.title}' was found near q = {np.asarray(q)}: {MOST_ITERATIONS} iterations did not "

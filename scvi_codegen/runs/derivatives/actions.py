@@ -57,10 +57,10 @@ def actions_between(states: SavedStates) -> Array:
         actions, reached = actions_of_steps(states.stepper, starts, states.parameters, states.options)
         if last - first == len(actions):
             result[first:last] = actions
-            check_recomputed(starts.t, reached, ends[first + 1 : last + 1], ends[first:last])
+            check_recomputed(states, starts.t, reached, ends[first + 1 : last + 1], ends[first:last])
         else:
             result[first] = compensated_sums(actions)[-1]
-            check_recomputed(starts.t[-1:], reached[-1:], ends[last : last + 1], ends[first : first + 1])
+            check_recomputed(states, starts.t[-1:], reached[-1:], ends[last : last + 1], ends[first : first + 1])
     return result
 
 

@@ -172,7 +172,7 @@ def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], ve
         before = saved[:-1]
         if jumps:  # states near rest, after impacts that accumulate, are not exact relative to themselves
             before = np.maximum(np.abs(before), max(np.abs(starts.q).max(), np.abs(starts.p).max()))
-        check_recomputed(part.t, np.concatenate(ends, axis=1), saved[1:], before)
+        check_recomputed(states, part.t, np.concatenate(ends, axis=1), saved[1:], before)
     if start and back:
         vectors[0] = vectors[0] @ start.matrix
 

@@ -61,6 +61,10 @@ ADMISSIBLE = 0.5
 """Singular values of the derivative of a projection are at least 1, or 0 for inadmissible directions."""
 CONTINUOUS = 1e-9
 """Largest difference of the rates of both sides of a kink that is rounding: the flow has no jump there."""
+AT_KINK = 1e-9
+"""Part of the distance from a kink at the start of an iteration below which its end is at the kink."""
+BEYOND = 2.0**1000
+"""Mode of a side, beyond all values of u."""
 WEIGHTS = np.array([1.0, -9.0, 45.0]) / 60.0
 PLACES = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
 
@@ -106,11 +110,33 @@ def jumps_within(
             jumps[k] = _end_of_part(states, starts, k, row)
     if stepper.modes and numbers[0] == 0:
         t, state = float(states.t[0]), np.concatenate([states.q[0], states.p[0]])
+        rows = [0, min(1, len(states) - 1)]
+        ends = np.concatenate([states.q[rows], states.p[rows]], axis=1)
+        check_sides(stepper, ends, tuple(states.t[rows].tolist()), float(starts.h[0]), parameters_on_sides(states, t))
         here = Place(states, t, parameters_on_sides(states, t), all_inputs)
         matrix = _with_directions(here, np.eye(stepper._input_size), state, 0.0 * here.parameters)
         matrix[:, [len(state) + column for column in stepper.mode_columns]] = 0.0
         jumps[0] = Jump(matrix, state)
     return jumps
+
+
+def check_sides(stepper: Integrator, ends: Array, t: tuple[float, float], h: float, parameters: Array) -> None:
+    """Raise :class:`StateError` if two states (2, 2m) rest at a kink beside which steps have different derivatives."""
+    (q0, q), (p0, p) = np.split(ends, 2, axis=1)
+    before = abs(_event_values(stepper, q0, p0, t[0], parameters))
+    after = abs(_event_values(stepper, q, p, t[1], parameters))
+    for kink in stepper.searched:
+        if isinstance(kink, Kink) and after[n := _number(stepper, kink)] <= AT_KINK * before[n]:
+            sides = [parameters.copy(), parameters.copy()]
+            for side, at in zip((-1.0, 1.0), sides, strict=True):
+                at[stepper.interface.parameters.index(kink.mode)] = side * BEYOND
+            below, above = (stepper.jacobian(q, p, h, t[1], at) for at in sides)
+            if abs(above - below).max() > CONTINUOUS * abs(above).max():
+                raise StateError(
+                    f"the motion rests at a kink of its equations, {kink.title} = 0: "
+                    "derivatives with respect to its state are undefined, as those of both sides differ. Give a state "
+                    'beside it, or a stepper with kinks="as formulas", which has those of one side'
+                )
 
 
 def _check_grazes(states: SavedStates, numbers: NDArray[np.intp], changed: Array) -> None:

@@ -108,6 +108,11 @@ def steps_on_sides(steps: Iterable[Expr], modes: Mapping[Expr, Expr]) -> dict[Ex
     return {step: unit_step(step.args[0] + sign * modes[u]) for step, u, sign in functions if u in modes}
 
 
+def without_modes(formula: Expr) -> Expr:
+    """Return a formula with unit_step(u) in place of unit_step(u + mode)."""
+    return formula.xreplace(dict.fromkeys(formula.atoms(Mode), sympy.Integer(0)))
+
+
 def wrap(x: Expr, length: Expr) -> Expr:
     """Return x - L rint(x / L), the number of smallest size that differs from x by a multiple of L."""
     return x - length * rint(x / length)
