@@ -12,6 +12,7 @@ stay as they are.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -19,7 +20,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.systems.contact import Friction
-from scvi_codegen.systems.formulas.expressions import parts_of_type
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 
 if TYPE_CHECKING:
@@ -33,8 +33,9 @@ STEPS = re.compile(r"\b(sign|sqrt|[aA]bs|where|unit_step|Heaviside|Piecewise|[mM
 
 def with_dry_friction(system: Any) -> Any:
     """Return the system with contacts in place of the dry friction in its forces; itself if there is none."""
-    is_smooth = system._text is not None and not STEPS.search(system._text)
-    if is_smooth or not isinstance(system, LagrangianSystem) or system.clock or system.gauge != 0 or system.rotations:
+    if not isinstance(system, LagrangianSystem) or _is_smooth(system):
+        return system
+    if system.clock or system.gauge != 0 or system.rotations:
         return system
     forces, contacts = system.forces, []
     for slip, divided in _slips(system):
@@ -49,10 +50,19 @@ def with_dry_friction(system: Any) -> Any:
     return replace(system, forces=forces, contacts=(*system.contacts, *contacts)) if contacts else system
 
 
+def _is_smooth(system: LagrangianSystem) -> bool:
+    """Return whether the forces of a system from text have no steps; reads no formulas."""
+    if system._text is None:
+        return not system.forces
+    arguments = json.loads(system._text)[1]
+    return not STEPS.search(f"{arguments.get('forces')} {arguments.get('dissipation')}")
+
+
 def _slips(system: LagrangianSystem) -> Iterator[tuple[tuple[Expr, ...], Callable[[Expr], tuple[Expr, Expr]]]]:
     """Yield the slips of steps and of inverse lengths in forces, and what divides a force by sign(w) or 1/abs(w)."""
     from sympy import Pow, Rational
 
+    from scvi_codegen.systems.formulas.expressions import parts_of_type
     from scvi_codegen.systems.formulas.kinks import switching_function, unit_step
 
     steps = {switching_function(step.args[0])[0] for step in parts_of_type(unit_step, *system.forces)}
