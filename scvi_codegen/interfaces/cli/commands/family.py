@@ -59,7 +59,11 @@ def family(
     with progress_bar(model.family.get("count", COUNT), "orbits") as progress:
         members = _members(model, resume, progress)
     tell(_described(members), **_numbers(members))
-    writers = members.save, members.plot, lambda path: page_of(model, document_of(model), {}, members).save(path)
+    writers: tuple[Callable[[str], object], ...] = (
+        members.save,
+        members.plot,
+        lambda path: page_of(model, document_of(model), {}, members).save(path),
+    )
     for target, write in zip((output, plot, page), writers, strict=True):
         if target is not None:
             write(target)
