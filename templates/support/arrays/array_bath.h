@@ -24,32 +24,30 @@ static int prepare_bath(run_memory *run)
 static void half_of_bath(run_memory *run, long long n, int second)
 {
   const double *decay = run->bath, *strength = run->bath + n;
-  double first[NORMALS_AT_ONCE], taken[NORMALS_AT_ONCE], *later = run->bath + 2 * n;
+  double first[NORMALS_AT_ONCE], *later = run->bath + 2 * n;
   double *restrict p = run->p, *restrict carry = run->carry_p;
   const double *inverse_mass = run->inverse_mass;
   sums heat;
   wait_at_barrier(run);
   begin_sums(&heat, run, n);
   while (next_block(&heat)) {
-    double sum = 0.0;
+    double taken[NORMALS_AT_ONCE] = {0.0};
     for (long long from = heat.here.first, count; from < heat.here.end; from += count) {
       const double *xi = second ? later + from : first;
       count = heat.here.end - from < NORMALS_AT_ONCE ? heat.here.end - from : NORMALS_AT_ONCE;
       if (!second)
         normals(run->seed, (uint64_t)run->step, 1, HEAT, (int)from, (int)count, (uint32_t)run->trajectory, 1, first,
             later + from);
-      memset(taken, 0, sizeof taken);
       for (long long j = 0; j < count; j++) {
         const double p0 = p[from + j] + carry[from + j], change = fma(decay[from + j], p0, strength[from + j] * xi[j]);
-        taken[j] = change * (p0 + 0.5 * change) * inverse_mass[from + j];
+        taken[j] += change * (p0 + 0.5 * change) * inverse_mass[from + j];
         p[from + j] = p0 + change, carry[from + j] = 0.0;
       }
-      for (int half = NORMALS_AT_ONCE / 2; half > 0; half /= 2) /* a sum in vectors */
-        for (int j = 0; j < half; j++)
-          taken[j] += taken[half + j];
-      sum += taken[0];
     }
-    add_block(&heat, sum, 0.0);
+    for (int half = NORMALS_AT_ONCE / 2; half > 0; half /= 2)
+      for (int j = 0; j < half; j++)
+        taken[j] += taken[half + j];
+    add_block(&heat, taken[0], 0.0);
   }
   wait_at_barrier(run);
   add_compensated(&run->heat, &run->heat_low, sum_of(&heat, 0), 0.0);

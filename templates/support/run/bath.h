@@ -27,6 +27,11 @@ typedef FACTORS_OF(lanes) present_factors;
 typedef double bath_number;
 typedef bath_factors present_factors;
 #endif
+enum {
+  DRAWN = M + STRENGTHS, /* normals of a half step */
+  NUMBERS_DRAWN = DRAWN * (int)(sizeof(bath_number) / sizeof(double)),
+  STEPS_DRAWN = NUMBERS_DRAWN < NORMALS_AT_ONCE ? NORMALS_AT_ONCE / NUMBERS_DRAWN : 1 /* at once */
+};
 
 static inline void rotate(double *x, double *y, double c, double s)
 {

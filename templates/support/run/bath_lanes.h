@@ -2,10 +2,6 @@
 
 /* Half steps of the bath of many trajectories, which are SIMD lanes; trajectory k has stream k of the noise, as in
  * single runs (bath_run.h). Requires: ensemble_run.h, bath.h. */
-enum {
-  DRAWN = M + STRENGTHS, /* normals of a half step */
-  STEPS_DRAWN = DRAWN * LANES < NORMALS_AT_ONCE ? NORMALS_AT_ONCE / (DRAWN * LANES) : 1 /* at once */
-};
 
 /* Factors and normals of half steps of the trajectories of a block, their states before a step and after its first half
  * in the bath. */
@@ -65,22 +61,7 @@ static inline void select_states(lanes stays, state *now, const state *others)
     ((lanes *)now)[i] = lanes_selected(stays, ((lanes *)now)[i], ((const lanes *)others)[i]);
 }
 
-/* Changes of the energies in a step, with forces at t. */
-static void find_energy_changes(const block_bath *bath, const block_memory *block, double t, const state *now,
-    double *change)
-{
-  for (int j = 0; j < LANES; j++) {
-    double q[M], p[M], parameters[P + 1], energy[2] = {NAN, NAN}, scratch[SCRATCH];
-    for (int k = 0; k < 2; k++) {
-      read_lane(block, k ? now : &bath->heated, j, q, p, parameters);
-      NAME(energy)(t, q, p, parameters, &energy[k], scratch);
-    }
-    change[j] = energy[1] - energy[0];
-  }
-}
-
-#ifdef METROPOLIS_IN_LANES
-/* Phi_-h is Phi_h of reversed momenta, bit by bit, as L is even in velocities. */
+/* Phi_-h is Phi_h of reversed momenta, bit by bit, if L is even in velocities. */
 static inline void reverse_momenta(const block_memory *block, state *now)
 {
   for (int j = 0; j < LANES; j++)
@@ -88,32 +69,26 @@ static inline void reverse_momenta(const block_memory *block, state *now)
       now->p[i][j] = -now->p[i][j], now->carry_p[i][j] = -now->carry_p[i][j];
 }
 
-/* Returns lanes to the state before the step where it is rejected, as by is_accepted. */
-static void accept_or_reject(const block_bath *bath, block_memory *block, double t, state *now)
+/* Accepts or rejects the step of each lane, as is_accepted; or deactivates lanes in which many iterations change the
+ * energy by more than kT: single runs decide (status_of_root). */
+static void judge_step(const block_bath *bath, block_memory *block, double t, state *now)
 {
-  double chance[LANES], change[LANES];
-  lane_view accepted;
-  reverse_momenta(block, now);
-  find_energy_changes(bath, block, t, now, change);
+  double chance[LANES];
+  lane_view stays = {lanes_of(1.0)};
   uniform_numbers(block->seed, (uint64_t)block->step - 1, ACCEPTANCE, (uint32_t)block->trajectory, LANES, chance);
   for (int j = 0; j < LANES; j++) {
-    accepted.lane[j] = log(chance[j]) <= -change[j] / bath->factors.terms[0][j];
-    block->reversed[j] = accepted.lane[j] > 0.0 ? block->reversed[j] : 1.0 - block->reversed[j];
+    double q[M], p[M], parameters[P + 1], energy[2] = {NAN, NAN}, scratch[SCRATCH], kT = bath->factors.terms[0][j];
+    for (int k = 0; k < 2; k++) {
+      read_lane(block, k ? now : &bath->heated, j, q, p, parameters);
+      NAME(energy)(t, q, p, parameters, &energy[k], scratch);
+    }
+    if (!block->metropolis)
+      block->active[j] = kT == 0 || fabs(energy[1] - energy[0]) <= kT ? block->active[j] : 0.0;
+    else if (!(log(chance[j]) <= -(energy[1] - energy[0]) / kT))
+      stays.lane[j] = 0.0, block->reversed[j] = 1.0 - block->reversed[j];
   }
-  select_states(accepted.all, now, &bath->heated);
+  select_states(stays.all, now, &bath->heated);
   block->guess = 0;
-}
-#endif
-
-/* Deactivates lanes in which many iterations change the energy by more than kT: single runs decide (status_of_root). */
-static SELDOM void leave_doubtful_roots(const block_bath *bath, block_memory *block, double t, const state *now)
-{
-  double change[LANES];
-  find_energy_changes(bath, block, t, now, change);
-  for (int j = 0; j < LANES; j++) {
-    const double kT = bath->factors.terms[0][j];
-    block->active[j] = kT == 0 || fabs(change[j]) <= kT ? block->active[j] : 0.0;
-  }
 }
 
 /* The half before step k of a call. */
@@ -125,9 +100,7 @@ static inline void enter_step(block_bath *bath, block_memory *block, long long k
         (double *)bath->first, (double *)bath->second);
   exchange_heat(&bath->factors, bath->first[k % STEPS_DRAWN], now->p, now->carry_p);
   bath->heated = *now;
-#ifdef METROPOLIS_IN_LANES
   reverse_momenta(block, now);
-#endif
   forget_curve(block, now, memory);
 }
 
@@ -136,12 +109,9 @@ static inline void leave_step(block_bath *bath, block_memory *block, long long k
     state *now)
 {
   lane_view active;
-  if (iterations > FEW_ITERATIONS)
-    leave_doubtful_roots(bath, block, t, now);
-#ifdef METROPOLIS_IN_LANES
-  if (block->metropolis)
-    accept_or_reject(bath, block, t, now);
-#endif
+  reverse_momenta(block, now);
+  if (block->metropolis || iterations > FEW_ITERATIONS)
+    judge_step(bath, block, t, now);
 #ifndef CONSTANT_BATH
   prepare_lanes(bath, block, now);
 #endif

@@ -8,11 +8,6 @@
 #define LARGEST_RETURN_ERROR 1e-8 /* of Phi_-h(Phi_h(q)) relative to |q| and the step: it is reversible */
 #define RETURN_ROUNDING 1e-14 /* relative to the largest coordinate, in which others may round */
 
-enum {
-  DRAWN = M + STRENGTHS, /* normals of a half step */
-  STEPS_DRAWN = DRAWN < NORMALS_AT_ONCE ? NORMALS_AT_ONCE / DRAWN : 1 /* whose normals are computed at once */
-};
-
 /* Arguments of the steps of a run. */
 typedef struct {
   const double *parameters;
