@@ -357,6 +357,7 @@ class WorkRate:
     rate: Expr
 
 
+@lru_cache(maxsize=64)
 def work_rates(system: MechanicalSystem) -> tuple[WorkRate, ...]:
     """Return the power, then the rate of each momentum map that forces or damping change; empty without forces."""
     of_contacts = constraint_power(system) if system.reactions else sympy.S.Zero

@@ -9,9 +9,13 @@ import numpy as np
 from scipy.special import elliprd
 from sympy import Abs, Expr, Matrix, sqrt
 
+from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.multibody.trees.energies import TINY, exact_number, exact_vector
 from scvi_codegen.systems.multibody.trees.tree import Vector, about
+
+MOST_TURNS = 500
+"""Rotations of Jacobi's method, which takes fewer than ten."""
 
 
 def box(edges: Vector, rho: float, beta: float, w: Matrix, v: Matrix) -> list[Expr]:
@@ -57,7 +61,7 @@ def ellipsoid(r: Vector, coefficients: Vector, rho: float, beta: float, w: Matri
 def principal_axes(matrix: Vector) -> Vector:
     """Return principal axes by Jacobi's rotations from the axes of a matrix, as MuJoCo does, also for equal moments."""
     turn = np.eye(3)
-    while True:
+    for _ in range(MOST_TURNS):
         inner = turn.T @ matrix @ turn
         k = max(range(3), key=lambda axis: abs(inner[axis - 2, axis - 1]))
         off, apart = inner[k - 2, k - 1], inner[k - 2, k - 2] - inner[k - 1, k - 1]
@@ -65,3 +69,4 @@ def principal_axes(matrix: Vector) -> Vector:
         if not (abs(off) > 1e-12 and 1 - np.cos(angle) > 1e-12):
             return turn
         turn = turn @ about(np.eye(3)[k], angle)
+    raise SystemDefinitionError(f"Jacobi's rotations to the principal axes of {matrix.tolist()} do not converge")
