@@ -21,10 +21,7 @@ function restart() {
       if (family) single(); else fault = code.advance(now, 4);
       for (let k = 0; k < code.stored() && !fault; k++) states.push(pointsOf(stored_q.subarray(k * m, (k + 1) * m), stored_p.subarray(k * m, (k + 1) * m), stored_t[k]));
     });
-    if (family) {
-      picture.curves = trails; // the orbit
-      states.push(...family.orbits.map(({ q, p }) => pointsOf(q, p, about.t))); // one frame for all
-    }
+    if (family) { picture.curves = trails; states.push(...family.orbits.map(({ q, p }) => pointsOf(q, p, about.t))); } // one frame for all
     const shown = states.filter((points) => points.flat().every(Number.isFinite));
     start();
     picture.ahead(shown);
@@ -71,10 +68,8 @@ function addSlider(title, label, name, { low, high, step = 0.001, log = false, h
   sliders.push(show);
 }
 const showSliders = () => sliders.forEach((show) => show());
-if (family) addSlider("Family", "Orbit", "Orbit", {
-  low: 0, high: family.orbits.length - 1, step: 1 / (family.orbits.length - 1), get: () => present,
-  set: (k) => { const { q, v, parameters } = family.orbits[Math.round(k)]; Object.assign(settings, { q, v }); Object.assign(settings.parameters, parameters); restart(); },
-});
+const moveTo = ({ q, v, parameters }) => { Object.assign(settings, { q, v }); Object.assign(settings.parameters, parameters); restart(); };
+if (family) addSlider("Family", "Orbit", "Orbit", { low: 0, high: family.orbits.length - 1, step: 1 / (family.orbits.length - 1), get: () => present, set: (k) => moveTo(family.orbits[Math.round(k)]) });
 addSlider("Time", "Speed", "Speed", { ...about.speed, log: true, get: () => settings.speed, set: (x) => { settings.speed = x; } });
 const { adaptive } = about.step; // of unknown durations
 addSlider("Time", about.step.label.replace(" in tau", ""), about.step.label, { ...about.step, log: true, get: () => settings.step, set: (x) => { settings.step = x; restart(); } });

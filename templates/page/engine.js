@@ -47,8 +47,7 @@ const initial = {
   parameters: Object.fromEntries(about.parameters.map(({ name, value }) => [name, value])),
 };
 Object.assign(initial.parameters, family?.orbits[0].parameters);
-let settings = structuredClone(initial);
-let present = 0; // number of the orbit of a family
+let settings = structuredClone(initial), present = 0; // number of the orbit of a family
 let legs = [0]; // numbers of steps, "r" where the direction of time is reversed, and new values of inputs
 const value = (given) => (typeof given === "string" ? settings.parameters[given] : given);
 const ranges = byName(about.parameters.map(({ name, low, high }) => [name, [low, high]]));

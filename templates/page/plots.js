@@ -50,21 +50,16 @@ function addPanel(title, draw) {
   panels.push(panel);
   return panel;
 }
-/** Adds a panel of curves over the family, with its bifurcations and the present orbit; `told` is the text of this. */
-function addFamilyPanel(title, heights, told) {
-  const { orbits } = family;
-  addPanel(`${title} over ${spelled(family.value)}`, ({ canvas, output }) => {
-    const columns = heights(orbits[0]).map((_, k) => orbits.map((orbit) => heights(orbit)[k])), xs = orbits.map((orbit) => orbit.value);
-    const { px, py, pen } = plot(canvas, columns.flatMap(() => [...xs, NaN]), columns.flatMap((ys) => [...ys, NaN]), colors.c0);
-    orbits.forEach((orbit, k) => heights(orbit).forEach((y) => { if (orbit.bifurcation || k === present) { pen.beginPath(); pen.arc(px(orbit.value), py(y), 3.5, 0, TAU); pen.fillStyle = k === present ? colors.c1 : colors.muted; pen.fill(); } }));
-    output.textContent = told(orbits[present]);
-  });
-}
-if (family) {
-  addFamilyPanel("Period", ({ period }) => [period], ({ period, value }) => `${short(period, 6)} at ${short(value, 6)}`);
-  if (family.value !== "energy") addFamilyPanel("Energy", ({ energy }) => [energy], ({ energy }) => short(energy, 6));
-  addFamilyPanel(`log₁₀ ${family.sizes}`, ({ sizes }) => sizes.map(Math.log10), ({ kind, sizes }) => [...sizes.slice(0, 3).map((x) => short(x, 4)), kind].join(", "));
-}
+// Curves over a family, with its bifurcations and the present orbit.
+const over = (title, heights, told) => addPanel(`${title} over ${spelled(family.value)}`, ({ canvas, output }) => {
+  const { orbits } = family, columns = heights(orbits[0]).map((_, k) => [...orbits.map((orbit) => heights(orbit)[k]), NaN]);
+  const { px, py, pen } = plot(canvas, columns.flatMap(() => [...orbits.map((orbit) => orbit.value), NaN]), columns.flat(), colors.c0);
+  orbits.forEach((orbit, k) => { if (orbit.bifurcation || k === present) heights(orbit).forEach((y) => { pen.beginPath(); pen.arc(px(orbit.value), py(y), 3.5, 0, TAU); pen.fillStyle = k === present ? colors.c1 : colors.muted; pen.fill(); }); });
+  output.textContent = told(orbits[present]);
+});
+if (family) over("Period", ({ period }) => [period], ({ period, value }) => `${short(period, 6)} at ${short(value, 6)}`);
+if (family && family.value !== "energy") over("Energy", ({ energy }) => [energy], ({ energy }) => short(energy, 6));
+if (family) over(`log₁₀ ${family.sizes}`, ({ sizes }) => sizes.map(Math.log10), ({ bifurcation, stability, sizes }) => [...sizes.slice(0, 3).map((x) => short(x, 4)), bifurcation || stability].join(", "));
 const [solid] = shape.solids;
 const defaults = about.plots.length ? about.plots : [solid && m <= WHOLE && about.coordinates.length ? [`${solid.name}.y`, `${solid.name}.x`] : m <= WHOLE && about.coordinates.length ? ((k) => (k < 0 ? [about.coordinates[0], "t"] : [about.momenta[k] || "t", about.coordinates[k]]))(about.coordinates.findIndex((_, k) => !about.rotations.some(({ columns }) => columns.includes(k)))) : [`q.${probes[0]}`, "t"]];
 for (const [y, x] of defaults) {

@@ -202,8 +202,8 @@ ROD = sc.LagrangianSystem.from_text(
     "rod",
     ["x", "y"],
     "m*(x_dot**2 + y_dot**2)/2 - m*g*y",
-    constraints=["x**2 + y**2 = l**2"],
-    parameters={"m": 1.3, "g": 1.0, "l": 1.0},
+    constraints=["x**2 + y**2 = (l + d)**2"],
+    parameters={"m": 1.3, "g": 1.0, "l": 1.0, "d": 0.0},
 )
 
 
@@ -213,16 +213,17 @@ def test_families_of_a_rod_are_elliptic_integrals():
     rod = sc.compile_stepper(ROD, "svi:6")
     rest = sc.equilibrium(rod, [0.3, -0.9])
     assert [*rest.q, *rest.frequencies] == pytest.approx([0, -1, 1], abs=1e-13)
-    start = sc.periodic_orbit(rod, [0.6, -0.8], [0.0, 0.0], period=6.4, fixed=["x"])
+    start = sc.periodic_orbit(rod, [0.6, -0.9], [0.0, 0.0], period=6.4, fixed=["x"])
     assert start.monodromy.shape == (2, 2)
     at = {"step": 0.4, "count": 6}
     families = [
         sc.family(rod, rest, amplitude=0.1, **at),
         sc.family(rod, start, parameter="l", fixed=["x"], **at),
         sc.family(rod, start, parameter="l", energy=start.energy, **at),
+        sc.family(rod, start, parameter="d", fixed=["x"], **at),
     ]
     for orbit in (orbit for family in families for orbit in family):
-        m, g, length = orbit.parameters
+        m, g, length = orbit.parameters[:3] + [0, 0, orbit.parameters[3]]
         expected = 4 * ellipk((orbit.energy / (m * g * length) + 1) / 2) * np.sqrt(length / g)
         assert orbit.period == pytest.approx(expected, rel=1e-11)
         assert np.hypot(*orbit.q) == pytest.approx(length, rel=1e-15)

@@ -278,7 +278,7 @@ def test_a_family_has_its_orbits_bifurcations_and_range_and_belongs_to_its_syste
     about = described(sc.page(system, family=family).html)
     shown, (fold,) = about["family"], family.bifurcations
     assert (shown["value"], shown["sizes"]) == ("F", "|multiplier|")
-    assert [orbit["kind"] == "fold" for orbit in shown["orbits"]] == [k == fold.after + 1 for k in range(5)]
+    assert [orbit["bifurcation"] for orbit in shown["orbits"]] == ["fold" * (k == fold.after + 1) for k in range(5)]
     values = [orbit["value"] for orbit in shown["orbits"]]
     assert values == [*family.values[: fold.after + 1], family.value_of(fold.orbit), *family.values[fold.after + 1 :]]
     assert [about["q"], about["v"]] == [family[0].q.tolist(), family[0].p.tolist()]

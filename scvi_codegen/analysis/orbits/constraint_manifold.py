@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from scvi_codegen.common.errors import EventError, StateError
+from scvi_codegen.common.errors import OrbitError, StateError
 from scvi_codegen.runs.states.reduction import Reduction
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.integrator import Integrator
-from scvi_codegen.runs.stepping.projection import constraint_values, linearised, projected
+from scvi_codegen.runs.stepping.projection import linearised, projected
 
-DIFFERENCE = 2.0**-17
-"""Increment of central differences of constraints by a parameter, relative to it: the cube root of rounding errors."""
+MOMENT = 2.0**-30
+"""Part of a period in which a motion changes by rounding errors of its derivatives."""
 
 
 def reduction_of(stepper: Integrator, t: float, parameters: Array) -> Reduction:
@@ -55,15 +55,16 @@ class ConstraintManifold(Reduction):
         try:
             return projected(self.stepper, *self.free.normalised(q, p), self.t, self.parameters)[:2]
         except StateError as error:
-            raise EventError(str(error)) from error
+            raise OrbitError(str(error)) from error
 
-    def shift(self, state: Array, parameter: int) -> Array:
-        """Return the least change (2m,) of a state by a parameter that the constraints contain, -G^+ g_lambda."""
-        (q, p), value = np.split(state, 2), self.parameters[parameter]
-        step = DIFFERENCE * (abs(value) or 1.0) * (np.arange(len(self.parameters)) == parameter)
-        less, more = (constraint_values(self.stepper, q, p, self.t, self.parameters + by)[0, 0] for by in (-step, step))
-        by_parameter = (more - less)[: self.count] / (2.0 * step[parameter])
-        return np.append(-np.linalg.pinv(self._jacobian(q)) @ by_parameter, np.zeros(len(p)))
+    def shift(self, state: Array, parameter: int, period: float) -> Array:
+        """Return the change (2m,) of a state by a parameter, -M^-1 G^T (G M^-1 G^T)^-1 g_lambda of positions.
+
+        It is the derivative of the end of a step without duration, whose end is on the constraints, by the parameter.
+        """
+        (q, p), seed = np.split(state, 2), np.eye(self.stepper._input_size)[[len(state) + parameter]]
+        ends = self.stepper._products(q, p, MOMENT * period, self.t, self.parameters, None, seed)
+        return np.append(ends[0, : len(q)], np.zeros(len(p)))
 
     def _jacobian(self, q: Array) -> Array:
         """Return G."""

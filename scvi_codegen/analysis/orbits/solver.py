@@ -55,7 +55,6 @@ from scvi_codegen.runs.states.times import steps_within
 from scvi_codegen.runs.states.validation import Array, Parameters, check_inputs_given
 from scvi_codegen.runs.stepper import STEPPER, Stepper
 from scvi_codegen.runs.stepping.features import require
-from scvi_codegen.runs.stepping.projection import consistent
 from scvi_codegen.runs.stepping.step_plan import ErrorControl, Fixed
 from scvi_codegen.runs.trajectory import Trajectory
 
@@ -263,8 +262,8 @@ def periodic_orbit(
 
     Args:
         stepper: the compiled stepper.
-        q, p, velocity: (m,) initial guess of a state on the orbit, with one of p and velocity. Rotations must close as
-            rotations, not as quaternions.
+        q, p, velocity: (m,) initial guess of a state on the orbit, with one of p and velocity, which is moved onto the
+            constraints. Rotations must close as rotations, not as quaternions.
         period: initial guess of the period, positive.
         steps: number of equal steps per period, instead of adaptive ones.
         h: instead of ``steps``, the largest step size for the initial period; its sign is ignored.
@@ -286,8 +285,8 @@ def periodic_orbit(
         A :class:`PeriodicOrbit`.
 
     Raises:
-        OrbitError: if the iteration does not converge, converges to an equilibrium or to another energy, or if the
-            system is not periodic in time with this period.
+        OrbitError: if the iteration does not converge, converges to an equilibrium or to another energy, if there are
+            no constrained positions near q, or if the system is not periodic in time with this period.
         MethodError: if time is transformed, the stepper has nonholonomic constraints, an energy is prescribed with
             forces, or the period of a time-dependent system is free.
         StateError: if a shape, name or number is invalid, an input is not set, or ``reversor`` is no symmetry.
@@ -309,8 +308,6 @@ def periodic_orbit(
     t, values = checked_number(t, "the time t"), stepper._parameters(parameters)
     momenta = stepper._initial_momenta(q, p, velocity, t, values)
     start = np.concatenate(stepper._states.pair(q, momenta))
-    if len(stepper.interface.constraints) > stepper.interface.masked:
-        start = np.concatenate(consistent(stepper, q, momenta, t, values))
     search = OrbitSearch.at(
         stepper,
         start[: stepper.dimension],
@@ -325,6 +322,7 @@ def periodic_orbit(
         options=options,
     )
     guess = np.append(start, search.period)
+    guess = search.moved(guess, 0.0 * guess)
     if reversor is not None:
         search, guess = search.symmetric(reversor, start, lambda _: guess)
     return search.orbit(guess, bound_of(sequence, error))
@@ -696,7 +694,7 @@ class OrbitSearch:
         for shortened in 0.5 ** np.arange(MOST_HALVINGS):
             if not self.period / FREEDOM <= z[-1] - shortened * change[-1] <= self.period * FREEDOM:
                 continue
-            with suppress(EventError, StepFailedError):
+            with suppress(EventError, OrbitError, StepFailedError):
                 trial = self.moved(z, -shortened * into @ change)
                 at = self.closing_equations(trial)
                 less = np.linalg.norm(inverse @ at.defects / units) < (1.0 - shortened / 4.0) * size
@@ -840,7 +838,7 @@ class OrbitSearch:
         tangents[:size, : len(start)] = inward.T
         if self.varied is not None:
             tangents[-1, len(start) + self.varied] = 1.0
-            shift = tangents[-1, : len(start)] = space.shift(start, self.varied)
+            shift = tangents[-1, : len(start)] = space.shift(start, self.varied, period)
         tangents[size, -2] = ends[0]
         tangents[size + 1, -2] = 1.0
         variations = np.zeros((last - first, len(tangents)))

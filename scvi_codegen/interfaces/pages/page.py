@@ -22,6 +22,7 @@ import numpy as np
 import sympy
 
 from scvi_codegen.analysis.orbits.family import Family
+from scvi_codegen.analysis.orbits.solver import ERROR, PeriodicOrbit
 from scvi_codegen.codegen.rendering.environment import template_environment
 from scvi_codegen.codegen.rendering.source import Interface, Source
 from scvi_codegen.common.atomic import write_text
@@ -42,8 +43,8 @@ from scvi_codegen.interfaces.models.model_files.page_section import (
 from scvi_codegen.interfaces.models.options import FURTHER
 from scvi_codegen.interfaces.models.packages.example import absolute_tolerances_of, check_example
 from scvi_codegen.interfaces.models.packages.package import integrator_of
-from scvi_codegen.interfaces.pages.orbits import begun_at, described
 from scvi_codegen.interfaces.pages.webassembly import LICENCES, check_compiler, webassembly
+from scvi_codegen.interfaces.pictures.family import sizes_of
 from scvi_codegen.interfaces.pictures.recognition import shape_of
 from scvi_codegen.interfaces.pictures.shape import DrawnSystem, shape_of_picture
 from scvi_codegen.runs.stepping.array_interface import read_arrays
@@ -80,6 +81,8 @@ LONG_NUMBER = re.compile(r"\d{12}")
 """Numbers of robots from files, with which a Lagrangian is not shown."""
 SECONDS = 30
 """Duration of the span of a model at the speed that a page begins with, unless time is in seconds or so."""
+SECONDS_OF_ORBIT, STEPS_OF_ORBIT = 6, 64
+"""Duration of the first orbit of a family, and its least number of adaptive steps, by default."""
 STEPS = 1000
 """Default number of steps of the span, from which the speed follows, of step sizes far from seconds."""
 HEIGHT = 760
@@ -133,22 +136,20 @@ def page(
 
     Raises:
         MethodError: without a step size or tolerance, and for inputs that are tables instead of numbers.
-        StateError: for a range of a parameter that does not contain its value, an unknown variable of a plot, and a
-            family of another system.
+        StateError: for a parameter outside of its range, an unknown variable of a plot, and another system's family.
         ModelFileError: for an invalid model file, unknown sliders and values of the wrong form.
         ArgumentError: for unknown arguments, and those of a motion beside a model.
         BuildError: without the extra ``compiler``, or if compilation fails.
     """
-    arguments = {"ranges": ranges, "speed": speed, "plots": plots, "picture": picture}
+    arguments = {"ranges": ranges, "speed": speed, "plots": plots, "picture": picture, "family": family}
     settings = {name: value for name, value in arguments.items() if value is not None}
     if SYSTEM_OR_ARRAYS.accepts(model):
-        first = {} if family is None else {"q": family[0].q, "p": family[0].p}
-        model = _model_of(model, first | motion)
+        model = _model_of(model, motion if family is None else {"q": family[0].q, "p": family[0].p, **motion})
     elif motion:
         raise ArgumentError(f"page() takes {', '.join(motion)} for a system alone: change them in the model")
     if isinstance(model, Model):
-        return page_of(model, document_of(model), settings, family)
-    return page_of(load_model(model), document_in(model), settings, family)
+        return page_of(model, document_of(model), settings)
+    return page_of(load_model(model), document_in(model), settings)
 
 
 def _model_of(system: Any, motion: Mapping[str, Any]) -> Model:
@@ -166,20 +167,17 @@ def _model_of(system: Any, motion: Mapping[str, Any]) -> Model:
     return Model(**arguments)
 
 
-def page_of(
-    model: Model, document: Mapping[str, Any], settings: Mapping[str, Any], family: Family | None = None
-) -> Page:
+def page_of(model: Model, document: Mapping[str, Any], settings: Mapping[str, Any]) -> Page:
     """Return the page of a model whose formulas are those of a document. Raises as :func:`page`.
 
     Args:
         model: with the settings of its file.
         document: sections of the file.
-        settings: ranges, speed, plots and the picture, which replace those of the file.
-        family: periodic orbits along which a slider moves.
+        settings: ranges, speed, plots and the picture, which replace those of the file, and the family of orbits.
     """
     settings = dict(settings)
-    if family is not None:
-        model = begun_at(model, family)
+    if (family := settings.pop("family", None)) is not None:
+        model = _begun_at(model, family)
     model = replace(model, picture=settings.pop("picture", model.picture))
     ranges = {**model.page.get("ranges", {}), **settings.get("ranges", {})}
     model = replace(model, page={**model.page, **settings, "ranges": ranges})
@@ -193,6 +191,40 @@ def page_of(
     result = Page(model.with_known_sizes() if of_fixed_sizes else model, document, adaptive=adaptive, family=family)
     result.html  # noqa: B018  (reports errors here)
     return result
+
+
+def _begun_at(model: Model, family: Family) -> Model:
+    """Return a model that begins at the first orbit of a family, with its speed and the range of its parameter."""
+    first, page, name = family[0], dict(model.page), model.system.name
+    if first.stepper.interface.system != name:
+        raise StateError(f"the family is one of '{first.stepper.interface.system}', not of '{name}'")
+    if family.parameter is not None:
+        values = [*family.values.tolist(), model.parameters[family.parameter]]
+        page["ranges"] = {family.parameter: (min(values), max(values)), **page.get("ranges", {})}
+    page.setdefault("speed", float(f"{first.period / SECONDS_OF_ORBIT:.1g}"))
+    if model.h is None and model.tolerance is None:
+        model = replace(model, tolerance=ERROR, error=None, max_step=first.period / STEPS_OF_ORBIT)
+    return replace(model, q=first.q, p=first.p, velocity=None, t=first.t, page=page)
+
+
+def _orbits(family: Family, *, from_momenta: bool) -> dict[str, Any]:
+    """Return the orbits and bifurcations of a family in their order, as the scripts of the page read them."""
+    places = [(k, "", orbit) for k, orbit in enumerate(family)]
+    places += [(found.after, found.kind, found.orbit) for found in family.bifurcations]
+    _, kinds, orbits = zip(*sorted(places, key=lambda place: place[0]), strict=True)  # stable
+    name, sizes = sizes_of(orbits)
+
+    def entry(kind: str, orbit: PeriodicOrbit, moduli: Any) -> dict[str, Any]:
+        q, p, names, parameters = orbit.q, orbit.p, orbit.stepper.parameters, orbit.parameters
+        v = p if from_momenta else np.asarray(orbit.stepper.velocity(q, p, orbit.t, parameters))
+        return {
+            "q": q.tolist(), "p": p.tolist(), "v": v.tolist(), "value": family.value_of(orbit), "period": orbit.period,
+            "energy": orbit.energy, "parameters": dict(zip(names, parameters.tolist(), strict=False)),
+            "sizes": moduli.tolist(), "stability": "stable" if orbit.stable else "unstable", "bifurcation": kind,
+        }  # fmt: skip
+
+    entries = [*map(entry, kinds, orbits, sizes)]
+    return {"value": family.parameter or "energy", "sizes": name, "orbits": entries}
 
 
 def _check(model: Model, ranges: Mapping[str, tuple[float, float]]) -> None:
@@ -390,7 +422,7 @@ def _description(shown: Page, interface: Interface, *, initial: bool) -> dict[st
     """Return what the scripts of the page read."""
     model, adaptive = shown.model, shown.adaptive
     ranges = model.page.get("ranges", {})
-    orbits = None if shown.family is None else described(shown.family, from_momenta=starts_from_momenta(model))
+    orbits = None if shown.family is None else _orbits(shown.family, from_momenta=starts_from_momenta(model))
     q, v = (orbits["orbits"][0][name] for name in "qv") if orbits else (_flat(model.q), _rates(model))
     system = _drawn_system(model, interface)
     shape = (shape_of_picture(system, model.picture) if model.picture else shape_of(system)).to_data()

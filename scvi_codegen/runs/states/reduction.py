@@ -81,7 +81,7 @@ class Reduction:
         """Return ``outward`` at a state near another one, whose coordinates they share."""
         return self.outward(*np.split(state, 2))
 
-    def shift(self, state: Array, parameter: int) -> Array:
+    def shift(self, state: Array, parameter: int, period: float) -> Array:
         """Return the change (2m,) of a state by a parameter, which is none."""
         return np.zeros(2 * self.dimension)
 

@@ -35,9 +35,7 @@ NAMES, COUNT = {"vary": "parameter", "stride": "step"}, 50
 @click.option("--plot", type=click.Path(), metavar="FILE", help="Plot (.png, .svg, .pdf).")
 @click.option("--page", type=click.Path(), metavar="FILE", help="Page with a slider along the family (.html).")
 @reporting
-def family(
-    model_name: str, resume: str | None, output: str | None, plot: str | None, page: str | None, **choices: Any
-) -> None:
+def family(model_name: str, resume: str | None, output: str | None, plot: str | None, **choices: Any) -> None:
     """Continue a family of periodic orbits of MODEL, and locate its bifurcations.
 
     The family begins at an orbit near the initial state of MODEL (--period), or at the equilibrium near its positions
@@ -48,6 +46,7 @@ def family(
       scvi-codegen family planar-pendulum --q 0 --amplitude 0.1 --count 20 --plot pendulum.png
       scvi-codegen family henon-heiles --q 0,0.9 --amplitude 0.01 --until 'energy > 0.2' -o family.npz
     """
+    page = choices.pop("page")
     for target in (output, plot, page):
         if target is not None:
             check_writable(Path(target), "'-o', '--plot', '--page'")
@@ -59,12 +58,8 @@ def family(
     with progress_bar(model.family.get("count", COUNT), "orbits") as progress:
         members = _members(model, resume, progress)
     tell(_described(members), **_numbers(members))
-    writers: tuple[Callable[[str], object], ...] = (
-        members.save,
-        members.plot,
-        lambda path: page_of(model, document_of(model), {}, members).save(path),
-    )
-    for target, write in zip((output, plot, page), writers, strict=True):
+    moving = page_of(model, document_of(model), {"family": members}) if page else members
+    for target, write in ((output, members.save), (plot, members.plot), (page, moving.save)):
         if target is not None:
             write(target)
             tell(f"wrote {target}")
