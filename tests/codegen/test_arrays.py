@@ -114,3 +114,15 @@ def test_terms_of_the_first_index_are_computed_once_per_pair() -> None:
     assert code[outer:inner].count("] = X[") == 3
     assert code[inner:end].count("] = X[") == 3
     assert code[inner:end].count("F[start_") == 6
+
+
+@pytest.mark.parametrize(("mass", "is_equal"), [("g", 1), ("m[i]", 0)])
+def test_explicit_steps_store_opposite_forces_once_and_know_equal_masses(mass: str, is_equal: int) -> None:
+    lagrangian = f"sum(i in N, {mass}*q_dot[i]**2/2) - sum(i in N periodic, (q[i+1] - q[i])**4)"
+    parameters = {"m[N]": 1, "g": 2}
+    system = either_system(name="ring", coordinates=["q[N]"], lagrangian=lagrangian, parameters=parameters)
+    program = lower_arrays(system, as_method("stoermer-verlet"), prefix="arrays", solver="fixed-point")
+    code = render_arrays(program, control_of(program)).code
+    assert "lanes values[1][CHUNK];" in code
+    assert "- values[0][at - part_0.first] + values[0][at - part_1.first];" in code
+    assert f"EQUAL_MASSES = {is_equal} " in code

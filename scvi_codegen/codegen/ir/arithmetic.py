@@ -363,6 +363,9 @@ def _linearise(graph: _Graph, roots: Sequence[int]) -> tuple[tuple[Expression, .
             texts[k], depths[k] = content, 0
             continue
         expression = Operation(content[0], tuple(texts[operand] for operand in content[1]))
+        match expression:
+            case Operation("neg", (Operation("-", (Load() as a, Load() as b)),)):  # -(a - b)
+                expression = Operation("-", (b, a))
         texts[k], depths[k] = expression, 1 + max(depths[operand] for operand in content[1])
         if uses[k] > 1 or depths[k] > DEEPEST_EXPRESSION:
             texts[k], depths[k] = Load("w", len(temporaries)), 0

@@ -42,7 +42,7 @@ static void treat_rows(const sweep *of, section rows, int behind)
     const coordinate_array *array = &of->array[k];
     const long long inner = (array->end - array->first) / of->rows;
     const section here = {array->first + rows.first * inner, array->first + rows.end * inner};
-    continue_section(of->run, of->work, here, of->then);
+    continue_section(of->run, of->work, here, *of->then);
   }
 }
 

@@ -8,7 +8,7 @@
  * in a state, so that many steps are checked at once; if one fails, they are repeated one by one. With PLAIN_SUMS
  * increments are added to the state at once, and their rounding errors are dropped; the kicks at the end of a step and
  * at the start of the next one are one where steps are checked together. Requires: arrays.h, add_forces, LEAPS,
- * TOGETHER, the tables; with ROWS array_rows.h. */
+ * TOGETHER, EQUAL_MASSES, the tables; with ROWS array_rows.h. */
 
 /* Workspace: positions of the next kick, forces at the end of a step; the state before steps that are checked. */
 typedef struct {
@@ -49,17 +49,6 @@ static inline int ends_with_a_kick(void)
   return KICK[0] != 0.0 && KICK[LEAPS - 1] != 0.0 && DRIFT[LEAPS - 1] == 0.0;
 }
 
-#ifndef PLAIN_SUMS
-/* Rounded sum of x and its increment, which becomes the rounding error (two-sum; Knuth, TAOCP vol. 2, sec. 4.2.2). */
-static inline void add_increment(double *x, double *increment)
-{
-  const double sum = *x + *increment, part = sum - *x;
-  *increment = (*x - (sum - part)) + (*increment - part);
-  *x = sum;
-}
-
-#endif
-
 /* Continues `count` coordinates. Forces that were used in both steps become 0 for the next ones. */
 static inline __attribute__((always_inline)) void continue_coordinates(double *restrict q, double *restrict p,
     double *restrict dq, double *restrict dp, double *restrict X, double *restrict F,
@@ -73,7 +62,7 @@ static inline __attribute__((always_inline)) void continue_coordinates(double *r
     if (by.starts)
       F[i] = 0.0;
     if (by.moves)
-      q[i] += by.drift * (inverse_mass[i] * p[i]);
+      q[i] += by.drift * (inverse_mass[EQUAL_MASSES ? 0 : i] * p[i]);
   }
 #else
   for (long long i = 0; i < count; i++) {
@@ -91,7 +80,7 @@ static inline __attribute__((always_inline)) void continue_coordinates(double *r
     if (by.ends || by.starts)
       dp[i] = more_p;
     if (by.moves) {
-      more_q += by.drift * (inverse_mass[i] * (moving + more_p));
+      more_q += by.drift * (inverse_mass[EQUAL_MASSES ? 0 : i] * (moving + more_p));
       if (by.arrives) {
         add_increment(&at, &more_q);
         q[i] = at;
@@ -104,38 +93,33 @@ static inline __attribute__((always_inline)) void continue_coordinates(double *r
 }
 
 /* Continues the coordinates of a section; the flags are constants of each loop. */
-static void continue_section(const run_memory *run, const work_arrays *work, section here, const continuation *by)
+static void continue_section(const run_memory *run, const work_arrays *work, section here, continuation by)
 {
   for (long long first = here.first, count; first < here.end; first += count) {
     const double *masses = run->inverse_mass + (work->equal_masses ? 0 : first);
     count = here.end - first < SECTION ? here.end - first : SECTION;
 #define CONTINUE(ends, starts, moves, arrives)                                                                      \
   continue_coordinates(run->q + first, run->p + first, run->carry_q + first, run->carry_p + first, work->X + first, \
-      work->F + first, masses, count, (continuation){ends, starts, moves, arrives, by->end, by->start, by->drift})
-    if ((LEAPS > 2 || !ends_with_a_kick()) && by->moves && !by->arrives) {
-      if (by->ends)
+      work->F + first, masses, count, (continuation){ends, starts, moves, arrives, by.end, by.start, by.drift})
+    if ((LEAPS > 2 || !ends_with_a_kick()) && by.moves && !by.arrives) {
+      if (by.ends)
         CONTINUE(1, 1, 1, 0);
-      else if (by->starts)
+      else if (by.starts)
         CONTINUE(0, 1, 1, 0);
       else
         CONTINUE(0, 0, 1, 0);
-    } else if (by->ends && by->starts)
+    } else if (by.ends && by.starts)
       CONTINUE(1, 1, 1, 1);
-    else if (by->ends && by->moves)
+    else if (by.ends && by.moves)
       CONTINUE(1, 0, 1, 1);
-    else if (by->ends)
+    else if (by.ends)
       CONTINUE(1, 0, 0, 0);
-    else if (by->starts)
+    else if (by.starts)
       CONTINUE(0, 1, 1, 1);
     else
       CONTINUE(0, 0, 1, 1);
 #undef CONTINUE
   }
-}
-
-static void continue_own(const run_memory *run, const work_arrays *work, continuation by)
-{
-  continue_section(run, work, mine(run, work->n), &by);
 }
 
 #ifdef ROWS
@@ -151,20 +135,19 @@ static void kick(const run_memory *run, const problem *arrays, const work_arrays
     return;
 #endif
   add_forces(run, arrays, X, t, by, F);
-  continue_own(run, work, then);
+  continue_section(run, work, mine(run, work->n), then);
 }
 
 /* The first drift of a step, with the first kick if its forces are known. */
 static continuation starting(double h, int ends, int starts)
 {
-  const continuation by = {.ends = ends,
+  return (continuation){.ends = ends,
       .starts = starts,
       .moves = 1,
       .arrives = LEAPS == 2 && ends_with_a_kick(),
       .end = h * KICK[LEAPS - 1],
       .start = h * KICK[0],
       .drift = h * DRIFT[0]};
-  return by;
 }
 
 /* Performs a step; `continues` from a former one, and into a next one. */
@@ -175,7 +158,7 @@ static void take_step(run_memory *run, const problem *arrays, const work_arrays 
   if (!kicks_end)
     wait_at_barrier(run); /* other threads may continue coordinates of the former step */
   if (!continues && (run->guess || !kicks_end))
-    continue_own(run, work, starting(h, 0, kicks_end));
+    continue_section(run, work, mine(run, work->n), starting(h, 0, kicks_end));
   else if (!continues)
     kick(run, arrays, work, run->q, run->t, h * KICK[0], INCREMENTS(run), starting(h, 0, 0));
   for (int k = 1; k < last + !kicks_end; k++) {
@@ -216,12 +199,9 @@ static int is_state_finite(const run_memory *run, long long n)
   wait_at_barrier(run);
   begin_sums(&all, run, n);
   while (next_block(&all)) {
-    int faults = 0;
-    for (long long i = all.here.first; i < all.here.end; i++) {
-      faults |= !is_finite(run->q[i]);
-      faults |= !is_finite(run->p[i]);
-    }
-    add_block(&all, faults, 0.0);
+    const section here = all.here;
+    const int count = (int)(here.end - here.first);
+    add_block(&all, !(all_finite(run->q + here.first, count) && all_finite(run->p + here.first, count)), 0.0);
   }
   wait_at_barrier(run);
   return sum_of(&all, 0) == 0.0;

@@ -250,8 +250,11 @@ static int perform_step(run_memory *run, const problem *arrays, const work_array
     status = constrained_substep(&of, run->h * PART[k], run->t + run->h * PART_END[k]);
   if (status != OK)
     return status;
-  add_all(run->q, of.work->dq, run->carry_q, n);
-  add_all(run->p, of.work->dp, run->carry_p, n);
+  for (long long i = 0; i < n; i++) {
+    run->carry_q[i] = of.work->dq[i], run->carry_p[i] = of.work->dp[i];
+    add_increment(&run->q[i], &run->carry_q[i]);
+    add_increment(&run->p[i], &run->carry_p[i]);
+  }
   run->guess = 1;
   return OK;
 }

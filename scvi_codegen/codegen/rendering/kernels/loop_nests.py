@@ -17,7 +17,7 @@ from dataclasses import replace
 from enum import Enum, auto
 from typing import TypeAlias
 
-from scvi_codegen.codegen.ir.kernel import RolledKernel
+from scvi_codegen.codegen.ir.kernel import Expression, Operation, RolledKernel
 from scvi_codegen.codegen.ir.program import Layout
 from scvi_codegen.codegen.rendering.text import wrapped, wrapped_comment
 from scvi_codegen.systems.formulas.indices import Access, Array, Loop, Place, Size
@@ -140,6 +140,14 @@ def describing_function(layout: Layout, name: str, kind: str, initialisers: Sequ
     return function_of_sizes(layout, f"static void describe_{name}(const problem *arrays, {kind} *all)", lines)
 
 
+def _signed(results: Sequence[Expression]) -> tuple[list[int], list[tuple[str, int]]]:
+    """Return the results that are stored, and sign and number there of each: forces of a term are opposite in pairs."""
+    terms = [(r.operands[0], True) if isinstance(r, Operation) and r.operator == "neg" else (r, False) for r in results]
+    stored = {terms[k][0]: k for k in sorted(range(len(terms)), key=lambda k: not terms[k][1])}  # without sign, if any
+    signs = ["-" if negative != terms[stored[term]][1] else "+" for term, negative in terms]
+    return [*stored.values()], [(sign, [*stored].index(term)) for sign, (term, _) in zip(signs, terms, strict=True)]
+
+
 class Nest:
     """Loops of a kernel, with arguments and parameters assigned in the outermost loop in which they are known.
 
@@ -171,6 +179,7 @@ class Nest:
         self.levels = {loop.index: depth for depth, loop in enumerate(rolled.loops, 1)}
         self.loops = {loop.index: loop for loop in rolled.loops}
         self.scalars = len(layout.parameters)
+        self.stored, self.signed = _signed(rolled.kernel.results)
 
     def read(self, k: int, slot: Access) -> str:
         """Return the assignment of an argument: an entry of the state, or of a direction."""
@@ -242,7 +251,7 @@ class Nest:
             for offset in offsets
         ]
         if self.chunked:
-            lines += [*self._part_passed_over(loop), f"lanes values[{len(self.rolled.writes)}][CHUNK];"]
+            lines += [*self._part_passed_over(loop), f"lanes values[{len(self.stored)}][CHUNK];"]
         lines += _loop(loop, "begin", "end", inner)
         if loop.near:
             lines += _loop(loop, "begin", "end", [line for of_target in behind for line in of_target])
@@ -278,19 +287,21 @@ class Nest:
 
         At both ends they are added target by target, so that the sums of an element have the order of separate loops.
         """
-        lines, row, value = [], "", ""
+        lines, ends, row, value = [], [], "", ""
         for k in targets:
             access = self.rolled.writes[k]
             shift = self.index(access.places[-1]).removeprefix(f"index_{loop.index}")
             lines.append(f"const section part_{k} = {{begin{shift}, end{shift}}};")
-            value += f" + values[{k}][at - part_{k}.first]"
+            sign, number = self.signed[k]
+            value += f" {sign} values[{number}][at - part_{k}.first]"
+            ends.append(f"add_ends(row_{targets[0]}, values[{number}], {sign}1.0, part_{k}, common_{targets[0]});")
             row = self.place_of(replace(access, places=(*access.places[:-1], Place())))
         common = f"part_{targets[0]}"
         for k in targets[1:]:
             common = f"overlap({common}, part_{k})"
         lines.append(f"const section common_{targets[0]} = {common};")
         lines.append(f"lanes *restrict row_{targets[0]} = F + {row};")
-        lines += [f"add_ends(row_{targets[0]}, values[{k}], part_{k}, common_{targets[0]});" for k in targets]
+        lines += ends
         head = f"for (long long at = common_{targets[0]}.first; at < common_{targets[0]}.end; at++)"
         return [*lines, head, f"  row_{targets[0]}[at] = row_{targets[0]}[at]{value};"]
 

@@ -126,6 +126,7 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
         "most_stages": max((len(_stages(convolutions)) for convolutions in program.layout.sums), default=0),
         "force_names": [rolled.kernel.name for rolled in loops.forces],
         "energy_names": [(scalar.name, _has_sums(rolled)) for rolled, scalar in terms],
+        "equal_masses": [*map(_is_uniform, loops.masses)] == [True],
         "mass_names": [rolled.kernel.name for rolled in loops.masses],
         "scalar_kernels": [kernel_text(kernel, DOUBLE) for kernel in scalars],
         "inverse_roots": inverse_roots(scalars),
@@ -158,6 +159,12 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
         ),
         **_constraint_context(program, constrained),
     }
+
+
+def _is_uniform(mass: RolledKernel) -> bool:
+    """Return whether a mass adds the same number once to every element that it adds to."""
+    places = mass.writes[0].places
+    return not mass.constants and len(mass.loops) == len(places) and not any(place.table for place in places)
 
 
 def _appended_arrays(program: ArrayProgram) -> Iterator[str]:
@@ -263,8 +270,8 @@ def _force_text(program: ArrayProgram, rolled: RolledKernel) -> str:
     call = f"{rolled.kernel.name}(u, t, parameters, value);"
     if nest.chunked:
         here = f"[{counter(rolled.loops[-1])} - begin]"
-        innermost = [call, *(f"values[{k}]{here} = by * value[{k}];" for k in slots)]
-        behind = [added(k, f"values[{k}]{here}") for k in slots]
+        innermost = [call, *(f"values[{n}]{here} = by * value[{k}];" for n, k in enumerate(nest.stored))]
+        behind = [added(k, f"{sign.strip('+')}values[{n}]{here}") for k, (sign, n) in enumerate(nest.signed)]
     else:
         innermost = [call, *(line for k in slots for line in added(k, f"{'by * ' * explicit}value[{k}]"))]
         behind = []
