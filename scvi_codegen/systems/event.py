@@ -25,8 +25,8 @@ COMPARISON = re.compile(r"(>=|<=|>|<)")
 LOOPS = re.compile(r"\s+for\b.*", re.DOTALL)
 UNDEFINED = "the event function {function} is not finite in the step from t = {t:.17g}"
 UNDEFINED_CHANGE = (
-    "the {changed} after the event {function} is not finite in the step from t = {t:.17g}: a formula of then= or "
-    "restitution is undefined at the state of the event; change it, or limit the event by where="
+    "the {changed} after the event {function} is not finite in the step from t = {t:.17g}: at the state of the event a "
+    "formula of then= is undefined, or its restitution is not from 0 to 1; change it, or limit the event by where="
 )
 ACCUMULATED = (
     "the crossings of the terminal event {function} accumulate at t = {t:.17g}: the run starts at its zero and "

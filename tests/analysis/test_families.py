@@ -62,6 +62,16 @@ def test_periods_of_a_pendulum_are_elliptic_integrals(pendulum):
 
 
 @pytest.mark.second
+def test_a_family_of_one_orbit_goes_on_from_its_file(pendulum, tmp_path):
+    start = sc.equilibrium(pendulum, [0.0])
+    sc.family(pendulum, start, amplitude=0.01, step=0.2, count=1).save(tmp_path / "one.npz")
+    members = sc.Family.load(pendulum, tmp_path / "one.npz").more(3)
+    assert members.ended == "it has as many orbits as were asked for"
+    whole = sc.family(pendulum, start, amplitude=0.01, step=0.2, count=4)
+    assert members.periods.tolist() == whole.periods.tolist()
+
+
+@pytest.mark.second
 def test_family_ends_where_rounding_errors_hide_the_orbit(pendulum):
     """Near the separatrix runs of a period do not close: they pass the upper equilibrium."""
     family = sc.family(pendulum, sc.equilibrium(pendulum, [0.0]), amplitude=0.1, step=1.0)
@@ -223,7 +233,7 @@ def test_families_of_a_rod_are_elliptic_integrals():
         sc.family(rod, start, parameter="d", fixed=["x"], **at),
     ]
     for orbit in (orbit for family in families for orbit in family):
-        m, g, length = orbit.parameters[:3] + [0, 0, orbit.parameters[3]]
+        m, g, length = orbit.parameters[:3] + np.array([0, 0, orbit.parameters[3]])
         expected = 4 * ellipk((orbit.energy / (m * g * length) + 1) / 2) * np.sqrt(length / g)
         assert orbit.period == pytest.approx(expected, rel=1e-11)
         assert np.hypot(*orbit.q) == pytest.approx(length, rel=1e-15)

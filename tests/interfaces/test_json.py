@@ -171,6 +171,8 @@ def test_json_of_families_is_that_of_the_model_file_and_of_a_file_that_continues
         [orbit["period"] for orbit in whole["orbits"]], rel=1e-9
     )
     assert again["orbits"][-1]["period"] == pytest.approx(4 * ellipk((1 + again["orbits"][-1]["energy"]) / 2), rel=1e-9)
+    refused = invoke("family", "own.toml", "--method", "svi:4", "--resume", "half.npz", "--vary", "g", status=2).output
+    assert "--vary is not allowed with --resume" in refused
     for wrong, message in (
         ("until = 3", r"[family] until must be a text, not 3"),
         ("form = 1", "unknown key 'form'"),

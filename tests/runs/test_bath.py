@@ -497,6 +497,11 @@ def test_what_a_heat_bath_excludes_is_refused_by_name(tmp_path):
     system = sc.LagrangianSystem.from_text("well", **WELL)
     with pytest.raises(sc.MethodError, match="precision='double-double' is not available with a heat bath"):
         sc.compile_stepper(system, "svi:2", precision="double-double")
+    for start in (well.integrate, well.start):
+        with pytest.raises(sc.StateError, match=r"of 'well' acts forward in time: h = -0\.1; give h > 0"):
+            start(*state, h=-0.1, **{"steps": 3} if start == well.integrate else {})
+    with pytest.raises(sc.MethodError, match=r"adaptive step size .* in a heat bath"):
+        sc.solve_ivp(well, (0.0, 1.0), [1.0, 0.0])
 
 
 @pytest.mark.second

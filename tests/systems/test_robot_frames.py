@@ -66,3 +66,16 @@ def test_frames_of_urdf_links_follow_and_belong_to_ensembles(tmp_path):
     frame = runs.frame("d")
     assert frame.position[..., 0] + 1j * frame.position[..., 1] == pytest.approx(expected)
     assert frame.velocity[..., 0] + 1j * frame.velocity[..., 1] == pytest.approx(slope * v)
+
+
+def test_frames_of_bodies_that_only_slide(tmp_path):
+    file = tmp_path / "slider.xml"
+    body = (
+        '<body name="a" pos="1 0 0" euler="0 0 90"><joint name="q" type="slide" axis="1 0 0"/><geom size=".1"/></body>'
+    )
+    file.write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+    stepper = sc.compile_stepper(sc.LagrangianSystem.from_mjcf(file), "svi:2")
+    frame = stepper.integrate([0.5], velocity=[2.0], h=0.1, steps=2).frame("a")
+    assert frame.position[-1] == pytest.approx([1.0, 0.9, 0.0])
+    assert frame.velocity[-1] == pytest.approx([0.0, 2.0, 0.0])
+    assert frame.rotation[-1] == pytest.approx(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]), abs=1e-15)

@@ -26,6 +26,7 @@ from scvi_codegen.runs.compiler import compile_stepper, second_stepper
 from scvi_codegen.runs.results.dense_output import times_of_run
 from scvi_codegen.runs.states.validation import Array, States
 from scvi_codegen.runs.stepper import Stepper
+from scvi_codegen.runs.stepping.features import require
 from scvi_codegen.runs.stepping.step_plan import ErrorControl
 from scvi_codegen.runs.trajectory import Trajectory
 from scvi_codegen.systems.event import EventLike
@@ -229,6 +230,8 @@ def _plan(
     ``motion``: initial state (q, p), first and last time. Fixed steps fill the span.
     """
     q, p, start, end = motion
+    if request.h is None and stepper.interface.temperature is not None:
+        require(stepper, "adaptive")
     met: Callable[[Trajectory], str] = lambda run: ""  # noqa: E731
     if request.error is not None:
         return {"t_end": end, "error": request.error}, _unconfirmed

@@ -257,12 +257,14 @@ class Family:
                 f"the orbits of '{os.fspath(path)}' are none of this '{stepper.title}', but of another one"
             )
         saved = zip(arrays["kinds"], arrays["bifurcations"], others, strict=True)
+        last = replace(last, **settings["last"])
+        first = first if len(orbits) > 1 else last  # from which no family returns to it
         return cls(
             orbits=tuple(orbits),
             bifurcations=tuple(Bifurcation(str(kind), int(k), at, continuation) for kind, k, at in saved),
             ended=settings["ended"],
             _first=first,
-            _last=replace(last, **settings["last"]),
+            _last=last,
             _continuation=continuation,
         )
 

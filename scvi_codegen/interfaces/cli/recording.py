@@ -4,7 +4,7 @@ import math
 import os
 import shlex
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -35,6 +35,7 @@ MAX_STATES = 10_000
 """Largest number of states used to summarise what was conserved."""
 WITH_RESUME = {"resume", "checkpoint", *(option.name for option in OPTIONS if option.determines == DURATION)}
 """Options that are allowed with ``--resume``."""
+OF_RUN = "the folder defines the run; only --steps or --span may extend it"
 
 
 def is_run_folder(output: str) -> bool:
@@ -53,15 +54,13 @@ def check_output(output: str, *, ensemble: bool = False) -> None:
     check_writable(Path(output), "'-o'")
 
 
-def check_resumed(context: click.Context) -> None:
-    """Reject options that would change the run that ``--resume`` continues."""
+def check_resumed(context: click.Context, allowed: Container[str] = WITH_RESUME, defines: str = OF_RUN) -> None:
+    """Reject options that would change what ``--resume`` continues."""
     for name in context.params:
         passed = context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT
-        if passed and name not in WITH_RESUME:
+        if passed and name not in allowed:
             word = "MODEL" if name == "model_name" else f"--{name.replace('_', '-')}"
-            raise click.UsageError(
-                f"{word} is not allowed with --resume: the folder defines the run; only --steps or --span may extend it"
-            )
+            raise click.UsageError(f"{word} is not allowed with --resume: {defines}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

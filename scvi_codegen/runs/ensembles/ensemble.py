@@ -236,7 +236,7 @@ class Ensemble:
         noise = Noise.checked(stepper, settings.seed, settings.metropolis, settings.trajectory, settings.inputs)
         start: dict[str, Any] = {"t0": t0, "q": positions, "p": momenta, "parameters": values, "noise": noise}
         for member in np.unique(values, axis=0) if stepper.interface.temperature is not None else ():
-            check_strengths(stepper, t0, member)
+            check_strengths(stepper, t0, settings.h, member)
         ensemble = cls(stepper=stepper, settings=settings, **start, inputs=inputs, fixed=fixed, save_every=save_every)
         if not stepper._has_energy(parameters):
             for member, at, momentum in zip(values, positions, momenta, strict=True):

@@ -122,6 +122,8 @@ def jumps_within(
 
 def check_sides(stepper: Integrator, ends: Array, t: tuple[float, float], h: float, parameters: Array) -> None:
     """Raise :class:`StateError` if two states (2, 2m) rest at a kink beside which steps have different derivatives."""
+    if not any(isinstance(event, Kink) for event in stepper.searched):
+        return
     (q0, q), (p0, p) = np.split(ends, 2, axis=1)
     before = abs(_event_values(stepper, q0, p0, t[0], parameters))
     after = abs(_event_values(stepper, q, p, t[1], parameters))

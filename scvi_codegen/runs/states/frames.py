@@ -49,7 +49,7 @@ def _in_world(links: Any, place: Any, q: Any, columns: Any) -> tuple[Array, Arra
         moved = (factor * q[..., columns[name]] + offset - link.zero)[..., np.newaxis]
         x, y, z = turn.T
         if link.kind == "slide":
-            origin = origin + moved * z
+            origin, turn = origin + moved * z, np.broadcast_to(turn, (*moved.shape[:-1], 3, 3))
         else:
             turned = np.cos(moved) * x + np.sin(moved) * y, np.cos(moved) * y - np.sin(moved) * x, z + 0 * moved
             turn = np.stack(turned, axis=-1)

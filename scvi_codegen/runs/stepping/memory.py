@@ -209,7 +209,7 @@ class Memory:
         if growth and self._can_measure_growth:
             self._memory.measures_growth = growth
         if self.stepper.interface.temperature is not None:
-            check_strengths(self.stepper, t, self._parameters, self._q)
+            check_strengths(self.stepper, t, self._h, self._parameters, self._q)
             self._noise.store(self._memory)
 
     def _set_up(self, plan: StepPlan, initial: InitialData) -> None:

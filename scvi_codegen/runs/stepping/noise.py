@@ -14,6 +14,7 @@ from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.states.times import steps_within, times_after
 from scvi_codegen.runs.states.validation import Array, evaluation
+from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
 from scvi_codegen.systems.system import BATH_ENERGY
 
 NO_BATH = "requires a heat bath: give temperature= or noise= to the system"
@@ -125,6 +126,8 @@ class Noise(NamedTuple):
         coloured = any(isinstance(value, ColouredNoise) for value in (inputs or {}).values())
         if interface.temperature is None and ((seed != 0 and not coloured) or metropolis):
             raise StateError(f"{'metropolis' if metropolis else 'seed'}= {NO_BATH} '{interface.system}'")
+        if metropolis and stepper.run_time_sizes:
+            raise MethodError(f"metropolis=True is not available with arrays of run-time sizes: {SIZES_REQUIRED}")
         if metropolis and (interface.changes_energy != BATH_ENERGY or "symmetric" not in interface.notes):
             raise MethodError(
                 f"metropolis=True is not available for '{interface.title}' ({', '.join(interface.notes)}; "
@@ -151,8 +154,10 @@ def negative_strength(stepper: Any, t: float, parameters: Array, q: Array | None
     return ""
 
 
-def check_strengths(stepper: Any, t: float, parameters: Array, q: Array | None = None) -> None:
-    """Raise :class:`StateError` if kT or a coefficient of the friction is negative at the start of a run."""
+def check_strengths(stepper: Any, t: float, h: float | None, parameters: Array, q: Array | None = None) -> None:
+    """Raise :class:`StateError` if a run would go backward in time, or starts with a negative kT or friction."""
+    if h is not None and h < 0.0:
+        raise StateError(f"the heat bath of '{stepper.interface.system}' acts forward in time: h = {h:g}; give h > 0")
     if message := negative_strength(stepper, t, parameters, q):
         raise StateError(message)
 

@@ -264,8 +264,9 @@ static int change_state(const event_step *step, int e, event_sample *at)
 {
   event_entries wall;
   const int is_impact = IS_IMPACT[EVENT_OF(e)];
-  int status = changes_at(step, e, at, &wall);
+  int status = changes_at(step, e, at, &wall), is_defined = 1;
   if (status == OK && is_impact && wall.rate < 0.0) {
+    is_defined = wall.restitution >= 0.0 && wall.restitution <= 1.0;
     step->watch->history[e].slack = wall.slack;
     step->watch->history[e].rounding = wall.slack / -wall.rate;
     status = impact(step, at, &wall);
@@ -279,11 +280,9 @@ static int change_state(const event_step *step, int e, event_sample *at)
       status = satisfy_constraints(step, at->t, at->q, at->p, 1);
   }
 #ifdef EVENT_MODES
-  const int is_mode = all_finite(step->watch->mode, EVENT_MODES);
-#else
-  const int is_mode = 1;
+  is_defined &= all_finite(step->watch->mode, EVENT_MODES);
 #endif
-  if (status == OK && !(is_mode && all_finite(at->q, M) && all_finite(at->p, M))) {
+  if (!is_defined || (status == OK && !(all_finite(at->q, M) && all_finite(at->p, M)))) {
     step->watch->undefined = -(EVENT_OF(e) + 1);
     status = NOT_FINITE;
   }

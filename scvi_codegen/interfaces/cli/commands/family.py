@@ -15,6 +15,7 @@ from scvi_codegen.common.errors import ModelFileError
 from scvi_codegen.common.representation import counted
 from scvi_codegen.interfaces.cli.command_group import check_writable, reporting, tell
 from scvi_codegen.interfaces.cli.model_options import model_arguments, read_model, with_known_sizes
+from scvi_codegen.interfaces.cli.recording import check_resumed
 from scvi_codegen.interfaces.cli.supervision import progress_bar
 from scvi_codegen.interfaces.models.model import Model
 from scvi_codegen.interfaces.models.model_files.document import document_of
@@ -26,6 +27,8 @@ from scvi_codegen.runs.stepper import Stepper
 OWN = tuple(option.name for option in options_of("family"))
 NAMES, COUNT = {"vary": "parameter", "stride": "step"}, 50
 """Arguments of the function with other names here, and the largest number of orbits."""
+OF_START = {"parameter", "p", "velocity", "keyframe", "time", *OWN} - {"count", "until"}
+"""Options of the first orbit, which the file of a family contains."""
 
 
 @click.command()
@@ -46,6 +49,9 @@ def family(model_name: str, resume: str | None, output: str | None, plot: str | 
       scvi-codegen family planar-pendulum --q 0 --amplitude 0.1 --count 20 --plot pendulum.png
       scvi-codegen family henon-heiles --q 0,0.9 --amplitude 0.01 --until 'energy > 0.2' -o family.npz
     """
+    if resume is not None:
+        context = click.get_current_context()
+        check_resumed(context, {*context.params} - OF_START, "the file defines the family; give --count or --until")
     page = choices.pop("page")
     for target in (output, plot, page):
         if target is not None:
