@@ -21,6 +21,8 @@ ACCEPTED = (
 )
 ORDERS = {"wxyz": 0, "xyzw": 1}
 """Shift of the components of a quaternion to (w, x, y, z), by their order."""
+RATE_SIGNS = np.array([[-1, -1, -1], [1, -1, 1], [1, 1, -1], [-1, 1, 1]], dtype=float)
+"""Signs of the components of a quaternion in E(q), see :func:`rates_matrices`."""
 ORTHOGONAL = 1e-8
 """Largest deviation of R^T R from the identity of an initial matrix, which is then projected."""
 
@@ -184,9 +186,7 @@ def momenta_of_body(q: Array, momentum: Array) -> Array:
 
 def rates_matrices(q: Array) -> Array:
     """Return the (.., 4, 3) matrices E(q) with q_dot = E(q) omega/2; E^T E = |q|^2, E^T q = 0."""
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    rows = [[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return np.asarray(np.take(q, [[1, 2, 3], [0, 3, 2], [3, 0, 1], [2, 1, 0]], axis=-1) * RATE_SIGNS)
 
 
 def _transposed(q: Array, p: Array) -> Array:

@@ -110,7 +110,7 @@ def state_of(
     if isinstance(q, Mapping):
         check_names(q, [*ordinary, *(member.name for member in members)], "q")
         attitudes = {member.name: _coordinates(member, q) for member in members}
-        parts = {name: column(q, name, "q") for name in ordinary}
+        parts = columns(q, ordinary, "q")
         state = joined_columns(parts | {name: coordinates for name, (coordinates, _) in attitudes.items()}, "q")
     else:
         state = real_array(q, "q")
@@ -126,10 +126,10 @@ def state_of(
         p = {}
     if isinstance(velocity, Mapping):
         parts = _moving(ordinary, members, velocity, attitudes, "velocity", state.shape[:-1])
-        state, velocity = np.broadcast_arrays(state, joined_columns(parts, "velocity"))
+        state, velocity = _as_many(state, joined_columns(parts, "velocity"))
     if isinstance(p, Mapping):
         parts = _moving(ordinary, members, p, attitudes, "p", state.shape[:-1])
-        state, p = np.broadcast_arrays(state, joined_columns(parts, "p"))
+        state, p = _as_many(state, joined_columns(parts, "p"))
     return state, p, velocity
 
 
@@ -185,7 +185,7 @@ def _moving(
     names = {m.name: m.rate if m.name in named else m.name for m in members}
     required = [*ordinary, *(names[m.name] for m in members if m.kind != "spin")]
     check_names(values, required, argument, also=[f"{names[m.name]}_space" for m in members if m.kind == "rotation"])
-    parts = {name: column(values, name, argument) for name in ordinary}
+    parts = columns(values, ordinary, argument)
     for name, rates in parts.items():
         common_shape({"q": states, f"{argument}: '{name}'": rates.shape[:-1]})
     for member in members:
@@ -209,8 +209,7 @@ def _moving(
             parts[name] = np.asarray(vector - q * radial)
             continue
         body = np.einsum("...ji,...j->...i", matrices(q), vector) if in_space else vector
-        q, body = np.broadcast_arrays(q, np.concatenate([body, body[..., :1]], axis=-1))
-        parts[name] = (velocities_of_body if argument == "velocity" else momenta_of_body)(q, body[..., :3])
+        parts[name] = (velocities_of_body if argument == "velocity" else momenta_of_body)(q, body)
     return parts
 
 
@@ -222,11 +221,25 @@ def check_names(values: Mapping[str, Any], required: Sequence[str], argument: st
                 f"there is no '{name}' in {argument}{closest(str(name), [*required, *also])} "
                 f"Known: {', '.join(required)}"
             )
+    in_space = {*also} & {*values}
     for name in required:
-        count = (name in values) + (f"{name}_space" in set(also) & set(values))
+        count = (name in values) + (f"{name}_space" in in_space)
         if count != 1:
             both = f"both '{name}' and '{name}_space' are in {argument}: give one of them"
             raise StateError(both if count else f"'{name}' is missing in {argument}")
+
+
+def _as_many(one: Array, other: Array) -> Sequence[Array]:
+    """Return positions and momenta or velocities of as many states."""
+    return (one, other) if one.shape == other.shape else np.broadcast_arrays(one, other)
+
+
+def columns(values: Mapping[str, Any], names: Sequence[str], argument: str) -> dict[str, Array]:
+    """Return numbers by name as columns; those of one state in one part, under the first name."""
+    numbers = [values[name] for name in names]
+    if {*map(type, numbers)} == {float}:
+        return {names[0]: np.array(numbers)}
+    return {name: column(values, name, argument) for name in names}
 
 
 def column(values: Mapping[str, Any], name: str, argument: str) -> Array:
