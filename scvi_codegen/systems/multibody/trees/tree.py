@@ -180,10 +180,6 @@ def without_fixed(links: Sequence[Link]) -> list[Link]:
                 frames = *base.frames, *((name, pose @ inner) for name, inner in frames)
                 moving[carrier] = replace(base, inertia=base.inertia + link.inertia.seen_from(pose), frames=frames)
         else:
-            if link.joint.kind == "free" and carrier >= 0:
-                raise SystemDefinitionError(
-                    f"joint '{link.joint.name}' is free, but its parent moves: remove the joint"
-                )
             places.append((len(moving), Pose()))
             moving.append(replace(link, parent=carrier, joint=replace(link.joint, pose=pose), frames=frames))
     if not moving:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scvi_codegen.common.errors import SystemDefinitionError, closest
+from scvi_codegen.common.errors import closest
 from scvi_codegen.systems.multibody.trees.document import Element, Unread, checked_limits, root_of
 from scvi_codegen.systems.multibody.trees.schema import URDF
 from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about, axes_of, named
@@ -51,7 +51,7 @@ def links_of_urdf(path: str | PathLike[str], *, floating: bool, parts: Collectio
     joints = _by_child(robot, links, floating=floating)
     roots = [name for name in links if name not in joints]
     if len(roots) != 1:
-        raise SystemDefinitionError(f"{path}: the links must form one tree, but without parents are {roots or 'none'}")
+        robot.refuse(f"must have links that form one tree, but without parents are {roots or 'none'}")
     outgoing = defaultdict[str, list[str]](list)
     for child, joint in joints.items():
         outgoing[_linked(joint, "parent")].append(child)
@@ -68,7 +68,10 @@ def links_of_urdf(path: str | PathLike[str], *, floating: bool, parts: Collectio
             places[child] = place
             order.append(child)
     if len(order) < len(links):
-        raise SystemDefinitionError(f"{path}: the links {sorted(set(links) - set(order))} form a circle")
+        circle = sorted(set(links) - set(order))
+        joints[circle[0]].refuse(f"closes a loop: the links {circle} form a circle")
+    _check_free(joints)
+    _check_followed(robot)
     _list_unread(robot, parts, unread)
     unread.warn(str(path))
     return robot.node.get("name") or Path(path).stem, named(tree)
@@ -88,6 +91,34 @@ def _by_child(robot: Element, links: Mapping[str, Element], *, floating: bool) -
         if joint.text("type") == "floating" and _linked(joint, "parent") not in joints:
             joint.refuse("is free, and so is its parent by floating=True: omit floating")
     return joints
+
+
+def _check_free(joints: Mapping[str, Element]) -> None:
+    """Raise an error for a free joint whose parent moves, of joints by the links that they move."""
+    for joint in (joint for joint in joints.values() if joint.text("type") == "floating"):
+        parent = _linked(joint, "parent")
+        while parent in joints:
+            if joints[parent].text("type") != "fixed":
+                joint.refuse("is free, but its parent moves: remove the joint")
+            parent = _linked(joints[parent], "parent")
+
+
+def _check_followed(robot: Element) -> None:
+    """Raise an error for a joint that follows itself, also through others, or one that is no hinge or slide."""
+    followed, single = dict[str, str](), list[str]()
+    for joint in robot.children("joint"):
+        kind, mimic = KINDS[joint.text("type")], joint.child("mimic")
+        single += [joint.name] * (kind in SINGLE)
+        if mimic is not None and kind != "fixed":
+            followed[joint.name] = mimic.text("joint")
+    for joint in robot.children("joint"):
+        seen = [joint.name]
+        while (other := followed.get(seen[-1])) is not None:
+            if other not in single:
+                joint.refuse(f"follows '{other}', which is no moving joint{closest(other, single)}")
+            if other in seen:
+                joint.refuse(f"follows itself: {', '.join((*seen, other))}")
+            seen.append(other)
 
 
 def _rotors(robot: Element) -> dict[str, float]:
