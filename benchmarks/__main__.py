@@ -44,6 +44,7 @@ def main(
       adaptive:kepler:0.9, ..   adaptive and fixed step size; heyoka and IAS15
       rotations:free-top, :heavy-top, :dumbbell, :bodies                    rigid bodies; heyoka, MuJoCo
       robots:chain:2, :5, :10, :30, :quadruped, :four-bar                   multibody systems; MuJoCo, Pinocchio, Exudyn
+      robots:tree:18:1, :tree:18:10, :tree:35:1, .., :tree:49:10            degrees of freedom and span, on a free base
       contact:rolling, :oscillator, :block, :bounces, :ladder               contact, dry friction; MuJoCo, Siconos
       mechanisms:2, :5, :10, :20                                            SymPy mechanisms; lambdify and PyDy
       fields:breather, :wave-2d, :schroedinger                              partial differential equations; py-pde

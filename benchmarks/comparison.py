@@ -15,7 +15,7 @@ import numpy as np
 from benchmarks.cases.references import Reference, reference, rms_error
 from benchmarks.cases.unforced import STATES, Array, Case
 from benchmarks.contenders.peers import PEERS
-from benchmarks.report import CaseResult, Contender, Measurement
+from benchmarks.report import ERRORS, CaseResult, Contender, Measurement
 from benchmarks.settings import Plan, ReportActivity
 from scvi_codegen.common.errors import ScviCodegenError
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
@@ -30,6 +30,7 @@ class Race:
         ours: function that returns the contenders of this package.
         peers: functions of the case and whether the run is quick that return the contenders of a peer, by its name.
         ends: function that returns the final states of a case, from its velocities or from momenta.
+        errors: at which all methods are compared.
     """
 
     case: Case
@@ -38,6 +39,7 @@ class Race:
         default_factory=lambda: {name: peer.contenders for name, peer in PEERS.items()}
     )
     ends: Callable[[Case, Array | None], Reference] = reference
+    errors: tuple[float, ...] = ERRORS
 
 
 @without_accuracy_warnings()
@@ -62,6 +64,7 @@ def run_race(build: Callable[[Plan], Race], plan: Plan, report_activity: ReportA
         reference_accuracy=exact.accuracy,
         measurements=tuple(measure(contenders, reference_of, repeats=plan.rounds)),
         skipped=skipped,
+        errors=chosen.errors,
     )
 
 

@@ -180,6 +180,7 @@ class CaseResult:
         reference_accuracy: accuracy of its reference.
         measurements: all settings of all methods.
         skipped: methods that were left out, with the reason.
+        errors: at which all methods are compared.
     """
 
     name: str
@@ -188,6 +189,7 @@ class CaseResult:
     reference_accuracy: float
     measurements: tuple[Measurement, ...]
     skipped: Mapping[str, str]
+    errors: tuple[float, ...] = ERRORS
 
     def methods(self) -> list[str]:
         """Return the names of the curves in the order of measurement."""
@@ -203,7 +205,7 @@ class CaseResult:
             columns=COLUMNS,
             rows=tuple(good.get(method, {"method": method, "setting": "failed"}) for method in self.methods()),
             remarks=(
-                *filter(None, (_line_at(self, error) for error in ERRORS)),
+                *filter(None, (_line_at(self, error) for error in self.errors)),
                 *failures,
                 *(f"skipped {name}: {why}" for name, why in self.skipped.items()),
             ),

@@ -13,7 +13,7 @@ from benchmarks.cases.forced import driven_pendulum
 from benchmarks.cases.large import atoms, bodies, field, ring
 from benchmarks.cases.published import PUBLISHED_CASES, published_case
 from benchmarks.cases.references import Reference, rms_error
-from benchmarks.cases.robots import ROBOTS
+from benchmarks.cases.robots import ROBOTS, TREES
 from benchmarks.cases.rods import RODS, rods, with_constraints
 from benchmarks.cases.rotations import BODIES, FEW_BODIES, ROTATIONS, tumbling
 from benchmarks.cases.suites import SUITE_CASES, SUITE_ENDS, suite_case
@@ -159,10 +159,20 @@ def _halved(
     return Race(case=chosen, ours=partial(fixed_contenders, chosen, some), ends=lambda _, __: exact_end())
 
 
-def _robot(make: Callable[[], Case], plan: Plan) -> Race:
-    """Return a multibody system at halved fixed steps; trees also with adaptive steps."""
-    race = _halved(make, ROBOT_METHODS, ROBOTS_EXACT, plan)
-    if race.case.system.constraints or race.case.system.rotations:
+def _tree(make: Callable[[], Case], plan: Plan) -> Race:
+    """Return a robot on a free base."""
+    return replace(_robot(make, plan, TREE_METHODS, TREES_EXACT), errors=TREE_ERRORS)
+
+
+def _robot(
+    make: Callable[[], Case],
+    plan: Plan,
+    methods: Mapping[str | Method, range] | None = None,
+    exact: Mapping[str | Method, int] | None = None,
+) -> Race:
+    """Return a multibody system at halved fixed steps; without closed loops also with adaptive steps."""
+    race = _halved(make, methods or ROBOT_METHODS, exact or ROBOTS_EXACT, plan)
+    if race.case.system.constraints:
         return race
 
     def ours() -> list[Contender]:
@@ -198,6 +208,9 @@ EXPLICIT |= {Composition(8): range(6), "stoermer-verlet": range(1, 13)}
 EXACT: dict[str | Method, int] = {"svi:10": 3, Composition(10): 5}
 ROBOT_METHODS: dict[str | Method, range] = {f"svi:{s}": range(most) for s, most in ((2, 7), (4, 5), (6, 4))}
 ROBOTS_EXACT: dict[str | Method, int] = {"svi:8": 3, "svi:6": 4}
+TREE_METHODS: dict[str | Method, range] = {"svi:2": range(4, 9), "svi:4": range(1, 6)}
+TREE_ERRORS = (1e-4, 1e-7, 1e-10)
+TREES_EXACT: dict[str | Method, int] = {"svi:4": 6, "svi:3": 7}
 MECHANISM_METHODS: dict[str | Method, range] = {"svi:4": range(6)}
 
 ALL_CASES: Mapping[str, Callable[[], Case]] = {
@@ -221,6 +234,7 @@ BUILDERS: dict[str, Callable[[Plan], Race]] = {
     **{f"rotations:{name}": partial(_rotation, name) for name in ROTATIONS},
     "rotations:bodies": _tumbling,
     **{f"robots:{name}": partial(_robot, make) for name, make in ROBOTS.items()},
+    **{f"robots:{name}": partial(_tree, make) for name, make in TREES.items()},
     **{name: partial(_contact, name) for name in CONTACTS},
     **{f"fields:{name}": partial(_field, make) for name, make in FIELDS.items()},
     **{f"lattices:{name}": partial(_halved, make, EXPLICIT, EXACT) for name, make in LATTICES.items()},

@@ -1,4 +1,4 @@
-"""Multibody systems as models of MuJoCo, which this package reads: chains of hinges, a quadruped, a four-bar linkage.
+"""Multibody systems as models of MuJoCo, which this package reads: chains of hinges, robots on a free base, a linkage.
 
 The linkage is written in Cartesian coordinates with constraints instead, because its loop is closed; its errors are
 those of the positions of its two masses.
@@ -6,6 +6,7 @@ those of the positions of its two masses.
 
 from __future__ import annotations
 
+import random
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -50,7 +51,7 @@ def _case(name: str, mjcf: str, q: Sequence[float], velocity: Sequence[float], s
         q=np.array([q], dtype=float),
         velocity=np.array([velocity], dtype=float),
         span=span,
-        step=0.04,
+        step=others.get("step", 0.04),
         mjcf=mjcf,
     )
 
@@ -82,6 +83,36 @@ def quadruped() -> Case:
     mjcf = _model(f'<body name="trunk" pos="0 0 0">{trunk}{legs}</body>')
     q, velocity = [0.0, 0.0, 1.0, *angles, 1.0, 0.0, 0.0, 0.0], [0.3, 0.0, 1.0, *speeds, 0.4, 1.0, 0.2]
     return _case("quadruped", mjcf, q, velocity, span=1.0)
+
+
+def tree(degrees: int, span: float) -> Case:
+    """Return limbs of hinges on a free base, with random inertias and velocities, in free fall."""
+    chance, hinges = random.Random(1), degrees - 6
+    limbs = 4 if hinges <= 14 else 5
+    bodies, first = "", 0
+    for limb in range(limbs):
+        count = hinges // limbs + (limb < hinges % limbs)
+        bodies += "".join(_hinged(k, chance) for k in range(first, first + count)) + "</body>" * count
+        first += count
+    trunk = '<freejoint name="base"/><inertial pos="0.01 0.02 0.03" mass="6" diaginertia="0.05 0.2 0.22"/>'
+    mjcf = _model(f'<body name="trunk" pos="0 0 1">{trunk}{bodies}</body>')
+    q, velocity = [0.0, 0.0, 1.0, *[0.0] * hinges, 1.0, 0.0, 0.0, 0.0], np.random.default_rng(1).uniform(-1, 1, degrees)
+    return _case(f"tree:{degrees}:{span:g}", mjcf, q, velocity.tolist(), span=span, step=0.25)
+
+
+def _hinged(number: int, chance: random.Random) -> str:
+    """Return the opening of a body on a hinge, somewhere near its parent, with a random inertia."""
+
+    def uniform(size: float, count: int) -> str:
+        return " ".join(f"{chance.uniform(-size, size):.5f}" for _ in range(count))
+
+    mass = chance.uniform(0.3, 2.0)
+    inertia = " ".join(f"{mass * moment:.6f}" for moment in (0.004, 0.005, 0.006))
+    return (
+        f'<body name="b{number}" pos="{uniform(0.15, 3)}" euler="{uniform(40, 3)}"><joint name="q{number}" '
+        f'axis="{("1 0 0", "0 1 0", "0 0 1")[number % 3]}"/><inertial pos="{uniform(0.05, 3)}" '
+        f'quat="{uniform(1, 4)}" mass="{mass:.5f}" diaginertia="{inertia}"/>'
+    )
 
 
 def four_bar() -> Case:
@@ -119,3 +150,5 @@ ROBOTS: Mapping[str, Callable[[], Case]] = {
     "four-bar": four_bar,
 }
 """Functions that build a case, by the name after ``robots:``."""
+TREES = {f"tree:{m}:{span}": partial(tree, m, span) for m in (18, 35, 49) for span in (1, 10)}
+"""The same for robots on a free base, by their degrees of freedom and the duration of the motion."""

@@ -43,7 +43,7 @@ def mujoco_contenders(case: Case, quick: bool) -> Iterator[Contender]:
     prepare = _mujoco_preparation(case, model, data, together=together)
     for integrator in INTEGRATORS:
         for stiff in (False, True)[: 2 if model.neq else 1]:
-            for steps in step_counts(replace(case, step=LARGEST_STEP), range(2 if quick else HALVINGS)):
+            for steps in _counts(case, quick):
                 yield Contender(
                     method=f"MuJoCo {integrator}{', stiff' * stiff}",
                     setting=f"h={case.span / steps:.4g}",
@@ -53,6 +53,13 @@ def mujoco_contenders(case: Case, quick: bool) -> Iterator[Contender]:
                     trajectories=len(case.q) if together else 1,
                     starts=len(case.q),
                 )
+
+
+def _counts(case: Case, quick: bool) -> list[int]:
+    """Return numbers of steps, from the step size of the case on if that is larger."""
+    largest = max(case.step, LARGEST_STEP)
+    most = HALVINGS + round(np.log2(largest / LARGEST_STEP))
+    return step_counts(replace(case, step=largest), range(2 if quick else most))
 
 
 def _mujoco_preparation(case: Case, model: Any, data: Any, *, together: bool) -> Callable[..., Callable[[], Any]]:
@@ -139,10 +146,22 @@ def pinocchio_contenders(case: Case, quick: bool) -> Iterator[Contender]:
         made = pinocchio.buildModelFromMJCF(str(path))
     model = made[0] if isinstance(made, tuple) else made
     data, pool, m = model.createData(), pinocchio.ModelPool(model, 1), case.dimension
-    seconds, zero = time.perf_counter() - began, np.zeros(m)
+    seconds, zero = time.perf_counter() - began, np.zeros(model.nv)
+    places, turned = _pinocchio_places(case, model), model.nq != model.nv
 
     def rates(t: float, x: Array) -> Array:
-        return np.concatenate([x[m:], pinocchio.aba(model, data, x[:m], x[m:], zero)])
+        if not turned:
+            return np.concatenate([x[m:], pinocchio.aba(model, data, x[:m], x[m:], zero)])
+        q, v = x[places[0]], x[places[1]]
+        q[3:7] /= np.linalg.norm(q[3:7])
+        turn = pinocchio.Quaternion(q[3:7]).matrix()
+        v[:3] = turn.T @ v[:3]  # of the base in its own axes
+        a = pinocchio.aba(model, data, q, v, zero)
+        rate = np.empty_like(x)
+        rate[places[0]] = np.concatenate([turn @ v[:3], _quaternion_rate(x[places[0][3:7]], v[3:6]), v[6:]])
+        a[:3] = turn @ (a[:3] + np.cross(v[3:6], v[:3]))
+        rate[places[1]] = a
+        return rate
 
     def runge_kutta(index: int, steps: int) -> Array:
         x, h = start_of(case, index), case.span / steps
@@ -154,8 +173,9 @@ def pinocchio_contenders(case: Case, quick: bool) -> Iterator[Contender]:
         return x[:m]
 
     def timed(steps: int, index: int) -> Callable[[], Callable[[], Array]]:
-        q, v = (np.tile(part[index][:, np.newaxis], 4 * steps) for part in case.states)
-        torques, accelerations = np.zeros_like(q), np.empty_like(q)
+        start = start_of(case, index)
+        q, v = (np.tile(start[part][:, np.newaxis], 4 * steps) for part in places)
+        torques, accelerations = np.zeros_like(v), np.empty_like(v)
 
         def evaluate() -> Callable[[], Array]:
             pinocchio.abaInParallel(1, pool, q, v, torques, accelerations)
@@ -164,10 +184,27 @@ def pinocchio_contenders(case: Case, quick: bool) -> Iterator[Contender]:
         return evaluate
 
     ends, starts = lru_cache(maxsize=None)(runge_kutta), len(case.q)
-    for steps in step_counts(replace(case, step=LARGEST_STEP), range(2 if quick else HALVINGS)):
+    for steps in _counts(case, quick):
         name, setting = "Pinocchio aba, RK4 (bound)", f"h={case.span / steps:.4g}"
         yield Contender(name, setting, "4 aba a step in C++", seconds, partial(timed, steps), starts=starts)
     yield from dop853("aba from Python", seconds, case, quick, rates, LOOSE, "Pinocchio DOP853")
+
+
+def _pinocchio_places(case: Case, model: Any) -> tuple[list[int], list[int]]:
+    """Return the indices in (q, v) of a case of Pinocchio's positions and velocities, those of a free base first."""
+    m = case.dimension
+    names = [str(symbol) for symbol in case.system.coordinates]
+    hinges = [names.index(name) for name in list(model.names)[1:] if name in names]
+    if model.nq == model.nv:
+        return hinges, [m + k for k in hinges]
+    turn, omega = [m - 3, m - 2, m - 1, m - 4], range(case.size - 3, case.size)  # the one rotation is the last
+    return [0, 1, 2, *turn, *hinges], [m, m + 1, m + 2, *omega, *(m + k for k in hinges)]
+
+
+def _quaternion_rate(q: Array, omega: Array) -> Array:
+    """Return q (omega, 0)/2 of a quaternion (x, y, z, w) and an angular velocity in the body frame."""
+    x, w = q[:3], q[3]
+    return np.append(w * omega + np.cross(x, omega), -x @ omega) / 2
 
 
 def exudyn_contenders(case: Case, quick: bool) -> Iterator[Contender]:

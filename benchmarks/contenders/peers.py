@@ -177,7 +177,7 @@ PEERS = {
     "siconos": Peer(
         ("siconos",), siconos_contacts, lambda case: "contact:" in case.name, "apt install python3-siconos"
     ),
-    "pinocchio": Peer(("pinocchio",), pinocchio_contenders, _is_tree),
+    "pinocchio": Peer(("pinocchio",), pinocchio_contenders, lambda case: _is_tree(case) or ":tree:" in case.name),
     "exudyn": Peer(("exudyn",), exudyn_contenders, _is_tree),
     "cyrk": Peer(("CyRK", "numba"), _cyrk, _has_formulations),
     "scipy": Peer(("scipy",), _scipy, _has_formulations),
