@@ -83,10 +83,11 @@ def test_pairs_of_geoms_are_selected_as_by_mujoco(ball, rest, friction, tmp_path
 
 
 def test_what_is_not_read_of_geoms_is_named_in_one_warning(tmp_path):
-    more = BALL.format('condim="6"') + '<body pos="1 0 0"><freejoint/><geom type="cylinder" size=".1 .1"/></body>'
+    more = BALL.format('condim="6" adhesion="1"')
+    more += '<body pos="1 0 0"><freejoint/><geom type="cylinder" size=".1 .1"/></body>'
     with pytest.warns(SystemDefinitionWarning, match="friction of geom 'ball' on geom 'floor'; contacts of 2 pairs"):
         assert len(robot(tmp_path, FLOOR + more).contacts) == 1
-    with pytest.warns(SystemDefinitionWarning, match="without contacts$"):
+    with pytest.warns(SystemDefinitionWarning, match="without adhesion of geoms ball; contacts$"):
         robot(tmp_path, FLOOR + more, contacts="ignore")
 
 

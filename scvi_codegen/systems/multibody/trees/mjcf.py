@@ -277,6 +277,9 @@ class _MujocoModel:
     def touches(self) -> Iterator[Touch]:
         """Yield the contacts of spheres with planes; other pairs of geoms are listed as unread."""
         pairs, unread = self.pairs(), 0
+        adhesive = [geom.element.name for geom in self.geoms if geom.element.number("adhesion", 0)]
+        if adhesive and not self.disabled & {"contact", "constraint"}:
+            self.unread.add("adhesion of geoms", *adhesive)
         if "contacts" not in self.parts:
             if next(pairs, None):
                 self.unread.add("contacts")
