@@ -99,8 +99,12 @@ static inline void enter_step(block_bath *bath, block_memory *block, long long k
     normals(block->seed, (uint64_t)block->step, STEPS_DRAWN, HEAT, 0, DRAWN, (uint32_t)block->trajectory, LANES,
         (double *)bath->first, (double *)bath->second);
   exchange_heat(&bath->factors, bath->first[k % STEPS_DRAWN], now->p, now->carry_p);
-  bath->heated = *now;
-  reverse_momenta(block, now);
+#ifdef SPLITTING
+  if (block->metropolis)
+#endif
+    bath->heated = *now;
+  if (block->metropolis)
+    reverse_momenta(block, now);
   forget_curve(block, now, memory);
 }
 
@@ -109,7 +113,8 @@ static inline void leave_step(block_bath *bath, block_memory *block, long long k
     state *now)
 {
   lane_view active;
-  reverse_momenta(block, now);
+  if (block->metropolis)
+    reverse_momenta(block, now);
   if (block->metropolis || iterations > FEW_ITERATIONS)
     judge_step(bath, block, t, now);
 #ifndef CONSTANT_BATH
