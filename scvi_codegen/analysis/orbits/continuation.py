@@ -87,7 +87,8 @@ PHASES = 64
 BEND = math.tan(LARGEST_TURN / 4.0) / 2.0
 """Largest distance of a family from the chord of a step, relative to the chord: of an arc that turns by 30 degrees."""
 NEAR_START = 0.05
-"""Time between start and nearest impact, relative to the period, below which the start is moved along the orbit."""
+"""Time between start and nearest impact, relative to the period, below which the start is moved along the orbit. With
+the time of one radian as unit, a step of .3 along the family moves the impact by up to .3/(2 pi) = .05 periods."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,8 @@ from scvi_codegen.systems.formulas.grammar import parse_expression
 from scvi_codegen.systems.formulas.symbols import symbol
 
 AT_ZERO = 1e-6
-"""Positions and momenta, relative to the largest ones, below which they are those of a crossing of the fixed set."""
+"""Positions and momenta, relative to the largest ones, below which they are those of a crossing of the fixed set, by
+the digits of printed states. A candidate too many costs a trial only: steps verify each."""
 MOST_CANDIDATES = 256
 
 
