@@ -431,7 +431,8 @@ def _reason(until: Until, stepper: Stepper) -> Callable[[PeriodicOrbit], str]:
     holds = Formula.of(f"where({until}, 1, 0)", (*states, *stepper.parameters, "energy", "period"))
 
     def reason(orbit: PeriodicOrbit) -> str:
-        numbers = (*orbit.q, *orbit.p, *orbit.parameters, orbit.energy, orbit.period)
+        parameters = orbit.parameters[: len(stepper.parameters)]  # without modes
+        numbers = (*orbit.q, *orbit.p, *parameters, orbit.energy, orbit.period)
         try:
             return f"{until} holds" if holds(dict(zip(holds.symbols, numbers, strict=True))) == 1.0 else ""
         except (ArithmeticError, ValueError) as error:
