@@ -129,9 +129,8 @@ def check_sides(stepper: Integrator, ends: Array, t: tuple[float, float], h: flo
     after = abs(_event_values(stepper, q, p, t[1], parameters))
     for kink in stepper.searched:
         if isinstance(kink, Kink) and after[n := _number(stepper, kink)] <= AT_KINK * before[n]:
-            sides = [parameters.copy(), parameters.copy()]
-            for side, at in zip((-1.0, 1.0), sides, strict=True):
-                at[stepper.interface.parameters.index(kink.mode)] = side * BEYOND
+            column = np.arange(len(parameters)) == stepper.interface.parameters.index(kink.mode)
+            sides = (np.where(column, side, parameters) for side in (-BEYOND, BEYOND))
             below, above = (stepper.jacobian(q, p, h, t[1], at) for at in sides)
             if abs(above - below).max() > CONTINUOUS * abs(above).max():
                 raise StateError(
