@@ -20,10 +20,10 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from enum import StrEnum, auto
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from scvi_codegen.common.errors import SystemDefinitionError, closest
-from scvi_codegen.systems.contacts.rows import Impacts
 from scvi_codegen.systems.event import Formula, conditions_of
 
 if TYPE_CHECKING:
@@ -54,6 +54,18 @@ def _check_limits(shown: str, kinetic: tuple[str, Formula], static: tuple[str, F
         )
 
 
+class Impacts(StrEnum):
+    """Law of the impacts of a contact beside those of others that it meets at the same time.
+
+    One contact after another until none approaches, as the balls of a cradle: the last one alone leaves. Or all that
+    touch at once by Newton's law, 0 <= v_n+ + e v_n-, 0 <= Lambda, of which one is 0 (C. Glocker, *Set-Valued Force
+    Laws*, 2001): -1/3, 2/3, 2/3 of three balls, and a box that falls flat does not turn.
+    """
+
+    SEQUENTIAL = auto()
+    SIMULTANEOUS = auto()
+
+
 @dataclass(frozen=True, slots=True)
 class Contact:
     """Unilateral contact, made by :func:`contact`.
@@ -69,7 +81,7 @@ class Contact:
         of: coordinates by whose gradient the gap is divided, so that it is a distance to first order.
         name: name in messages; by default the formula of the gap.
         impacts: their law beside those of others, ``"sequential"`` or ``"simultaneous"``
-            (:class:`~scvi_codegen.systems.contacts.rows.Impacts`).
+            (:class:`Impacts`).
 
     Raises:
         SystemDefinitionError: for friction without slip or slip without friction, and invalid coefficients.

@@ -42,7 +42,8 @@ from scvi_codegen.codegen.rendering.source import Interface, Source
 from scvi_codegen.common.errors import EventError, ScviCodegenError, SystemDefinitionError, closest
 from scvi_codegen.common.precision import mp
 from scvi_codegen.methods.tables.nodes import chebyshev_lobatto, to_unit
-from scvi_codegen.systems.contacts.rows import ContactRows, Impacts
+from scvi_codegen.systems.contact import Impacts
+from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.event import Kink, Refraction, Transition, modes_of
 from scvi_codegen.systems.formulas.array_statements import (
     EntryRules,

@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 from scvi_codegen.codegen.rendering.own_names import with_exported_names, with_own_names
 from scvi_codegen.codegen.rendering.preprocessor import preprocessed
 from scvi_codegen.codegen.rendering.reachable import readable
-from scvi_codegen.systems.contacts.rows import ContactRows, Impacts
+from scvi_codegen.systems.contact import Impacts
+from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.event import Event, Kink, Refraction, Transition
 from scvi_codegen.systems.formulas.indices import Access, ArrayDeclarations, ArrayMap, Loop
 from scvi_codegen.version import __version__

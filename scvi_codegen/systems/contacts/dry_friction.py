@@ -20,12 +20,13 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.systems.contact import Friction
-from scvi_codegen.systems.lagrangian import LagrangianSystem
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from sympy import Expr
+
+    from scvi_codegen.systems.lagrangian import LagrangianSystem
 
 STEPS = re.compile(r"\b(sign|sqrt|[aA]bs|where|unit_step|Heaviside|Piecewise|[mM]in|[mM]ax)\b")
 """Functions of formulas that consist of steps, and the length of a slip."""
@@ -33,6 +34,8 @@ STEPS = re.compile(r"\b(sign|sqrt|[aA]bs|where|unit_step|Heaviside|Piecewise|[mM
 
 def with_dry_friction(system: Any) -> Any:
     """Return the system with contacts in place of the dry friction in its forces; itself if there is none."""
+    from scvi_codegen.systems.lagrangian import LagrangianSystem
+
     if not isinstance(system, LagrangianSystem) or _is_smooth(system):
         return system
     if system.clock or system.gauge != 0 or system.rotations:

@@ -14,8 +14,8 @@ from itertools import repeat
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.systems.contact import WORDS, Contact, ContactLike, Friction, slips_of, static_limit
-from scvi_codegen.systems.contacts.rows import ContactRows, Impacts
+from scvi_codegen.systems.contact import WORDS, Contact, ContactLike, Friction, Impacts, slips_of, static_limit
+from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.event import LOOPS, Formula
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
 from scvi_codegen.systems.formulas.indices import Array, Size

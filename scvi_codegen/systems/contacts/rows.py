@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from enum import IntFlag, StrEnum, auto
 from typing import NamedTuple
 
+from scvi_codegen.systems.contact import Impacts
+
 
 class ContactMode(StrEnum):
     """Mode of a contact; one without friction that is closed slips."""
@@ -21,18 +23,6 @@ class Dependence(IntFlag):
     HELD = 1
     LOADED = 2
     STUCK = 4
-
-
-class Impacts(StrEnum):
-    """Law of the impacts of a contact beside those of others that it meets at the same time.
-
-    One contact after another until none approaches, as the balls of a cradle: the last one alone leaves. Or all that
-    touch at once by Newton's law, 0 <= v_n+ + e v_n-, 0 <= Lambda, of which one is 0 (C. Glocker, *Set-Valued Force
-    Laws*, 2001): -1/3, 2/3, 2/3 of three balls, and a box that falls flat does not turn.
-    """
-
-    SEQUENTIAL = auto()
-    SIMULTANEOUS = auto()
 
 
 class ContactRows(NamedTuple):
