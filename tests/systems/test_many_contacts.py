@@ -49,6 +49,19 @@ def rests(stepper: Any, t_end: float, **parameters: float) -> Any:
 
 @pytest.mark.second
 @pytest.mark.filterwarnings("ignore:the contacts depend")
+@pytest.mark.parametrize(("speed", "h"), [(0.5, 0.01), (0.5, 0.02), (2.0, 0.01)])
+def test_a_box_that_slides_to_rest_changes_its_mode_once(speed: float, h: float) -> None:
+    """Rates of slips at rest are rounding of the normal forces: they are no contradiction of its corners."""
+    slope = box(friction=0.3)
+    run = slope.integrate([0, HEIGHT, 0], velocity=[speed, 0, 0], h=h, t_end=3.0)
+    stop = speed / (0.3 * G)
+    assert run.contact_modes == [(0.0, ("slip", "slip")), (pytest.approx(stop, abs=1e-13), ("stick", "stick"))]
+    assert run.q[-1, 0] == pytest.approx(speed * stop / 2, abs=1e-13)
+    assert run.contact_forces()[-1] == pytest.approx(np.array([[G / 2, 0], [G / 2, 0]]), abs=1e-12)
+
+
+@pytest.mark.second
+@pytest.mark.filterwarnings("ignore:the contacts depend")
 def test_a_box_on_a_slope_creeps_nowhere_and_slides_by_its_closed_form() -> None:
     stepper = box(friction=0.5)
     run = rests(stepper, 10.0, s=np.deg2rad(20))

@@ -118,7 +118,8 @@ static int reduce_equations(const contact_terms *of, const contact_unknowns *in,
   return eliminate(matrix, in->count, independent);
 }
 
-/* Largest of some rates, and of those by moved forces, relative to the terms of right + W f. */
+/* Largest of some rates, and of those by moved forces, relative to the terms of right + W f, with the bounds
+ * sqrt(W_rr W_jj) of abs(W_rj): entries that cancel, as of slips at rest with normal forces, have the rounding of these. */
 static real discord_of(const contact_terms *of, const real *rates, const real *moved, const real *right,
     const real *force)
 {
@@ -127,7 +128,7 @@ static real discord_of(const contact_terms *of, const real *rates, const real *m
   for (int r = 0; r < CONTACT_ROWS; r++) {
     real size = fabs(right[r]);
     for (int j = 0; j < CONTACT_ROWS; j++)
-      size += fabs(of->W[r * CONTACT_ROWS + j] * force[j]);
+      size += sqrt(of->W[r * (CONTACT_ROWS + 1)] * of->W[j * (CONTACT_ROWS + 1)]) * fabs(force[j]);
     largest = fmax(largest, fmax(fabs(rates[r]), fabs(rate_after(of, still, moved, r))) / fmax(size, DBL_MIN));
   }
   return largest;
