@@ -70,7 +70,7 @@ Bodies that are ejected move regularly from then on, which brings the mean close
 RIGHT, LOOSER, MOST_REPEATED, PARTS, DIGITS = 1e-10, 1e4, 2**16, 16, 15
 """Difference that leaves ten digits, and its ratio to the tolerance if that is larger; most steps of a repetition that
 confirms a growth, and number of its comparisons; digits of a double."""
-ALL_STEPS, SOME_STEPS, LOOSE_TOLERANCE = 1, 4, 1e-5
+ALL_STEPS, SOME_STEPS, LOOSE_TOLERANCE = 1, 8, 1e-5
 """One of how many steps measures the growth above this tolerance, where an orbit has few steps, and below."""
 
 

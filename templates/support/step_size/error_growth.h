@@ -38,7 +38,7 @@ enum { TANGENT = 2 * M }; /* numbers of a tangent vector on which accelerations 
 #else
 enum { TANGENT = M };
 #define IS_SMALL(change, k, size, rate) \
-  ((change) * ((rate) + (change)) <= (1e-4 * LESS) * ((double)((k) * (k) * (k) * (k)) * ((size) * (size))))
+  ((change) * ((rate) + (change)) <= (0.004 * LESS) * ((double)((k) * (k) * (k) * (k)) * ((size) * (size))))
 #endif
 
 /* Taylor's coefficients h^k dq^(k) / k!, which TANGENT_END has in eight columns. */
