@@ -71,6 +71,7 @@ from scvi_codegen.codegen.variants import (
     TangentVectors,
     Variant,
 )
+from scvi_codegen.common.collection import without_collection
 from scvi_codegen.common.errors import MethodError, SizesRequiredError, SystemDefinitionError
 from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.methods import as_method, sliding
@@ -337,6 +338,7 @@ class Sources:
         size = workspace_in_pairs(program) if in_pairs(program) else interface.workspace
         return replace(interface, words=2, workspace=size)
 
+    @without_collection
     def integrator(self, *, controlled: bool = True) -> tuple[Source, Interface]:
         """Return the C source and its interface.
 
@@ -389,6 +391,7 @@ class Sources:
         """Return the source with Newton's iteration if the integrator itself contains none."""
         return render(self.program(fallback=True), fallback="provided") if self.uses_fallback_library else None
 
+    @without_collection
     def tangent(self, *, second: bool = False) -> Source | None:
         """Return the source with first, or also second, derivatives of steps with respect to all their arguments.
 
@@ -485,6 +488,7 @@ class Sources:
         at_momenta = dict(zip(self.system.velocities, velocities, strict=True))
         return [value.xreplace(at_momenta) for value in values]
 
+    @without_collection
     def variant(self, variant: Variant) -> Source | None:
         """Return the source of a variant; ``None`` if the method lacks it."""
         if self.precision == DOUBLE_DOUBLE:
@@ -535,6 +539,7 @@ class ArraySources(Sources):
         by_momenta = self.g is None and self.solver == "fixed-point" and self.system.coupled_terms
         return site_hamiltonian(self.system) if by_momenta and not self.system.bath else None
 
+    @without_collection
     def integrator(self, *, controlled: bool = True) -> tuple[Source, Interface]:
         """Return the C source and its interface; arguments as of :meth:`Sources.integrator`."""
         program = self.program()
@@ -604,6 +609,7 @@ def _modes_of(kinks: Iterable[Kink]) -> tuple[tuple[str, ...], ...]:
 
 
 @checks_arguments(system=SYSTEM, symmetries=SYMMETRIES)
+@without_collection
 def generate_source(
     system: MechanicalSystem,
     method: Method | str,

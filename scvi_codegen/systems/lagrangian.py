@@ -9,6 +9,7 @@ from numbers import Real
 from typing import TYPE_CHECKING, Any, Literal
 
 from scvi_codegen.common.atomic import naming_folders
+from scvi_codegen.common.collection import without_collection
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import FORMULAS, MAPPED, NAMES, NUMBERS, TEXTS, ArgumentType, checks_arguments
@@ -349,6 +350,7 @@ class LagrangianSystem(MechanicalSystem):
 
     @classmethod
     @checks_arguments(SystemDefinitionError, gravity=NUMBERS, **ROBOT)
+    @without_collection
     def from_urdf(
         cls,
         path: str | PathLike[str],
@@ -394,6 +396,7 @@ class LagrangianSystem(MechanicalSystem):
 
     @classmethod
     @checks_arguments(SystemDefinitionError, contacts=PLANES, **ROBOT)
+    @without_collection
     def from_mjcf(
         cls,
         path: str | PathLike[str],
