@@ -17,8 +17,8 @@ REFUSALS = {
     1: "the run starts at t = {t:.17g} with the gap of contact {k} at {value:.6g}, which must not be negative: correct "
     "the initial positions, or the sign of the gap",
     3: "no impulses satisfy the law of impact with friction at t = {t:.17g}, contact {k}: reduce its friction",
-    5: "contact {k} has impossible coefficients at t = {t:.17g}: friction is {value:.6g}, which must not be negative, "
-    "nor at rest above static friction; restitution must be 0 to 1",
+    5: "contact {k} has an impossible coefficient at t = {t:.17g}, {value:.6g}: friction must not be negative, nor "
+    "static friction at rest less than that of sliding; restitution must be 0 to 1",
     6: "contact {k} pulls, or exceeds its friction, at t = {t:.17g} in each mode that was tried: limit the steps by "
     "max_step= (or h=), or reduce its friction",
     7: "simultaneous impacts with friction would create kinetic energy by Newton's law at t = {t:.17g}, contact {k}: "

@@ -342,13 +342,15 @@ static int painleve(const contact_problem *in, real *entry)
   return -1;
 }
 
-/* Whether friction is negative, less static than sliding at rest, or a restitution is not in [0, 1]. */
-static int is_impossible(const contact_terms *of, int k)
+/* Whether friction is negative, less static than sliding at rest, or a restitution is not in [0, 1]; that number. */
+static int is_impossible(const contact_terms *of, int k, real *number)
 {
   const real mu = of->coefficient[3 * k], held = of->coefficient[3 * k + 1], e = of->coefficient[3 * k + 2];
   const int slip = CONTACTS[k].tangential;
   const int rests = slip >= 0 && length_of(of->rate + slip, CONTACTS[k].slips) <= CONTACT_ROUNDING * of->speed[slip];
-  return !(mu >= 0.0 && held >= 0.0 && e >= 0.0 && e <= 1.0) || (rests && held < (1.0 - CONTACT_ROUNDING) * mu);
+  const int is_friction = !(mu >= 0.0 && held >= 0.0) || (rests && held < (1.0 - CONTACT_ROUNDING) * mu);
+  *number = is_friction ? fmin(mu, held) : e;
+  return is_friction || !(e >= 0.0 && e <= 1.0);
 }
 
 /* Sets the consistent modes at a state that stick most, of redundant contacts those near given forces. */

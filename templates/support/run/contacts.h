@@ -144,6 +144,7 @@ static int begin_contacts(const event_step *step, event_sample *at)
 {
   contact_terms of;
   contact_change now;
+  real impossible = 0.0;
   int status;
   memset(&now, 0, sizeof now);
   for (int k = 0; k < EVENT_CONTACTS; k++)
@@ -154,8 +155,8 @@ static int begin_contacts(const event_step *step, event_sample *at)
     const int row = CONTACTS[k].normal;
     if (row >= 0 && !of.absent[k] && of.value[row] < -CONTACT_PENETRATION * of.size[row])
       status = refuse(step, CONTACT_PENETRATES, k, of.value[row]);
-    if (status == OK && is_impossible(&of, k))
-      status = refuse(step, CONTACT_IMPOSSIBLE, k, of.coefficient[3 * k]);
+    if (status == OK && is_impossible(&of, k, &impossible))
+      status = refuse(step, CONTACT_IMPOSSIBLE, k, impossible);
     now.closes[k] = row >= 0 && !of.absent[k] && fabs(of.value[row]) <= CONTACT_ROUNDING * of.size[row];
   }
   if (status == OK)
