@@ -147,6 +147,8 @@ def compile_stepper(
     shape: dict[str, Any] = {"mesh": system.mesh, "links": system.drawn_links}
     if sizes is not None or tables is not None:
         system, time_transformation = _at_sizes(system, time_transformation, sizes or {}, tables)
+        others = {"precision": precision, "controller": controller, "time_transformation": time_transformation}
+        system, rows = _with_contacts(system, method, kinks, (), **others)
     method = as_method(method, system)
     settings = solver, prefix, symmetries, time_transformation, controller, precision, kinks
     sources = CachedSources(system, method, *settings)

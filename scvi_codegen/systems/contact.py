@@ -34,6 +34,10 @@ WORDS = ("name", "impacts")
 """Arguments that are no formulas."""
 
 
+MOST_CONTACTS = 64
+"""Contacts of a system."""
+
+
 def _number(formula: Formula) -> float | None:
     """Return the value of a formula that is a number, else ``None``."""
     with suppress(TypeError, ValueError):

@@ -26,7 +26,7 @@ LOOPS = re.compile(r"\s+for\b.*", re.DOTALL)
 UNDEFINED = "the event function {function} is not finite in the step from t = {t:.17g}"
 UNDEFINED_CHANGE = (
     "the {changed} after the event {function} is not finite in the step from t = {t:.17g}: at the state of the event a "
-    "formula of then= is undefined, or its restitution is not from 0 to 1; change it, or limit the event by where="
+    "formula of then= is undefined, or its restitution is negative; change it, or limit the event by where="
 )
 ACCUMULATED = (
     "the crossings of the terminal event {function} accumulate at t = {t:.17g}: the run starts at its zero and "
@@ -67,7 +67,8 @@ PASSED = (
 )
 SLIDING = (
     "the motion slides on {function} = 0 at t = {t:.17g}: the forces on both sides of this jump point to it (dry "
-    "friction, a relay). Use sc.friction(..), or a smooth force such as tanh(u/width), or end the run there"
+    "friction, a relay). Use sc.friction(..), for forces along a slip also a method by its name ('svi:4'), or a smooth "
+    "force such as tanh(u/width), or end the run there"
 )
 
 
@@ -310,7 +311,7 @@ def impact(
 
     Args:
         function: g, in coordinates, time and parameters; a wall that depends on time moves.
-        restitution: coefficient e, a number from 0 to 1 or a formula.
+        restitution: coefficient e, a number from 0 to 1 or a formula, whose values must not be negative.
         where, terminal: as of :class:`Event`.
     """
     return Event(function, direction=-1, terminal=terminal, where=where, restitution=restitution)

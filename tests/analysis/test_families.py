@@ -75,7 +75,7 @@ def test_a_family_of_one_orbit_goes_on_from_its_file(pendulum, tmp_path):
 def test_family_ends_where_rounding_errors_hide_the_orbit(pendulum):
     """Near the separatrix runs of a period do not close: they pass the upper equilibrium."""
     family = sc.family(pendulum, sc.equilibrium(pendulum, [0.0]), amplitude=0.1, step=1.0)
-    assert re.search(r"period 31.*, whose least speed is 1.0e-02 of the mean \(0 at a homoclinic", family.ended)
+    assert re.search(r"period 3\d\..*, whose least speed is \S+e-03 of the mean \(0 at a homoclinic", family.ended)
     assert "no periodic orbit was found" in family.ended
     assert max(orbit.residual for orbit in family) < 1e-2
     assert not family.bifurcations

@@ -60,12 +60,13 @@ def test_multibody_systems_are_measured_without_peers(make):
     assert 0.0 < min(each.error for each in result.measurements) < 1e-6
 
 
-@pytest.mark.parametrize(("name", "setting"), [("mujoco", "h=0.01"), ("pinocchio", "h=0.01"), ("exudyn", "rtol=1e-06")])
-def test_chains_move_in_engines_as_here(name, setting):
+@pytest.mark.parametrize(("name", "most"), [("mujoco", 0.01), ("pinocchio", 0.01), ("exudyn", 1e-6)])
+def test_chains_move_in_engines_as_here(name, most):
+    """At steps or tolerances of at most ``most``."""
     pytest.importorskip(name, reason="extra bench")
     robot = chain(3)
-    contenders = getattr(engines, f"{name}_contenders")(robot, quick=True)
-    found = end(next(each for each in contenders if each.setting == setting))
+    contenders = getattr(engines, f"{name}_contenders")(robot, quick=name == "exudyn")
+    found = end(next(each for each in contenders if float(each.setting.partition("=")[2]) <= most))
     assert np.abs(found - ours(robot, "svi:4", 200)).max() < 2e-6
 
 

@@ -166,7 +166,7 @@ def test_json_of_families_is_that_of_the_model_file_and_of_a_file_that_continues
     assert parse_model(dump_model(model)) == model
     half = json_of("family", "own.toml", "--q", "0", "--method", "svi:4", "-o", "half.npz")
     assert half["orbits"] == whole["orbits"][:2]
-    again = json_of("family", "own.toml", "--q", "0", "--method", "svi:4", "--resume", "half.npz")
+    again = json_of("family", "own.toml", "--method", "svi:4", "--resume", "half.npz")
     assert [orbit["period"] for orbit in again["orbits"]] == pytest.approx(
         [orbit["period"] for orbit in whole["orbits"]], rel=1e-9
     )

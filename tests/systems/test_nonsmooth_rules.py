@@ -146,7 +146,9 @@ DRY: dict[str, tuple[str, dict[str, str], list[sc.Friction]]] = {
 
 
 @STEPS
-@pytest.mark.parametrize("name", DRY)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in ("coulomb", "in space") else pytest.mark.rotated) for name in DRY]
+)
 def test_forces_that_jump_along_a_slip_are_dry_friction(name: str, steps: dict[str, float]) -> None:
     names, forces, contacts = DRY[name]
     text, bias = " + ".join(f"({x}_dot**2 - {x}**2)/2" for x in names.split()), name == "two-sided"
@@ -169,10 +171,25 @@ def test_friction_is_part_of_steppers_of_either_precision(contacts: list[sc.Fric
     assert stepper.integrate([1.0], [0.0], t_end=13.0, error=1e-8).q[-1] == pytest.approx([-0.1], abs=1e-8)
 
 
-@pytest.mark.parametrize("force", ["d*sign(x_dot)", "-d*x_dot*abs(x_dot)", "-d*sign(x) - x_dot"])
+@pytest.mark.parametrize("force", ["d*sign(x_dot)", "-d*x_dot*abs(x_dot)", "-d*sign(x) - x_dot", "-d*x*sign(x_dot)"])
 def test_other_jumps_are_no_friction(force: str) -> None:
-    """Forces that supply energy, that are continuous at rest, and of positions alone."""
+    """Forces that supply energy, or may do so, that are continuous at rest, and of positions alone."""
     assert not made("x_dot**2/2 - x**2/2", forces={"x": force}, d=0.15).interface.contacts
+
+
+@pytest.mark.parametrize("size", [3, pytest.param(70, marks=pytest.mark.rotated), "N"])
+def test_friction_of_arrays_is_one_contact_an_element_of_at_most_64(size: int | str) -> None:
+    """Smooth forces of arrays of run-time sizes are no expressions."""
+    text, force = f"sum(i in {size}, x_dot[i]**2/2 - x[i]**2/2)", "-0.15*sign(x_dot[i])"
+    array = lagrange("array", f"x[{size}]", text, forces={"x[i]": force})
+    known = {"sizes": {"N": 3}} if size == "N" else {}
+    stepper = sc.compile_stepper(array, "svi:2", flags=QUICK_FLAGS, **known)
+    assert len(stepper.interface.contacts) == (0 if size == 70 else 3)
+    if size != 70:
+        run = stepper.integrate([1.0, 0.5, 0.1], [0.0] * 3, h=0.1, t_end=13.0)
+        assert run.q[-1] == pytest.approx([-0.1, -0.1, 0.1], abs=1e-6)
+    smooth = lagrange("array", "x[N]", "sum(i in N, x_dot[i]**2/2 - x[i]**2/2)", forces={"x[i]": "-x_dot[i]*abs(x[i])"})
+    assert sc.compile_stepper(smooth, "svi:2", flags=QUICK_FLAGS, kinks="as formulas").run_time_sizes
 
 
 @STEPS

@@ -30,7 +30,7 @@ from scvi_codegen.common.display.mathml import mathml_terms
 from scvi_codegen.common.display.page import mathematics_font
 from scvi_codegen.common.errors import ArgumentError, ExpressionError, MethodError, StateError, closest
 from scvi_codegen.common.representation import summary
-from scvi_codegen.common.validation import ArgumentType, checks_arguments, keyword_hint
+from scvi_codegen.common.validation import ArgumentType, checks_arguments, keyword_hint, of
 from scvi_codegen.interfaces.models.model import DEFAULT_METHOD, Model
 from scvi_codegen.interfaces.models.model_files.document import document_of
 from scvi_codegen.interfaces.models.model_files.model_file import document_in, load_model
@@ -89,13 +89,14 @@ HEIGHT = 760
 """Height of a page in a notebook, in pixels."""
 WHOLE = 24
 """Number of coordinates up to which plots show each of them; of more, two nodes."""
+FAMILY = of("a family of periodic orbits, of scvi_codegen.family", Family)
 MODEL = ArgumentType(
     "a Model, a system or the path of a model file",
     lambda value: isinstance(value, Model | str | os.PathLike) or SYSTEM_OR_ARRAYS.accepts(value),
 )
 
 
-@checks_arguments(model=MODEL)
+@checks_arguments(model=MODEL, family=FAMILY)
 def page(
     model: Any,
     *,

@@ -16,7 +16,7 @@ R and g, which contains multipliers, are differentiated by differences.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -110,9 +110,9 @@ def jumps_within(
             jumps[k] = _end_of_part(states, starts, k, row)
     if stepper.modes and numbers[0] == 0:
         t, state = float(states.t[0]), np.concatenate([states.q[0], states.p[0]])
-        rows = [0, min(1, len(states) - 1)]
+        rows = [len(states) - 1, 0, min(1, len(states) - 1)]
         ends = np.concatenate([states.q[rows], states.p[rows]], axis=1)
-        check_sides(stepper, ends, tuple(states.t[rows].tolist()), float(starts.h[0]), parameters_on_sides(states, t))
+        check_sides(stepper, ends, states.t[rows].tolist(), float(starts.h[0]), parameters_on_sides(states, t))
         here = Place(states, t, parameters_on_sides(states, t), all_inputs)
         matrix = _with_directions(here, np.eye(stepper._input_size), state, 0.0 * here.parameters)
         matrix[:, [len(state) + column for column in stepper.mode_columns]] = 0.0
@@ -120,18 +120,25 @@ def jumps_within(
     return jumps
 
 
-def check_sides(stepper: Integrator, ends: Array, t: tuple[float, float], h: float, parameters: Array) -> None:
-    """Raise :class:`StateError` if two states (2, 2m) rest at a kink beside which steps have different derivatives."""
+def check_sides(stepper: Integrator, states: Array, t: Sequence[float], h: float, parameters: Array) -> None:
+    """Raise :class:`StateError` if states rest at a kink beside which steps have different derivatives.
+
+    Args:
+        stepper, h, parameters: of the steps.
+        states: (n, 2m) one for the sizes of kinks, and those at rest.
+        t: n times.
+    """
     if not any(isinstance(event, Kink) for event in stepper.searched):
         return
-    (q0, q), (p0, p) = np.split(ends, 2, axis=1)
-    before = abs(_event_values(stepper, q0, p0, t[0], parameters))
-    after = abs(_event_values(stepper, q, p, t[1], parameters))
+    positions, momenta = np.split(states, 2, axis=1)
+    at = zip(positions, momenta, t, strict=True)
+    before, *at_rest = (abs(_event_values(stepper, q, p, time, parameters)) for q, p, time in at)
+    after, q, p = np.max(at_rest, axis=0), positions[-1], momenta[-1]
     for kink in stepper.searched:
         if isinstance(kink, Kink) and after[n := _number(stepper, kink)] <= AT_KINK * before[n]:
             column = np.arange(len(parameters)) == stepper.interface.parameters.index(kink.mode)
             sides = (np.where(column, side, parameters) for side in (-BEYOND, BEYOND))
-            below, above = (stepper.jacobian(q, p, h, t[1], at) for at in sides)
+            below, above = (stepper.jacobian(q, p, h, t[-1], at) for at in sides)
             if abs(above - below).max() > CONTINUOUS * abs(above).max():
                 raise StateError(
                     f"the motion rests at a kink of its equations, {kink.title} = 0: "
@@ -143,8 +150,11 @@ def check_sides(stepper: Integrator, ends: Array, t: tuple[float, float], h: flo
 def _check_grazes(states: SavedStates, numbers: NDArray[np.intp], changed: Array) -> None:
     """Raise :class:`StateError` if a function whose crossings change the state or its rate touches 0 without crossing.
 
-    Derivatives are infinite on the side where it crosses. Zeros of time alone and events with ``where`` are left out.
+    Derivatives are infinite on the side where it crosses. Zeros of time alone, events with ``where``, and those of
+    arrays of run-time sizes are left out.
     """
+    if not states.stepper.binding.has("event_values"):
+        return
     stepper, first, last = states.stepper, max(numbers[0] - 1, 0), min(numbers[-1] + 2, len(states))
     own = [event for event in stepper.events for _ in stepper._events_of_entries(event)]
     events = [*own, *stepper.searched[len(stepper.events) :]]

@@ -126,7 +126,7 @@ class Noise(NamedTuple):
         coloured = any(isinstance(value, ColouredNoise) for value in (inputs or {}).values())
         if interface.temperature is None and ((seed != 0 and not coloured) or metropolis):
             raise StateError(f"{'metropolis' if metropolis else 'seed'}= {NO_BATH} '{interface.system}'")
-        if metropolis and stepper.run_time_sizes:
+        if metropolis and interface.layout.sizes:
             raise MethodError(f"metropolis=True is not available with arrays of run-time sizes: {SIZES_REQUIRED}")
         if metropolis and (interface.changes_energy != BATH_ENERGY or "symmetric" not in interface.notes):
             raise MethodError(

@@ -6,8 +6,8 @@ Let the forces f(q, v, t, s) contain the step s of a slip w = T(q, t) v + b(q, t
 
 motions may slide on w = 0 with the forces (f(1) + f(0))/2 + T^T tau, abs(tau) <= F (A. F. Filippov, *Differential
 Equations with Discontinuous Righthand Sides*, 1988). That is friction of the limit F without a gap, as are in space
-forces -F T^T w/sqrt(w_1^2 + w_2^2) of two slips. Jumps along other directions, and friction that would supply energy,
-stay as they are.
+forces -F T^T w/sqrt(w_1^2 + w_2^2) of two slips. Jumps along other directions, and forces that may
+supply energy, stay as they are.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from scvi_codegen.systems.contact import Friction
+from scvi_codegen.common.validation import OfRunTimeSizes
+from scvi_codegen.systems.contact import MOST_CONTACTS, Friction
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -36,9 +37,9 @@ def with_dry_friction(system: Any) -> Any:
     """Return the system with contacts in place of the dry friction in its forces; itself if there is none."""
     from scvi_codegen.systems.lagrangian import LagrangianSystem
 
-    if not isinstance(system, LagrangianSystem) or _is_smooth(system):
+    if not isinstance(system, LagrangianSystem) or isinstance(system, OfRunTimeSizes) or _is_smooth(system):
         return system
-    if system.clock or system.gauge != 0 or system.rotations:
+    if system.clock or system.gauge != 0 or system.rotations or system.bath is not None:
         return system
     forces, contacts = system.forces, []
     for slip, divided in _slips(system):
@@ -50,7 +51,9 @@ def with_dry_friction(system: Any) -> Any:
             if limit := _limit(system, slip, directions, pushes):
                 forces = others
                 contacts.append(Friction(slip if len(slip) > 1 else slip[0], limit))
-    return replace(system, forces=forces, contacts=(*system.contacts, *contacts)) if contacts else system
+    if not 0 < len(contacts) <= MOST_CONTACTS - len(system.contacts):
+        return system
+    return replace(system, forces=forces, contacts=(*system.contacts, *contacts))
 
 
 def _is_smooth(system: LagrangianSystem) -> bool:
@@ -111,7 +114,7 @@ def _divided(force: Expr, slip: Expr) -> tuple[Expr, Expr]:
 def _limit(
     system: LagrangianSystem, slip: Sequence[Expr], directions: Sequence[Sequence[Expr]], pushes: Sequence[Expr]
 ) -> Expr | None:
-    """Return F of forces -F T^T w/abs(w) if they are so, with one positive F at w = 0; else ``None``."""
+    """Return F of forces -F T^T w/abs(w) if they are so, with one F >= 0 for the default parameters; else ``None``."""
     from sympy import Add, S, cancel, solve
 
     from scvi_codegen.systems.formulas.kinks import switching_function, unit_step
@@ -127,9 +130,8 @@ def _limit(
     at_rest = solve(slip, velocities, dict=True)[0]
     own = [part for part in limit.atoms(unit_step) if switching_function(part.args[0])[0] in slip]
     above, below = (limit.xreplace(dict.fromkeys(own, side)).subs(at_rest) for side in (S.One, S.Zero))
-    value = above.subs(dict(zip(system.parameters, system.defaults, strict=True)))
-    is_continuous, is_positive = _vanishes(above - below), value.free_symbols or (value.is_finite and value > 0)
-    return limit if is_continuous and is_positive and above != 0 else None
+    value = limit.subs(dict(zip(system.parameters, system.defaults, strict=True)))
+    return limit if value.is_nonnegative and above != 0 and _vanishes(above - below) else None
 
 
 def _vanishes(expression: Expr) -> bool:

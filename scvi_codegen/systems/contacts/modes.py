@@ -14,7 +14,16 @@ from itertools import repeat
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.systems.contact import WORDS, Contact, ContactLike, Friction, Impacts, slips_of, static_limit
+from scvi_codegen.systems.contact import (
+    MOST_CONTACTS,
+    WORDS,
+    Contact,
+    ContactLike,
+    Friction,
+    Impacts,
+    slips_of,
+    static_limit,
+)
 from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.event import LOOPS, Formula
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
@@ -27,8 +36,6 @@ if TYPE_CHECKING:
     from scvi_codegen.systems.lagrangian import LagrangianSystem
 
 
-MOST_CONTACTS = 64
-"""Contacts of a system."""
 LEAST_SLIP = 10**200
 """Inverse fourth power of a slip that is no direction: formulas of a vector that may be 0 are finite."""
 

@@ -266,7 +266,7 @@ static int change_state(const event_step *step, int e, event_sample *at)
   const int is_impact = IS_IMPACT[EVENT_OF(e)];
   int status = changes_at(step, e, at, &wall), is_defined = 1;
   if (status == OK && is_impact && wall.rate < 0.0) {
-    is_defined = wall.restitution >= 0.0 && wall.restitution <= 1.0;
+    is_defined = wall.restitution >= 0.0;
     step->watch->history[e].slack = wall.slack;
     step->watch->history[e].rounding = wall.slack / -wall.rate;
     status = impact(step, at, &wall);

@@ -27,7 +27,7 @@ from scvi_codegen.runs.stepper import Stepper
 OWN = tuple(option.name for option in options_of("family"))
 NAMES, COUNT = {"vary": "parameter", "stride": "step"}, 50
 """Arguments of the function with other names here, and the largest number of orbits."""
-OF_START = {"parameter", "p", "velocity", "keyframe", "time", *OWN} - {"count", "until"}
+OF_START = {"parameter", "q", "p", "velocity", "keyframe", "time", *OWN} - {"count", "until"}
 """Options of the first orbit, which the file of a family contains."""
 
 
