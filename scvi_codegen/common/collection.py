@@ -11,7 +11,7 @@ Called = TypeVar("Called", bound=Callable[..., Any])
 def without_collection(function: Called) -> Called:
     """Return a function during which cyclic garbage is kept: expressions have no cycles, their references free them.
 
-    A derivation of a robot takes a quarter less processor time, in the same memory.
+    Derivations of robots take 9 % (18 degrees of freedom) to 25 % (11) less processor time, in the same memory.
     """
 
     @functools.wraps(function)

@@ -211,7 +211,7 @@ def _begun_at(model: Model, family: Family) -> Model:
 def _orbits(family: Family, *, from_momenta: bool) -> dict[str, Any]:
     """Return the orbits and bifurcations of a family in their order, as the scripts of the page read them."""
     places = [(k, "", orbit) for k, orbit in enumerate(family)]
-    places += [(found.after, found.kind, found.orbit) for found in family.bifurcations]
+    places += [(point.after, point.kind, point.orbit) for point in family.bifurcations]
     _, kinds, orbits = zip(*sorted(places, key=lambda place: place[0]), strict=True)  # stable
     name, sizes = sizes_of(orbits)
 
