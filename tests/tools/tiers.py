@@ -31,7 +31,7 @@ QUICK, SECOND = "not full and (quick or not second)", "second and not quick and 
 """Expressions of the quick tier, as in pyproject.toml, and of the second, for which ``-m second`` stands."""
 UNOPTIMISED_TIERS = (QUICK, SECOND, "not full")
 TIERS = ("quick", "second", "full", "rotated", "tiers")
-PARTS = 32
+PARTS = 48
 """Number of parts of the rotated cases, of which a run with SCVI_CODEGEN_TESTS_PART takes one."""
 
 Combination = tuple[tuple[str, int], ...]
