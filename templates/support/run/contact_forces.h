@@ -160,7 +160,7 @@ static real solve_contacts(const contact_terms *of, const contact_mode *mode, co
     }
     for (int i = 0; i < count; i++) {
       const real limit = in.owner[i] < 0 ? load : friction_limit(of, in.owner[i], 1, moved);
-      weight[i] = 1.0 / fmax(limit, CONTACT_SLOW * load);
+      weight[i] = load / fmax(limit, CONTACT_SLOW * load); /* forces may all be 0 */
     }
   }
   memset(moved, 0, sizeof moved);

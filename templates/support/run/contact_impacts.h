@@ -83,7 +83,7 @@ static int find_impulses(const event_step *step, const contact_terms *of, const 
   memset(total, 0, BYTES(CONTACT_ROWS));
   for (int round = 0; round < CONTACT_IMPACTS * EVENT_CONTACTS; round++) {
     real rate[CONTACT_ROWS], impulse[CONTACT_ROWS];
-    int meets[EVENT_CONTACTS], first = -1, several = 0;
+    int meets[EVENT_CONTACTS], shut[EVENT_CONTACTS], first = -1, several = 0;
     for (int r = 0; r < CONTACT_ROWS; r++)
       rate[r] = rate_after(of, of->rate, total, r);
     for (int k = EVENT_CONTACTS - 1; k >= 0; k--)
@@ -96,11 +96,12 @@ static int find_impulses(const event_step *step, const contact_terms *of, const 
       const int together = law == CONTACT_SIMULTANEOUS && law == CONTACTS[first].impacts && approaches[k];
       meets[k] = k == first || (together && rate[normal] <= CONTACT_ROUNDING * of->speed[normal]);
       several |= k != first && meets[k];
+      shut[k] = closed[k] || (approaches[k] && of->coefficient[3 * k + 2] == 0.0);
     }
     if (several && law != CONTACT_NEWTON)
       return refuse(step, CONTACT_GAINS_ENERGY, first, 0.0);
-    if (!impulses_of(of, meets, closed, law, rate, impulse) ||
-        (law == CONTACT_POISSON && !restitute(of, first, meets, closed, rate, impulse)))
+    if (!impulses_of(of, meets, shut, law, rate, impulse) ||
+        (law == CONTACT_POISSON && !restitute(of, first, meets, shut, rate, impulse)))
       return refuse(step, CONTACT_WITHOUT_IMPULSE, first, 0.0);
     for (int r = 0; r < CONTACT_ROWS; r++)
       total[r] += impulse[r];

@@ -362,7 +362,12 @@ static int choose_modes(const event_step *step, const contact_terms *of, const c
   int imposed[CONTACT_ROWS] = {0};
   for (int k = 0; k < EVENT_CONTACTS; k++)
     allow_modes(&in, k, now, step->watch->fastest[k]);
-  if (!relax_modes(&in, force, best)) {
+  int found = relax_modes(&in, force, best);
+  for (int k = 0; k < EVENT_CONTACTS && !found; k++) { /* where another slip unloads the one at its limit, that stays */
+    in.rests[k] |= in.begins[k] != 0;
+    in.begins[k] = 0;
+  }
+  if (!found && !relax_modes(&in, force, best)) {
     const int paradox = painleve(&in, &entry);
     return refuse(step, CONTACT_WITHOUT_MODE, paradox, paradox < 0 ? 0.0 : entry);
   }
