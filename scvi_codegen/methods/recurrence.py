@@ -52,7 +52,7 @@ GIVEN = ("q0", "p0", "h", "t", "inverse_mass")
 OF_C = C_KEYWORDS.union(
     """
     M L S i k e step data known acted dq dp number real lanes dd ddl force velocity NAN INFINITY NULL ALL CARRIES
-    COMPARISON DECAY EACH HOT MATH NAME PARAMETER REAL SELDOM SPLITTING STATUS TOLERANCE VANISHING WORDS
+    COMPARISON DECAY EACH HOT MATH NAME PARAMETER REAL SELDOM SPLITTING START STATUS TOLERANCE VANISHING WORDS
     """.split()  # noqa: SIM905  (as a paragraph)
 )
 """Names that quantities, rows and tables of statements cannot have, since they have another meaning in C."""

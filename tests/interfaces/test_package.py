@@ -1,5 +1,6 @@
 """Generated folders: C that any compiler takes, Python that needs no SymPy, files that are not lost."""
 
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -44,7 +45,8 @@ def test_folder_contains_a_complete_integrator(pendulum, tmp_path):
     folder = sc.generate_package(pendulum, tmp_path / "made" / "pendulum_svi")
     assert folder == tmp_path / "made" / "pendulum_svi"
     names = "Makefile README.md __init__.py interface.json main.c model.toml pendulum_svi.c pendulum_svi.h"
-    assert sorted(path.name for path in folder.iterdir()) == names.split()
+    further = ["pendulum_svi_adaptive.h", "pendulum_svi_mechanics.h"]
+    assert sorted(path.name for path in folder.iterdir()) == names.split() + further
     assert sc.load_model(folder / "model.toml") == pendulum
     assert "pendulum_svi_step" in (folder / "README.md").read_text()
 
@@ -60,6 +62,39 @@ def test_a_single_file_computes_the_same_bits(tmp_path):
     assert len(printed[0]) > 20
     assert printed[0] == printed[1]
     assert sc.load_package(single).step([0.5], [0.0], 0.1) == sc.load_package(many).step([0.5], [0.0], 0.1)
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize(("method", "lines"), [("stoermer-verlet", 250), ("composition:4", 260), ("svi:2", 3000)])
+def test_the_source_is_the_step_and_its_run(method, lines, tmp_path):
+    """The source ends with fixed steps; it and the files that it includes define what the header declares."""
+    model = model_of("kepler", method=sc.as_method(method), h=0.01)
+    folder = sc.generate_package(model, tmp_path / "kepler_run")
+    code = (folder / "kepler_run.c").read_text()
+    assert code.count("\n") <= lines
+    assert code.index("solve(") < code.index("kepler_run_advance(") < code.index('#include "kepler_run_mechanics.h"')
+    assert "kepler_run_energy(" not in code
+    assert "advance_to(" not in code
+    declared = re.findall(r"^\w[\w *]*?\b(kepler_run_\w+)\(", (folder / "kepler_run.h").read_text(), re.MULTILINE)
+    assert len(declared) >= 10
+    (folder / "all.c").write_text(
+        f'#include "kepler_run.h"\nint main(void) {{ return !({" && ".join(f"(long){name}" for name in declared)}); }}'
+    )
+    command = [needs("gcc"), "-std=c99", "-Werror", "all.c", "kepler_run.c", "-lm", "-o", "all"]
+    subprocess.run(command, cwd=folder, check=True)
+    subprocess.run([folder / "all"], check=True)
+    ours, other = sc.load_package(folder), sc.compile_stepper(model.system, model.method)
+    q, p = np.array([0.5, 0.1]), np.array([0.2, 1.7])
+    for call in (
+        lambda of: of.step(q, p, 0.1),
+        lambda of: of.velocity(q, of.momentum(q, p)),
+        lambda of: of.energy(q, p),
+        lambda of: of.momentum_maps(q, p),
+        lambda of: of.integrate(q, p, h=0.1, steps=50).p,
+        lambda of: of.integrate(q, p, t_end=2.0).q[-1] if method == "svi:2" else 0,
+        lambda of: of.discrete_lagrangian(q, q + 0.1, 0.1) if method != "composition:4" else 0,
+    ):
+        np.testing.assert_allclose(call(ours), call(other), rtol=1e-14)
 
 
 @pytest.mark.rotated

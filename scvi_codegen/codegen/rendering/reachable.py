@@ -17,6 +17,18 @@ from scvi_codegen.codegen.rendering.own_names import FileScope
 
 FIRST = "solve", "NAME(step)"
 """Functions whose source comes first."""
+FILES = {
+    "adaptive": ("Adaptive steps.", ("default_step_control", "smallest_tolerance", "advance_to")),
+    "mechanics": (
+        "Momenta and velocities, energies, conserved quantities, constraints; the discrete Lagrangian.",
+        (
+            *("momentum", "velocity", "energy", "energies", "momentum_maps", "rates"),
+            *("constraint_values", "project", "apart", "multipliers", "contact_terms"),
+            *("discrete_legendre", "work_and_impulses"),
+        ),
+    ),
+}
+"""Files behind that of the step and its run: what they are, and their exported functions."""
 PREFIXED = {"NAME", "STATUS"}
 """Macros of the prefix, which stay."""
 WORD = re.compile(r"\b(?:NAME|STATUS)\(\w+\)|(?<![.\w])(?<!->)[A-Za-z_]\w*")
@@ -24,6 +36,9 @@ COMMENTS = re.compile(r"/\*.*?\*/", re.DOTALL)
 REQUIRED = re.compile(r"\s+(?:\* )?Requires:.*?(?= \*/)", re.DOTALL)
 CHOICE = re.compile(r"\b[A-Z]{4,}(?:_[A-Z]+)*\b")
 """Name of an alternative or number in a comment."""
+ALIAS = re.compile(r"^#define (\w+)(?: ([A-Za-z_][\w ]*)|\((\w+)\) \3(?: /\*.*\*/)?)$", re.MULTILINE)
+"""Macro that is another name, keywords or its argument."""
+UNDEFINED = re.compile(r"^#undef (\w+)$", re.MULTILINE)
 CHOICES = "/* Choices of this integrator among the alternatives of the support headers. */\n"
 
 
@@ -64,15 +79,31 @@ class Part:
                 yield from part.leaves
 
 
-def readable(code: str) -> str:
-    """Return a source of one file without what no exported function reaches, the step first."""
+def readable(code: str) -> dict[str, str]:
+    """Return the files of a source, without what no exported function reaches, in the order in which C reads them.
+
+    The first one, of the name "", has the step and its run; the others are those of :data:`FILES` that are not empty.
+    """
     if "#define NAME(" not in code:
-        return code
-    code = code.replace(CHOICES, "")
+        return {"": code}
+    code = _without_aliases(code.replace(CHOICES, ""))
     scope = FileScope(code)
     parts = tuple(_parts(code.split("\n"), scope, ()))
-    text = "\n".join(_lines(_without_alternatives(_ordered(_reached(parts)))))
-    return re.sub(r"\n{3,}", "\n\n", text) + "\n"
+    files = _by_file(_without_alternatives(_reached(parts)))
+    texts = {
+        name: "\n".join([f"/* {FILES[name][0]} */\n" if name else "", *_lines(file)]).strip("\n")
+        for name, file in files.items()
+    }
+    return {name: re.sub(r"\n{3,}", "\n\n", text) + "\n" for name, text in texts.items()}
+
+
+def _without_aliases(code: str) -> str:
+    """Return a source with other names, or its argument, in place of each macro that is nothing else."""
+    for name, body, _ in ALIAS.findall(code):
+        if len(re.findall(rf"^#.*\b{name}\b", code, re.MULTILINE)) == 1:  # no condition, and no other definition
+            used = rf"(?<!#define )\b{name}\b"
+            code = re.sub(used, body, code) if body else re.sub(rf"{used}\(([^()]*)\)", r"\1", code)
+    return code
 
 
 def _parts(lines: Sequence[str], scope: FileScope, conditions: tuple[str, ...]) -> Iterator[Part]:
@@ -101,7 +132,9 @@ def _parts(lines: Sequence[str], scope: FileScope, conditions: tuple[str, ...]) 
 
 def _names(scope: FileScope, block: Sequence[str]) -> frozenset[str]:
     """Return the names that a declaration or macro makes, without parts of them that a macro contains."""
-    return frozenset(name for name in scope.names("\n".join(block)) if not name.endswith("_")) - PREFIXED
+    text = "\n".join(block)
+    names = {name for name in scope.names(text) if not name.endswith("_")}
+    return frozenset(names.union(UNDEFINED.findall(text)) - PREFIXED)
 
 
 def _continued(line: str, rest: Iterator[str]) -> Iterator[str]:
@@ -177,30 +210,59 @@ def _kept(part: Part, reached: set[Part]) -> Part | None:
     return replace(part, lines=(*lines, "#endif"), branches=tuple(branches))
 
 
-def _ordered(parts: Sequence[Part]) -> list[Part]:
-    """Return parts with the step and what it needs first; in their order if a name has several declarations."""
-    by_name = {name: part for part in parts for name in part.names}
-    declared = [name for part in parts for leaf in part.leaves if leaf.lines[0][0] != "#" for name in leaf.names]
-    if sum(len(part.names) for part in parts) > len(by_name) or len(declared) > len({*declared}):
-        return [*parts]
-    order: dict[Part, None] = {}
+def _by_file(parts: Sequence[Part]) -> dict[str, list[Part]]:
+    """Return the parts of each file by its name, each behind those that it needs; the step comes first."""
+    needed, placed = _needed(parts), set[Part]()
+    files: dict[str, list[Part]] = {"": [], **{name: [] for name in FILES}}
+    further = {f"NAME({function})": name for name, (_, functions) in FILES.items() for function in functions}
 
-    def place(part: Part) -> None:
-        if part in order or part in placing:
-            return
-        placing.add(part)
-        needed = {by_name[word] for word in part.words & by_name.keys()}
-        for other in parts:
-            if other in needed:
-                place(other)
-        order[part] = None
+    def place(part: Part, file: list[Part]) -> None:
+        if part not in placed:
+            placed.add(part)
+            for other in needed[part]:
+                place(other, file)
+            file.append(part)
 
-    placing = set[Part]()
-    first = [part for part in parts if not part.names]
+    exported = [part for part in parts if _is_exported(part)]
     steps = [part for name in FIRST for part in parts if name in part.names]
-    for part in (*first, *steps, *filter(_is_exported, parts), *parts):
-        place(part)
-    return [*order]
+    run = [part for part in exported if not part.names <= further.keys()]
+    for part in (*(part for part in parts if not part.names), *steps, *run):
+        place(part, files[""])
+    for name, file in files.items():
+        for part in exported:
+            if name in map(further.get, part.names):
+                place(part, file)
+    for part in parts:
+        place(part, file)
+    return {name: file for name, file in files.items() if file}
+
+
+def _needed(parts: Sequence[Part]) -> dict[Part, list[Part]]:
+    """Return the parts that must precede each one: all of them did so before.
+
+    They declare what it uses, directly or in a macro, or mention a macro that it defines, undefines or changes.
+    """
+    macros: dict[str, set[str]] = {}
+    for leaf in (leaf for part in parts for leaf in part.leaves if leaf.lines[0].startswith(("#define", "#undef"))):
+        for name in leaf.names:
+            macros.setdefault(name, set()).update(leaf.words)
+    declaring: dict[str, list[Part]] = {}
+    mentioning: dict[str, list[Part]] = {name: [] for name in macros}
+    needed: dict[Part, list[Part]] = {}
+    for part in parts:
+        words, pending = set[str](), [*part.words]
+        while pending:
+            if (word := pending.pop()) not in words:
+                words.add(word)
+                pending += macros.get(word, ())
+        before = {other for word in words for other in declaring.get(word, ())}
+        before |= {other for name in part.names for other in mentioning.get(name, ())}
+        needed[part] = [other for other in needed if other in before]
+        for name in part.names:
+            declaring.setdefault(name, []).append(part)
+        for word in words & macros.keys():
+            mentioning[word].append(part)
+    return needed
 
 
 def _lines(parts: Sequence[Part]) -> Iterator[str]:

@@ -1,7 +1,8 @@
 """C source of an integrator, and the interface that is needed to call it.
 
 An integrator is one header and one source file, ``<prefix>.h`` and ``<prefix>.c``. The latter includes support headers,
-plain C that is the same for every integrator, from a folder ``support``; amalgamated, it contains them.
+plain C that is the same for every integrator, from a folder ``support``; amalgamated, it contains them. To be read it
+contains the step and its run, and includes the rest of what an integrator uses.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from scvi_codegen.version import __version__
 
 TEXTS = ("header", "code", "declarations")
 PREFIX = re.compile(r"[A-Za-z_]\w*", re.ASCII)
-SUPPORT = re.compile(r"support/(?:\w+/)?\w+\.h", re.ASCII)
+SUPPORT = re.compile(r"(?:support/(?:\w+/)?)?\w+\.h", re.ASCII)
 """Names of files, which are written into a folder and must not lead out of it."""
 KINDS: dict[str, Callable[[Any], bool]] = {
     "str": lambda value: isinstance(value, str),
@@ -168,17 +169,27 @@ class Source:
         beside = self.beside.amalgamated() if self.beside else None
         return replace(self, code=code, support=(), beside=beside)
 
+    @property
+    def _readable_files(self) -> dict[str, str]:
+        """Files without what no exported function uses, by name; that of the step first."""
+        files = readable(self.amalgamated().code)
+        return dict(zip(files, with_exported_names("\f".join(files.values())).split("\f"), strict=True))
+
     def readable(self) -> Source:
-        """Return the source as one file without what no exported function uses, the step first."""
-        code = with_exported_names(readable(self.amalgamated().code))
-        return replace(self, code=code, support=(), beside=self.beside.readable() if self.beside else None)
+        """Return the source without what no exported function uses, the step first; the code includes what follows."""
+        (_, code), *rest = self._readable_files.items()
+        support = tuple(
+            (f"{self.prefix}_{name}.h", f"/* Included by {self.prefix}.c. */\n\n{text}") for name, text in rest
+        )
+        code += "".join(f'\n#include "{name}"' for name, _ in support) + "\n" * bool(support)
+        return replace(self, code=code, support=support, beside=self.beside.readable() if self.beside else None)
 
     def single_file(self) -> Source:
         """Return the source as one file whose names have the integrator's prefix.
 
         Files of several integrators can be included in one translation unit.
         """
-        code = with_own_names(self.readable().code, self.prefix, self.header)
+        code = with_own_names("\n".join(self._readable_files.values()), self.prefix, self.header)
         return replace(self, code=code, support=(), beside=self.beside.single_file() if self.beside else None)
 
     def to_record(self) -> dict[str, Any]:
@@ -198,7 +209,7 @@ class Source:
         for name, pattern in zip(names, (PREFIX, *[SUPPORT] * len(names)), strict=False):
             if not (isinstance(name, str) and pattern.fullmatch(name)):
                 raise ValueError(
-                    f"{name!r} is not the name of a file of an integrator: it must be a C identifier, or support/NAME.h"
+                    f"{name!r} is not the name of a file of an integrator: a C identifier, NAME.h, or support/NAME.h"
                 )
         beside = record["beside"]
         return cls(

@@ -28,7 +28,9 @@ from scvi_codegen.interfaces.models.packages.package import generate_package
     type=click.Choice(["double", "single"]),
     help="C for a microcontroller, in this precision, without a Python package.",
 )
-@click.option("--single-file", is_flag=True, help="Give all names the prefix: other C files can include the source.")
+@click.option(
+    "--single-file", is_flag=True, help="One source, all names with the prefix: other C files can include it."
+)
 @click.option("--fmu", is_flag=True, help="Write an FMU 3.0 for co-simulation: -o NAME.fmu.")
 @click.option(
     "--platform",

@@ -1,6 +1,7 @@
 """Generated folders: a complete integrator as C code for C programs, and as an importable package for Python.
 
-    pendulum_svi/  pendulum_svi.h  pendulum_svi.c   the integrator, C99
+    pendulum_svi/  pendulum_svi.h  pendulum_svi.c   the integrator, C99: the step and its run
+                   pendulum_svi_mechanics.h, ..     what follows these, included by pendulum_svi.c
                    main.c  Makefile                 ``make run`` runs the example with a C compiler and libm
                    __init__.py  interface.json      ``import pendulum_svi`` provides ``pendulum_svi.stepper``
                    model.toml  README.md            the model file, and instructions
@@ -236,7 +237,7 @@ def generate_package(
         force: overwrite files of the same names that were edited or not generated.
         embedded: the precision, ``"double"`` or ``"single"``, of C for a microcontroller, without a Python package;
             arrays have the sizes of the model.
-        single_file: give all names at file scope the prefix, so that one C file can include several integrators.
+        single_file: write one C file whose names all have the prefix, so that others can include several integrators.
 
     Returns:
         The folder.
