@@ -39,6 +39,8 @@ CHOICE = re.compile(r"\b[A-Z]{4,}(?:_[A-Z]+)*\b")
 ALIAS = re.compile(r"^#define (\w+)(?: ([A-Za-z_][\w ]*)|\((\w+)\) \3(?: /\*.*\*/)?)$", re.MULTILINE)
 """Macro that is another name, keywords or its argument."""
 UNDEFINED = re.compile(r"^#undef (\w+)$", re.MULTILINE)
+MEANINGS = "#define", "#undef", "typedef", "struct"
+"""Beginnings of declarations on whose words those depend that mention their names."""
 CHOICES = "/* Choices of this integrator among the alternatives of the support headers. */\n"
 
 
@@ -213,55 +215,54 @@ def _kept(part: Part, reached: set[Part]) -> Part | None:
 def _by_file(parts: Sequence[Part]) -> dict[str, list[Part]]:
     """Return the parts of each file by its name, each behind those that it needs; the step comes first."""
     needed, placed = _needed(parts), set[Part]()
-    files: dict[str, list[Part]] = {"": [], **{name: [] for name in FILES}}
-    further = {f"NAME({function})": name for name, (_, functions) in FILES.items() for function in functions}
+    file_of = {f"NAME({function})": name for name, (_, functions) in FILES.items() for function in functions}
+    steps = [part for name in FIRST for part in parts if name in part.names]
+    ends = {"": [*(part for part in parts if not part.names), *steps], **{name: list[Part]() for name in FILES}}
+    for part in filter(_is_exported, parts):
+        ends[min(file_of.get(name, "") for name in part.names)].append(part)
 
-    def place(part: Part, file: list[Part]) -> None:
+    def place(part: Part) -> Iterator[Part]:
         if part not in placed:
             placed.add(part)
             for other in needed[part]:
-                place(other, file)
-            file.append(part)
+                yield from place(other)
+            yield part
 
-    exported = [part for part in parts if _is_exported(part)]
-    steps = [part for name in FIRST for part in parts if name in part.names]
-    run = [part for part in exported if not part.names <= further.keys()]
-    for part in (*(part for part in parts if not part.names), *steps, *run):
-        place(part, files[""])
-    for name, file in files.items():
-        for part in exported:
-            if name in map(further.get, part.names):
-                place(part, file)
-    for part in parts:
-        place(part, file)
-    return {name: file for name, file in files.items() if file}
+    files = {}
+    for name, parts_at_end in ends.items():
+        file = [part for end in parts_at_end for part in place(end)]
+        declared = {word for part in placed for word in part.names}
+        if file := file + [part for end in parts if end.names & declared for part in place(end)]:
+            files[name] = file
+    return files
 
 
 def _needed(parts: Sequence[Part]) -> dict[Part, list[Part]]:
     """Return the parts that must precede each one: all of them did so before.
 
-    They declare what it uses, directly or in a macro, or mention a macro that it defines, undefines or changes.
+    They declare what it uses, directly or by a macro or type, or mention a macro that it defines, undefines or changes.
     """
-    macros: dict[str, set[str]] = {}
-    for leaf in (leaf for part in parts for leaf in part.leaves if leaf.lines[0].startswith(("#define", "#undef"))):
-        for name in leaf.names:
-            macros.setdefault(name, set()).update(leaf.words)
+    meanings: dict[str, set[str]] = {}
+    mentioning: dict[str, list[Part]] = {}
     declaring: dict[str, list[Part]] = {}
-    mentioning: dict[str, list[Part]] = {name: [] for name in macros}
+    for leaf in (leaf for part in parts for leaf in part.leaves if leaf.lines[0].startswith(MEANINGS)):
+        for name in leaf.names:
+            meanings.setdefault(name, set()).update(leaf.words)
     needed: dict[Part, list[Part]] = {}
     for part in parts:
         words, pending = set[str](), [*part.words]
         while pending:
             if (word := pending.pop()) not in words:
                 words.add(word)
-                pending += macros.get(word, ())
+                pending += meanings.get(word, ())
         before = {other for word in words for other in declaring.get(word, ())}
-        before |= {other for name in part.names for other in mentioning.get(name, ())}
+        if any(leaf.lines[0].startswith("#") for leaf in part.leaves):
+            before |= {other for name in part.names for other in mentioning.get(name, ())}
         needed[part] = [other for other in needed if other in before]
         for name in part.names:
             declaring.setdefault(name, []).append(part)
-        for word in words & macros.keys():
-            mentioning[word].append(part)
+        for word in words:
+            mentioning.setdefault(word, []).append(part)
     return needed
 
 

@@ -28,6 +28,14 @@
   {                                                                                                               \
     return count ? failed(instance, fmi3Error, "this FMU has no variables of type " #type) : fmi3OK;              \
   }
+#define ONLY_CO_SIMULATION(word, ...)                                                                             \
+  FMI_EXPORT fmi3Instance FMI(word)(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, \
+      fmi3Boolean logging, fmi3InstanceEnvironment environment, __VA_ARGS__)                                      \
+  {                                                                                                               \
+    if (log)                                                                                                      \
+      log(environment, fmi3Error, "logStatusError", "this FMU supports only co-simulation");                      \
+    return NULL;                                                                                                  \
+  }
 
 /* clang-format off */
 NO_VARIABLES(Float32)
@@ -81,21 +89,7 @@ NO_MODE(EnterConfigurationMode)
 NO_MODE(ExitConfigurationMode)
 NO_MODE(EvaluateDiscreteStates)
 NO_MODE(EnterContinuousTimeMode)
+ONLY_CO_SIMULATION(InstantiateModelExchange, fmi3LogMessageCallback log)
+ONLY_CO_SIMULATION(InstantiateScheduledExecution, fmi3LogMessageCallback log, fmi3Callback clock_update,
+    fmi3Callback lock, fmi3Callback unlock)
 /* clang-format on */
-
-FMI_EXPORT fmi3Instance FMI(InstantiateModelExchange)(fmi3String name, fmi3String token, fmi3String resources,
-    fmi3Boolean visible, fmi3Boolean logging, fmi3InstanceEnvironment environment, fmi3LogMessageCallback log)
-{
-  if (log)
-    log(environment, fmi3Error, "logStatusError", "this FMU supports only co-simulation");
-  return NULL;
-}
-
-FMI_EXPORT fmi3Instance FMI(InstantiateScheduledExecution)(fmi3String name, fmi3String token, fmi3String resources,
-    fmi3Boolean visible, fmi3Boolean logging, fmi3InstanceEnvironment environment, fmi3LogMessageCallback log,
-    fmi3Callback clock_update, fmi3Callback lock, fmi3Callback unlock)
-{
-  if (log)
-    log(environment, fmi3Error, "logStatusError", "this FMU supports only co-simulation");
-  return NULL;
-}
