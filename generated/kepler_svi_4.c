@@ -12,11 +12,11 @@
 
 /* Choices of this integrator among the alternatives of the support headers. */
 #define MOMENTUM_MAPS /* first integrals from symmetries */
+#define SPURIOUS_TESTED /* solutions of Newton's method */
+#define DISCRETE_LAGRANGIAN
 #ifndef __GNUC__ /* no vector extensions */
 #define NEWTON_ALONE
 #endif
-#define SPURIOUS_TESTED /* solutions of Newton's method */
-#define DISCRETE_LAGRANGIAN
 
 enum {
   M = 2, /* coordinates */

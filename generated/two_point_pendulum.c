@@ -12,12 +12,12 @@
 #define TOLERANCE 2.220446049250313e-16 /* default */
 
 /* Choices of this integrator among the alternatives of the support headers. */
-#ifndef __GNUC__ /* no vector extensions */
-#define NEWTON_ALONE
-#endif
 #define UNROLLED_EQUATIONS /* stage equations without loops */
 #define SPURIOUS_TESTED /* solutions of Newton's method */
 #define DISCRETE_LAGRANGIAN
+#ifndef __GNUC__ /* no vector extensions */
+#define NEWTON_ALONE
+#endif
 
 enum {
   M = 1, /* coordinates */
