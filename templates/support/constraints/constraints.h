@@ -440,14 +440,14 @@ int NAME(multipliers)(long long count, const real *t, const real *q, const real 
 #ifdef MASKED_CONSTRAINTS
 
 /* Masked constraints at a state, for the choice of their modes and for impacts: values g, rates G v + .., second rates
- * without forces of these constraints, the matrix W = G M^-1 G^T by rows, G by rows, then the coefficients of the
- * contacts. M^-1 includes the reactions of the other constraints. Parameters with masks of 0, and of 1. */
+ * without forces of these constraints, the rounding sizes of g, the matrix W = G M^-1 G^T by rows, G by rows, then the
+ * coefficients of the contacts. M^-1 includes the reactions of the other constraints. Parameters with masks of 0, and of 1. */
 int NAME(contact_terms)(real t, const real *q, const real *p, const real *idle, const real *imposed, real *terms,
     real *workspace)
 {
   enum { FIRST = CONSTRAINTS - MASKED };
   saddle *at = saddle_in(workspace);
-  real *rate = terms + MASKED, *second = rate + MASKED, *W = second + MASKED, *G = W + MASKED * MASKED;
+  real *rate = terms + MASKED, *second = rate + MASKED, *size = second + MASKED, *W = size + MASKED, *G = W + MASKED * MASKED;
   real u[2 * M], g[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES], value[M + 2 * CONSTRAINTS], right[CONSTRAINTS] = {0};
   real x[M], y[CONSTRAINTS];
   int status = find_velocity(t, q, p, idle, u + M, workspace);
@@ -460,6 +460,8 @@ int NAME(contact_terms)(real t, const real *q, const real *p, const real *idle, 
   constrained_motion(u, t, imposed, value);
   memcpy(terms, g + FIRST, sizeof(real) * MASKED);
   memcpy(rate, value + M + FIRST, sizeof(real) * MASKED);
+  constraint_rounding(u, t, imposed, y);
+  memcpy(size, y + FIRST, sizeof(real) * MASKED);
   memset(G, 0, sizeof(real) * MASKED * M);
   for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
     if (CONSTRAINT_ENTRY[e][0] >= FIRST)
@@ -485,7 +487,7 @@ int NAME(contact_terms)(real t, const real *q, const real *p, const real *idle, 
   for (int k = 0; k < MASKED; k++)
     second[k] += value[M + CONSTRAINTS + FIRST + k];
   contact_coefficients(u, t, imposed, G + MASKED * M);
-  return all_finite(terms, MASKED * (3 + MASKED + M)) ? OK : NOT_FINITE;
+  return all_finite(terms, MASKED * (4 + MASKED + M)) ? OK : NOT_FINITE;
 }
 #endif
 #endif

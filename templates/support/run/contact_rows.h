@@ -38,11 +38,12 @@ static const contact_mode CONTACT_IS_OPEN = {0, 0, 0, {0.0, 0.0}};
 static const contact_mode CONTACT_STICKS = {1, 3, 0, {0.0, 0.0}};
 static const contact_mode CONTACT_SLIPS = {1, 0, 0, {0.0, 0.0}};
 
-/* Rows at a state: values and rates, second rates b, W and G by rows, coefficients (mu, mu_s, e; limits of friction
- * without gap), the sizes of the terms of values and rates, the rounding of values, and rates at rest. */
+/* Rows at a state: values and rates, second rates b, the terms of values by whose rounding these differ, W and G by
+ * rows, coefficients (mu, mu_s, e; limits of friction without gap), the sizes of values and rates, the rounding of
+ * values, and rates at rest. */
 typedef struct {
   real numbers[CONTACT_NUMBERS];
-  const real *value, *rate, *second, *W, *G, *coefficient;
+  const real *value, *rate, *second, *terms, *W, *G, *coefficient;
   real size[CONTACT_ROWS], speed[CONTACT_ROWS], rounding[CONTACT_ROWS], drift[CONTACT_ROWS];
   int absent[EVENT_CONTACTS]; /* whether a condition of the contact fails, or the state is behind it */
 } contact_terms;
@@ -132,7 +133,8 @@ static int rows_at(real t, const real *q, const real *p, const real *parameters,
   of->value = of->numbers;
   of->rate = of->value + CONTACT_ROWS;
   of->second = of->rate + CONTACT_ROWS;
-  of->W = of->second + CONTACT_ROWS;
+  of->terms = of->second + CONTACT_ROWS;
+  of->W = of->terms + CONTACT_ROWS;
   of->G = of->W + CONTACT_ROWS * CONTACT_ROWS;
   of->coefficient = of->G + CONTACT_ROWS * M;
   return NAME(contact_terms)(t, q, p, idle, imposed, of->numbers, workspace);
@@ -156,7 +158,7 @@ static int terms_at(const event_step *step, const event_sample *at, contact_term
     of->speed[r] = sqrt(fabs(of->W[r * (CONTACT_ROWS + 1)] * power)) + fabs(of->rate[r] - by_velocity) +
         fabs(of->second[r]) * duration;
     of->drift[r] = fabs(of->rate[r] - by_velocity);
-    of->rounding[r] = DBL_EPSILON * (by_position + fabs(at->t) * of->drift[r]);
+    of->rounding[r] = DBL_EPSILON * (fmax(by_position, of->terms[r]) + fabs(at->t) * of->drift[r]);
     of->size[r] = by_position + of->speed[r] * duration;
   }
   memset(of->absent, 0, sizeof of->absent);

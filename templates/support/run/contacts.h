@@ -42,6 +42,17 @@ static int find_outside(const event_step *step, const contact_terms *of, real pa
   return first;
 }
 
+/* Notes that the gaps of contacts which were closed and open are at a zero of their functions within rounding. */
+static void note_opening(const event_step *step, const contact_terms *of, const int *closed)
+{
+  for (int i = 0; i < TRANSITIONS; i++) {
+    const int k = TRANSITION[i][0], row = CONTACTS[k].normal;
+    if (TRANSITION[i][1] == CONTACT_CLOSES && closed[k] && !mode_of(step->watch->mode, k).closed)
+      step->watch->history[EVENT_FIRST[FIRST_TRANSITION + i]] = (NAME(event_history)){
+          .last = step->watch->time, .slack = fabs(of->value[row]) + of->rounding[row], .hits = 1};
+  }
+}
+
 /* Impacts and new modes at a state, which is projected onto their constraints. That may turn slow slips, and modes are
  * chosen again if it makes their forces impossible; none that remain so are kept. */
 static int change_modes(const event_step *step, event_sample *at, contact_change *now)
@@ -79,6 +90,8 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
     status = refuse(step, CONTACT_WITHOUT_MODE, -1, 0.0);
   else if (status == OK && first >= 0)
     status = refuse(step, CONTACT_LEAVES_CONE, first, 0.0);
+  if (status == OK)
+    note_opening(step, &of, closed);
   return status;
 }
 
