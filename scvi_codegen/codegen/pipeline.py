@@ -494,8 +494,8 @@ class Sources:
         if self.precision == DOUBLE_DOUBLE:
             return self._variant_in_pairs(variant)
         match variant:
-            case Lanes():
-                source = render_ensemble(self.program())
+            case Lanes(precision):
+                source = render_ensemble(self.program(), precision=precision)
             case NewtonFallback():
                 source = self.fallback()
             case Derivatives(order):

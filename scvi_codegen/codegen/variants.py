@@ -31,7 +31,9 @@ class Variant:
 
 @dataclass(frozen=True, slots=True)
 class Lanes(Variant):
-    """Trajectories of an ensemble in SIMD lanes."""
+    """Trajectories of an ensemble in SIMD lanes, whose numbers have this precision."""
+
+    precision: Literal["double", "single"] = "double"
 
 
 @dataclass(frozen=True, slots=True)

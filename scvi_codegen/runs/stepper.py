@@ -463,6 +463,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         observe: str | None = None,
         seed: int = 0,
         metropolis: bool = False,
+        precision: str = "double",
     ) -> EnsembleTrajectory:
         """Run k trajectories on all cores, with common fixed steps (SIMD lanes) or with adaptive steps for each.
 
@@ -521,6 +522,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             observe=observe,
             seed=seed,
             metropolis=metropolis,
+            precision=precision,
         )
         runs = runs_of(self._ensemble(q, p, settings, velocity=velocity, action=action))
         runs.run(progress=progress, threads=threads)

@@ -58,7 +58,7 @@ def _kernel_text(context: Context, kernel: Kernel, *, partials: bool = False) ->
 
 @pass_context
 def _lane_kernel_text(context: Context, kernel: Kernel) -> str:
-    return lane_kernel_text(kernel, context["program"].fixed_point, context["fixed_point"].meaning)
+    return lane_kernel_text(kernel, context["program"].fixed_point, context["fixed_point"].meaning, context["target"])
 
 
 @pass_context

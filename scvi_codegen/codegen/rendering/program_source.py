@@ -538,7 +538,12 @@ def _control_context(program: Program, control: Control | None) -> dict[str, obj
 
 
 def render_ensemble(
-    program: Program, observed: Kernel | None = None, *, counts: bool = False, tangents: int = 0
+    program: Program,
+    observed: Kernel | None = None,
+    *,
+    counts: bool = False,
+    tangents: int = 0,
+    precision: Embedded = "double",
 ) -> Source | None:
     """Return source that integrates many trajectories at once, one per lane, by fixed-point iteration or explicitly.
 
@@ -550,13 +555,14 @@ def render_ensemble(
         observed: functions whose extremes are recorded.
         counts: whether changes of their signs are counted instead.
         tangents: number of tangent vectors among the coordinates.
+        precision: of the lanes.
     """
     fixed_point, split, headers = program.fixed_point, program.splitting, dict[str, str]()
-    bath = program.bath
+    bath, target = program.bath, TARGETS[precision]
     if program.quantities.integrals or (bath and bath.sizes["BATH_FACTORS"] > LARGEST_BATH_IN_LANES):
         return None
     if split is not None and not split.bodies:
-        kernels, points, source = split.kernels, 1, splitting_source(split, observed)
+        kernels, points, source = split.kernels, 1, splitting_source(split, observed, target)
         headers = {LEAP: splitting_header(split, Layout(lanes=True), action=program.acts_along)}
     elif program.rattle and program.constraints and not program.damping:
         kernels, points = program.rattle.kernels, program.rattle.points + 1
@@ -572,6 +578,8 @@ def render_ensemble(
     between = bath.kernel if bath else None, quantities.legendre, quantities.inverse_legendre, quantities.energy
     context = {
         "program": program,
+        "target": target,
+        "real": target.scalar,
         "points": points,
         "stored": points * (fixed_point.curves if fixed_point else 1),
         "observed": observed.values if observed else 0,

@@ -122,6 +122,7 @@ class EnsembleSettings:
     seed: int = 0
     metropolis: bool = False
     trajectory: int = 0
+    precision: str = "double"
 
     @property
     def control(self) -> ErrorControl:

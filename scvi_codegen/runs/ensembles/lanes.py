@@ -110,7 +110,8 @@ class CommonRuns:
         if observation is not None:
             binding = observation.binding
         elif not (constrained and (self.ensemble.inputs or stepper.sums_action)):
-            binding = stepper._ensemble_binding
+            in_single = self.ensemble.settings.precision == "single"
+            binding = stepper._binding_in_single if in_single else stepper._ensemble_binding
         if binding is not None and not (self.ensemble.noise.metropolis and not binding.constant("HAS_METROPOLIS")):
             lanes = LaneRuns(binding, self.ensemble, self._fields(), common=self)
             self.done = lanes.done
@@ -183,6 +184,7 @@ class LaneRuns(Batch):
         common: the trajectories whose failed lanes single runs continue; if ``None``, they are left.
 
     Attributes:
+        number: type of the numbers in the memory of a block.
         keeps_unknowns: whether the memory of a block contains the unknowns of the last step, as that of a single run.
         memory, active: of a part, the block, and a view of the flags of its active lanes.
         left: failed lanes of blocks that have ended, which single runs continue.
@@ -193,6 +195,7 @@ class LaneRuns(Batch):
     ) -> None:
         super().__init__(binding, ensemble)
         self.fields, self.common, self.width = fields, common, len(binding.new("block *").active)
+        self.number = np.float32 if ensemble.settings.precision == "single" else np.float64
         self.needs_velocities = common is not None and bool(binding.constant("NEEDS_VELOCITIES"))
         self.keeps_unknowns = bool(ensemble.stepper.interface.constraints)
 
@@ -201,7 +204,7 @@ class LaneRuns(Batch):
         super().prepare(first, end)
         self.left = list[Departure]()
         self.memory = self.struct.block = self.binding.new("block *")
-        self.active = np.frombuffer(self.binding.buffer(self.memory.active), dtype=np.float64)
+        self.active = np.frombuffer(self.binding.buffer(self.memory.active), dtype=self.number)
         self.active[:] = 1.0
         for name, values in self.fields.items():
             setattr(self.struct, name, self.binding.pointer(values))
@@ -211,7 +214,7 @@ class LaneRuns(Batch):
 
     def lanes(self, name: str) -> Array:
         """Return a (m, lanes) view of a field of the block, (2 S, m, lanes) of ``memory``."""
-        field = np.frombuffer(self.binding.buffer(getattr(self.memory, name)), dtype=np.float64)
+        field = np.frombuffer(self.binding.buffer(getattr(self.memory, name)), dtype=self.number)
         values = field.reshape(-1, len(self.memory.q), len(self.active))
         return values if len(values) > 1 else values[0]
 

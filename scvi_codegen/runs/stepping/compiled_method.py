@@ -323,6 +323,12 @@ class CompiledMethod:
         return None if source is None else Binding(building.load(source, flags=self.flags), source.prefix)
 
     @cached_property
+    def _binding_in_single(self) -> Binding | None:
+        """The same in single precision."""
+        source = self._variants[Lanes("single")]
+        return None if source is None else Binding(building.load(source, flags=self.flags), source.prefix)
+
+    @cached_property
     def _second_derivatives(self) -> Binding:
         """Library with second derivatives of steps, compiled on first use; raises ``MethodError`` if unavailable."""
         return self._linearised(Derivatives(order=2), "hessian")

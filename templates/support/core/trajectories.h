@@ -17,19 +17,19 @@ enum {
 typedef lanes coordinates[M]; /* values of all coordinates at a point */
 
 typedef lanes number; /* a value of each trajectory */
-typedef double weight; /* a value of a point, the same for all trajectories */
-typedef const double (*point_table)[S];
+typedef real weight; /* a value of a point, the same for all trajectories */
+typedef const real (*point_table)[S];
 
-static inline number number_of(double x)
+static inline number number_of(real x)
 {
   return lanes_of(x);
 }
 
 #define lanes_of_number(x) (x)
 
-LANE_BY_LANE(magnitude, fabs);
-LANE_BY_LANE(exponential, exp);
-LANE_BY_LANE(exponential_less_1, expm1);
+LANE_BY_LANE(magnitude, MATH(fabs));
+LANE_BY_LANE(exponential, MATH(exp));
+LANE_BY_LANE(exponential_less_1, MATH(expm1));
 
 /* Maximum of x_first .. x_(end - 1). */
 static inline number largest_between(const number *x, int first, int end)
@@ -50,13 +50,13 @@ static inline number largest_number(const number *x)
 }
 
 /* a / b in each lane, at most `bound` in size; 0 unless b is positive and the quotient a number. */
-static inline number bounded_ratio(number a, number b, double bound)
+static inline number bounded_ratio(number a, number b, real bound)
 {
   lane_view x = {a};
   const lane_view y = {b};
   for (int j = 0; j < LANES; j++) {
-    const double size = fabs(x.lane[j]), large = copysign(bound, x.lane[j]);
-    const double ratio = size < bound * y.lane[j] ? x.lane[j] / y.lane[j] : large;
+    const real size = MATH(fabs)(x.lane[j]), large = MATH(copysign)(bound, x.lane[j]);
+    const real ratio = size < bound * y.lane[j] ? x.lane[j] / y.lane[j] : large;
     x.lane[j] = y.lane[j] > 0.0 && size < INFINITY ? ratio : 0.0;
   }
   return x.all;
@@ -70,9 +70,9 @@ static inline number rest_of_numbers(number a, number b, number product)
   return multiply_add(a, b, -product);
 }
 
-static inline weight rest_of_weights(double a, weight b, weight product)
+static inline weight rest_of_weights(real a, weight b, weight product)
 {
-  return rest_of_product(a, b, product);
+  return (weight)rest_of_product(a, b, product);
 }
 
 /* Sums over points add in the order of points.h, so that trajectories have the bits of single runs: POINTS_THERE is the
@@ -87,7 +87,7 @@ enum {
 };
 
 /* sum_j table_nj x_j in `parts` independent sums; values at successive points are `apart` elements apart. */
-static inline __attribute__((always_inline)) lanes sum_in_parts(const double *row, const lanes *x, long long apart,
+static inline __attribute__((always_inline)) lanes sum_in_parts(const real *row, const lanes *x, long long apart,
     int parts)
 {
   lanes sum[4];
@@ -98,13 +98,13 @@ static inline __attribute__((always_inline)) lanes sum_in_parts(const double *ro
   return parts == 1 ? sum[0] : (sum[0] + sum[1]) + (sum[2] + sum[3]);
 }
 
-static inline lanes contribution_of_points(const double (*table)[S], int n, const lanes *x, long long apart)
+static inline lanes contribution_of_points(const real (*table)[S], int n, const lanes *x, long long apart)
 {
   return sum_in_parts(table[n], x, apart, POINTS_THERE < 8 ? 1 : 4);
 }
 
 /* The same for one coordinate. */
-static inline lanes apply(const double (*table)[S], int n, lanes (*x)[M], int i)
+static inline lanes apply(const real (*table)[S], int n, lanes (*x)[M], int i)
 {
   return contribution_of_points(table, n, &x[0][i], M);
 }
@@ -112,7 +112,7 @@ static inline lanes apply(const double (*table)[S], int n, lanes (*x)[M], int i)
 /* The same of stored values. */
 typedef lanes (*stored_forces)[M];
 
-static inline lanes sum_of_stored(const double (*table)[S], int n, stored_forces x, int i)
+static inline lanes sum_of_stored(const real (*table)[S], int n, stored_forces x, int i)
 {
   return sum_in_parts(table[n], &x[0][i], M, POINTS_THERE < 4 ? 1 : 4);
 }
@@ -191,13 +191,13 @@ typedef NAME(block) block_memory;
 
 /* Which trajectories the iteration still serves, and the number of iterations. */
 typedef struct {
-  double *active;
+  real *active;
   long long iterations;
 } solver_report;
 
 /* Arguments of a step. */
 typedef struct {
-  double t, h;
+  real t, h;
 #ifdef DOUBLE_DOUBLE
   double t_low, h_low;
 #endif

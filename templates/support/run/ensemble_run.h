@@ -9,7 +9,11 @@
 #define LOW_WORD(of, name) (of)->name##_low
 #else
 #define WORDS 1
-#define LOW_WORD(of, name) 0.0
+#ifdef SINGLE_PRECISION
+#define LOW_WORD(of, name) (of)->name##_low
+#else
+#define LOW_WORD(of, name) 0
+#endif
 #endif
 
 #if defined(DOUBLE_DOUBLE) && !defined(EXPLICIT_STEPS)
@@ -26,7 +30,7 @@ typedef struct {
 
 #ifdef THREE_WORDS
 /* x + carry += increment, each with its further words, in active lanes. */
-static void add_increments(lanes *x, lanes *carry, const lanes *increment, const double *active)
+static void add_increments(lanes *x, lanes *carry, const lanes *increment, const real *active)
 {
   for (int i = 0; i < M; i++) {
     lane_view sum = {x[i]}, low = {carry[i]}, lowest = {carry[M + i]};
@@ -45,7 +49,7 @@ static void add_increments(lanes *x, lanes *carry, const lanes *increment, const
 }
 #else
 /* x + carry += increment with its low word, in double-double arithmetic, in active lanes. */
-static void add_increments(lanes *x, lanes *carry, const lanes *increment, const double *active)
+static void add_increments(lanes *x, lanes *carry, const lanes *increment, const real *active)
 {
   for (int i = 0; i < M; i++) {
     const lane_view old = {x[i]}, old_carry = {carry[i]};
@@ -63,7 +67,7 @@ static void add_increments(lanes *x, lanes *carry, const lanes *increment, const
 #endif
 
 /* Deactivates lanes whose next state is not finite. */
-static void drop_infinite(const state *now, const lanes *dq, const lanes *dp, double *active)
+static void drop_infinite(const state *now, const lanes *dq, const lanes *dp, real *active)
 {
   lane_view sum = {lanes_of(0.0)};
   for (int i = 0; i < M; i++)
@@ -91,8 +95,12 @@ enum { SAVED = WORDS * M };
 void NAME(start)(block_memory *block, double t, double h)
 {
   memset(block, 0, sizeof *block);
-  block->t = t;
-  block->h = h;
+  block->t = (real)t;
+  block->h = (real)h;
+#ifdef SINGLE_PRECISION
+  block->t_low = (real)(t - block->t);
+  block->h_low = (real)(h - block->h);
+#endif
 #ifdef OBSERVED
   for (int n = 0; n < 3; n++)
     for (int i = 0; i < OBSERVED; i++)
@@ -126,8 +134,16 @@ static void store_states(const state *now, int count, double *q, double *p)
       q[j * WORDS * M + i] = position.lane[j];
       p[j * WORDS * M + i] = momentum.lane[j];
     }
-#ifdef DOUBLE_DOUBLE
+#if defined(DOUBLE_DOUBLE) || defined(SINGLE_PRECISION)
     const lane_view low_position = {now->carry_q[i]}, low_momentum = {now->carry_p[i]};
+#endif
+#ifdef SINGLE_PRECISION
+    for (int j = 0; j < count; j++) {
+      q[j * M + i] += low_position.lane[j];
+      p[j * M + i] += low_momentum.lane[j];
+    }
+#endif
+#ifdef DOUBLE_DOUBLE
     for (int j = 0; j < count; j++) {
       q[(j * WORDS + 1) * M + i] = low_position.lane[j];
       p[(j * WORDS + 1) * M + i] = low_momentum.lane[j];
@@ -157,7 +173,7 @@ static void store_actions(const block_memory *block, int count, long long place)
 /* Results of a step of which some trajectories are repeated. */
 typedef struct {
   lanes curve[STORED][M], position[2 * M], momentum[2 * M];
-  double active[LANES]; /* before the step, or before its repetition */
+  real active[LANES]; /* before the step, or before its repetition */
   long long guess;
   int repeated;
 } first_results;
@@ -165,7 +181,7 @@ typedef struct {
 /* Returns 1 if a step has to be repeated for the trajectories that failed in it, from the value at the beginning of the
  * extrapolated curve, as single runs do from the straight line; after that, restores the results of the others. */
 static SELDOM int repeats_failed(first_results *stored, history past, long long *guess, lanes *dq, lanes *dp,
-    double *active)
+    real *active)
 {
   lanes *before = &past.before[0][0], *curve = &stored->curve[0][0];
   if (stored->repeated) {
@@ -191,7 +207,7 @@ static SELDOM int repeats_failed(first_results *stored, history past, long long 
     for (int i = 0; i < M; i++)
       past.before[n][i] = apply(LAST_ALONE, 0, past.last, i);
   for (int j = 0; j < LANES; j++) {
-    const double succeeded = active[j];
+    const real succeeded = active[j];
     active[j] = stored->active[j] > 0.0 && !(succeeded > 0.0) ? 1.0 : 0.0;
     stored->active[j] = succeeded;
   }
@@ -355,8 +371,12 @@ static void begin_block(NAME(each) * c, int count)
   for (int j = 0; j < LANES; j++) {
     const long long from = c->next + (j < count ? j : count - 1);
     for (int i = 0; i < M; i++) {
-      block->q[i][j] = c->q[from * WORDS * M + i];
-      block->p[i][j] = c->p[from * WORDS * M + i];
+      block->q[i][j] = (real)c->q[from * WORDS * M + i];
+      block->p[i][j] = (real)c->p[from * WORDS * M + i];
+#ifdef SINGLE_PRECISION
+      block->carry_q[i][j] = (real)(c->q[from * M + i] - block->q[i][j]);
+      block->carry_p[i][j] = (real)(c->p[from * M + i] - block->p[i][j]);
+#endif
 #ifdef DOUBLE_DOUBLE
       block->carry_q[i][j] = c->q[(from * WORDS + 1) * M + i];
       block->carry_p[i][j] = c->p[(from * WORDS + 1) * M + i];
@@ -388,7 +408,7 @@ long long NAME(call_each)(NAME(each) * c, long long steps)
       break;
     for (int i = 0; i < P; i++)
       for (int j = 0; j < LANES; j++)
-        block->parameters[i][j] = c->parameters[(c->next + (j < count ? j : count - 1)) * P + i];
+        block->parameters[i][j] = (real)c->parameters[(c->next + (j < count ? j : count - 1)) * P + i];
     const long long every = c->segment_every[c->segment], begun = block->step;
     const long long size = steps - taken < c->left ? steps - taken : c->left;
     const long long place = c->rows * c->trajectories + c->next;
@@ -405,8 +425,11 @@ long long NAME(call_each)(NAME(each) * c, long long steps)
 #ifdef DRIVEN_FORCES
       block->guess = 0; /* the last force is that of the former inputs */
 #endif
-      block->guess = c->segment_h[c->segment] == block->h ? block->guess : 0;
-      block->h = c->segment_h[c->segment];
+      block->guess = (real)c->segment_h[c->segment] == block->h ? block->guess : 0;
+      block->h = (real)c->segment_h[c->segment];
+#ifdef SINGLE_PRECISION
+      block->h_low = (real)(c->segment_h[c->segment] - block->h);
+#endif
 #ifdef DOUBLE_DOUBLE
       set_step_to(c->segment_end[c->segment], block->t, block->t_low, &block->h, &block->h_low);
 #endif

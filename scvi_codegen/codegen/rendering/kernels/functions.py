@@ -19,7 +19,6 @@ from scvi_codegen.codegen.ir.program import FEW_UNKNOWNS, Layout, Program
 from scvi_codegen.codegen.rendering.kernels.loop_nests import Nest
 from scvi_codegen.codegen.rendering.kernels.printer import (
     ARRAYS,
-    DOUBLE,
     Target,
     print_lane_statements,
     print_number,
@@ -255,16 +254,16 @@ def kernel_text(kernel: Kernel, target: Target, *, partials: bool = False) -> st
     return _text(kernel, target, None, partial(print_statements, target=target), partials=partials)
 
 
-def lane_kernel_text(kernel: Kernel, fixed_point: FixedPointIteration | None, lanes: Lanes) -> str:
+def lane_kernel_text(kernel: Kernel, fixed_point: FixedPointIteration | None, lanes: Lanes, target: Target) -> str:
     """Return a function of vectors."""
-    printed = partial(print_lane_statements, fixed_point=fixed_point, sources=lanes.sources)
-    return _text(kernel, DOUBLE, lanes, printed)
+    printed = partial(print_lane_statements, fixed_point=fixed_point, sources=lanes.sources, number=target)
+    return _text(kernel, target, lanes, printed)
 
 
 def _text(kernel: Kernel, target: Target, lanes: Lanes | None, printed: Printed, *, partials: bool = False) -> str:
     """Return a function of numbers or lanes, after its parts and the terms of its loops with their tables."""
     real = "lanes" if lanes else target.scalar
-    time, parameter = (lanes.type_of(name) if lanes else real for name in ("t", "parameters"))
+    time, parameter = (lanes.type_of(name, target.scalar) if lanes else real for name in ("t", "parameters"))
     declared = {name: f"{real} *{name}" for name in ARRAYS} | {"u": f"const {real} *u", "t": f"{time} t"}
     declared |= {"parameters": f"const {parameter} *parameters", "kept": f"{real} *restrict kept"}
     cut = parts(kernel)
@@ -288,7 +287,7 @@ def _text(kernel: Kernel, target: Target, lanes: Lanes | None, printed: Printed,
 
 def lane_mass_text(kernel: Kernel, fixed_point: FixedPointIteration | None, lanes: Lanes, target: Target) -> str:
     """Return the function of constant masses: of numbers for one trajectory, or of vectors for many."""
-    return kernel_text(kernel, target) if lanes.are_points else lane_kernel_text(kernel, fixed_point, lanes)
+    return kernel_text(kernel, target) if lanes.are_points else lane_kernel_text(kernel, fixed_point, lanes, target)
 
 
 def _tables(loop: RolledKernel, target: Target) -> Iterator[str]:

@@ -49,6 +49,11 @@ class Target:
     smallest: float
     largest: float
 
+    @property
+    def bytes(self) -> int:
+        """Bytes of a number."""
+        return 4 if self.suffix else 8
+
     def rounded(self, value: Number) -> float:
         """Return the number of the target nearest to ``value``; 0 below its smallest, as for low words of tables."""
         nearest = nearest_float(value, self.halvings + 1)
@@ -195,7 +200,9 @@ def print_statements(code: Kernel | Part, target: Target = DOUBLE) -> list[str]:
     ]
 
 
-def print_lane_statements(code: Kernel | Part, fixed_point: FixedPointIteration | None, sources: Sources) -> list[str]:
+def print_lane_statements(
+    code: Kernel | Part, fixed_point: FixedPointIteration | None, sources: Sources, number: Target = DOUBLE
+) -> list[str]:
     """Return the statements of a kernel of vectors, or of one of its parts.
 
     Variables that are the same in every lane remain numbers; derivatives of an iteration are stored at their indices in
@@ -207,9 +214,9 @@ def print_lane_statements(code: Kernel | Part, fixed_point: FixedPointIteration 
     vectors = _Vectors(cut[0], sources)
     statements = []
     for kind, k, expression in cut[0].statements:
-        text, vector = print_expression(_with_lane_calls(expression, vectors)), vectors.has(expression)
+        text, vector = print_expression(_with_lane_calls(expression, vectors), number), vectors.has(expression)
         if kind == "w":
-            statements.append(f"const {'lanes' if vector else 'double'} w{k} = {text};")
+            statements.append(f"const {'lanes' if vector else number.scalar} w{k} = {text};")
         else:
             target = _mass_element(fixed_point, k) if kind == "derivative" else f"{kind}[{k}]"
             statements.append(f"{target} = {text};" if vector else f"{target} = lanes_of({text});")

@@ -39,6 +39,7 @@ from scvi_codegen.codegen.rendering.kernels.printer import (
     INVERSE_ROOT,
     TIMES,
     Sources,
+    Target,
     lane_functions,
     print_number,
     scalar_functions,
@@ -161,9 +162,9 @@ class Lanes:
         """True if lanes are points of one trajectory."""
         return "t" in self.sources
 
-    def type_of(self, source: str) -> str:
-        """Return the C type of the time or of a parameter."""
-        return "lanes" if source in self.sources else "double"
+    def type_of(self, source: str, scalar: str) -> str:
+        """Return the C type of the time or of a parameter; ``scalar``: that of numbers."""
+        return "lanes" if source in self.sources else scalar
 
 
 POINTS = Lanes(("u", "t"), "points", ("core/progress", "iteration/one_trajectory"))
@@ -253,7 +254,7 @@ def iteration_source(
     )
 
 
-def splitting_source(split: Splitting, observed: Kernel | None = None) -> IterationSource:
+def splitting_source(split: Splitting, observed: Kernel | None = None, number: Target = DOUBLE) -> IterationSource:
     """Return the template data of explicit steps of many trajectories, which are lanes."""
     kernels = (split.force, *(() if split.by_masses else (split.drift,)), *((observed,) if observed else ()))
     functions = {name for kernel in (*kernels, split.drift) for name in lane_functions(kernel, TRAJECTORIES.sources)}
@@ -267,7 +268,7 @@ def splitting_source(split: Splitting, observed: Kernel | None = None) -> Iterat
         | ({"CONSTANT_MASSES": "1"} if split.by_masses else {})
         | ({"DRIVEN_FORCES": "1"} if split.driven else {}),
         functions=tuple(map(_vector_function, sorted(functions))),
-        tables=tuple(lane_table(name, numbers, len(numbers)) for name, numbers in split.numbers.items()),
+        tables=tuple(lane_table(name, numbers, len(numbers), number=number) for name, numbers in split.numbers.items()),
         kernels=kernels,
         mass=split.drift if split.by_masses else None,
         damping=None,
@@ -331,16 +332,23 @@ def _tables(fixed_point: FixedPointIteration, meaning: Lanes, *, changes: bool) 
             yield lane_table(f"{numbers.name}_LOW", low, points, groups=fixed_point.in_groups)
 
 
-def lane_table(name: str, numbers: tuple[Number, ...] | NumberTable, points: int = 0, *, groups: bool = True) -> str:
+def lane_table(
+    name: str,
+    numbers: tuple[Number, ...] | NumberTable,
+    points: int = 0,
+    *,
+    groups: bool = True,
+    number: Target = DOUBLE,
+) -> str:
     """Return a table over points: one number for each of ``points``; if 0, vectors, those of a matrix by columns."""
-    kind, is_matrix = "double" if points else "lanes", isinstance(numbers[0], tuple)
+    kind, is_matrix = number.scalar if points else "lanes", isinstance(numbers[0], tuple)
     if not is_matrix:
         of_lanes = "[GROUPS]" if groups else ""
         size = f"[{points}]" if points else of_lanes
-        return table(f"static const {kind} {name}{size}", [print_number(x) for x in numbers[: points or None]])
+        return table(f"static const {kind} {name}{size}", [number.number(x) for x in numbers[: points or None]])
     rows = [row[:points] for row in numbers[:points]] if points else [*zip(*numbers, strict=True)]
     size = f"[{points}][{points}]" if points else "[POINTS * GROUPS]"
-    lines = [[print_number(x) for x in row] for row in rows]
+    lines = [[number.number(x) for x in row] for row in rows]
     return table(f"static const {kind} {name}{size}", lines, braces=bool(points))
 
 
