@@ -569,7 +569,8 @@ def render_ensemble(
         source = constrained_source(program.rattle, program.constraints)
     elif fixed_point is not None and fixed_point.serves_many:
         kernels, points = fixed_point.kernels, len(fixed_point.guess.abscissae)
-        source = iteration_source(fixed_point, TRAJECTORIES, kernels=(*kernels, *((observed,) if observed else ())))
+        of_steps = *kernels, *((observed,) if observed else ())
+        source = iteration_source(fixed_point, TRAJECTORIES, kernels=of_steps, number=target)
     else:
         return None
     prefix, by_masses = f"{program.prefix}_ensemble", bool(program.rattle and program.rattle.lower_masses)

@@ -3,6 +3,11 @@
 /* Convergence criterion of the fixed-point iteration. Requires: FINAL_ITERATIONS, the number of iterations after the
  * last one that is measured. Changes are squared, and so are the thresholds here. */
 
+#ifdef SINGLE_PRECISION
+#define LEVEL(squared) ((squared) * 2.9e17) /* the same number of round-off units */
+#else
+#define LEVEL(squared) squared
+#endif
 #define UNEXTRAPOLATED 16.0 /* the remaining change must be below 1/4 of the tolerance, or 1/2 at slow convergence */
 #if defined(NEWTON_KRYLOV) || defined(FORCES_OF_VELOCITIES)
 #define MARGIN UNEXTRAPOLATED
@@ -16,15 +21,15 @@
                                  * accidental */
 #define DIVERGED 1e6 /* changes above a thousand times the state: iterations are abandoned among the first, too */
 #define LARGEST_CHANGE 1e75 /* the fourth power of a larger change may overflow */
-#define ROUNDING_LEVEL 1e-25 /* changes below 3e-13 of the state may be rounding errors */
-#define CERTAIN_ROUNDING 1e-28 /* changes below 1e-14 that do not decrease are rounding errors */
+#define ROUNDING_LEVEL LEVEL(1e-25) /* changes below 3e-13 of the state may be rounding errors */
+#define CERTAIN_ROUNDING LEVEL(1e-28) /* changes below 1e-14 that do not decrease are rounding errors */
 #define STAGNATION 0.25 /* changes above that only if they decreased by less than half in two iterations */
-#define PROGRESS_LEVEL 1e-20 /* above 1e-10, iterations that gain less than a factor of 1.4 (two: 2) are abandoned */
+#define PROGRESS_LEVEL LEVEL(1e-20) /* above 1e-10, iterations that gain less than a factor of 1.4 (two: 2) are abandoned */
 #define STAGNANT 0.8 /* changes that decrease by less, and by less than half in two iterations, stagnate */
 #define FIRST_ITERATIONS 4 /* but not among the first ones, which need not contract */
 #define LEAST_SQUARED 1e-100 /* squares of smaller numbers, or of small parts of them, may be subnormal */
 #define LARGEST_SQUARED 1e100 /* squares of larger numbers, or sums of many, may overflow */
-#define NO_REMAINDER 1e-24 /* after changes below 1e-12 of the state, the remainder is far below rounding */
+#define NO_REMAINDER LEVEL(1e-24) /* after changes below 1e-12 of the state, the remainder is far below rounding */
 #define SLOWLY 1e-3 /* remainders of rounding errors count if the iteration gains less than a factor of 30 */
 #define NEGLIGIBLE_REMAINDER 3e-4 /* 1/60 of the tolerance */
 #define GOOD_GUESS 1e-6 /* after a prediction with an error below 1e-3 of the state, the next one uses two steps */
@@ -33,7 +38,7 @@
  * rounding error of q: a looser tolerance is one of the motion, wherever the origin is. */
 static inline double part_of_position(const solver_options *options)
 {
-  return options->tolerance > DBL_EPSILON ? DBL_EPSILON / options->tolerance : 1.0;
+  return options->tolerance > REAL_EPSILON ? REAL_EPSILON / options->tolerance : 1.0;
 }
 
 static inline double smaller(double a, double b)
@@ -137,13 +142,13 @@ static inline void add_largest_of_arrays(number *size)
 
 /* 1 / (size + a little of the largest), so that a coordinate at 0 has a size, too; or `absolute`, which converts to
  * changes of q. An infinite size gives NaN. */
-static inline void invert_sizes(const solver_options *options, double absolute, number *size)
+static inline void invert_sizes(const solver_options *options, real absolute, number *size)
 {
   const number largest = largest_number(size);
   add_largest_of_arrays(size);
   for (int i = 0; i < M; i++)
     size[i] =
-        (options->absolute ? number_of(absolute) : 1.0 / (size[i] + (DBL_EPSILON * largest + DBL_MIN))) + 0.0 * largest;
+        (options->absolute ? number_of(absolute) : 1.0 / (size[i] + (REAL_EPSILON * largest + REAL_MIN))) + 0.0 * largest;
 }
 
 /* Returns, of inverse sizes, the least where `stagnant` is 1, and those of each coordinate where it is 0. */

@@ -39,7 +39,7 @@ static inline void push(const step_data *step, const iteration_data *data, lanes
 
 /* 1 / the size of x at both ends of the step, which makes its changes relative, or `absolute`; groups of points are
  * `apart` elements apart. */
-static inline void measure_ends(const lanes *x, int apart, const solver_options *options, double absolute,
+static inline void measure_ends(const lanes *x, int apart, const solver_options *options, real absolute,
     number *inverse_size)
 {
   for (int i = 0; i < M; i++)

@@ -21,7 +21,7 @@ static inline number find_stiffness(number work, number size)
 }
 
 /* Weights of dF in the increments: those of positions as their end weights, those of momenta times h. */
-static inline void weigh_remainder(number stiffness, double h, remainder_weights *of)
+static inline void weigh_remainder(number stiffness, real h, remainder_weights *of)
 {
   number inverse = number_of(0.0);
   if (is_within(stiffness, FIRST_ORDER * LARGEST_STIFFNESS)) {

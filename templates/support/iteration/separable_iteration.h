@@ -60,7 +60,7 @@ typedef struct {
 #else
   number inverse_mass[M];
 #endif
-  double square, square_low;
+  real square, square_low;
 #ifdef LINEAR_FORCES
   linear_part linear;
 #endif
@@ -90,7 +90,7 @@ typedef struct {
 #endif
 } step_points;
 
-static void prepare_step_size(double h, iteration_data *data)
+static void prepare_step_size(real h, iteration_data *data)
 {
   data->square = h * h;
   data->square_low = rest_of_product(h, h, data->square);
@@ -102,7 +102,7 @@ static void prepare_step_size(double h, iteration_data *data)
 
 PASS drift_words find_drift(const step_points *w, long long i)
 {
-  const double h = w->step->h;
+  const real h = w->step->h;
   const number inverse = w->data->inverse_mass[i], v = inverse * w->step->p0[i];
   const number v_low = rest_of_numbers(inverse, w->step->p0[i], v);
   drift_words of;
@@ -131,7 +131,7 @@ PASS number unit_of(const step_points *w, long long i)
 }
 
 /* Size of a coordinate in the step: its motion |h v| + |h^2 F / m| and `part` of |q| (part_of_position). */
-PASS number size_of(const step_points *w, drift_words of, long long i, double part)
+PASS number size_of(const step_points *w, drift_words of, long long i, real part)
 {
   return part * magnitude(w->step->q0[i]) + magnitude(of.high) + magnitude(unit_of(w, i) * at_first(&w->F[i]));
 }
@@ -192,7 +192,7 @@ PASS end_increments increments_of(const step_points *w, long long i)
 
 /* Adds the square of a change. For many coordinates with names the sum of the rounding errors would stay above the
  * tolerance: there it is the largest. A NaN is detected later, by the increments. */
-static inline lanes with_change(lanes change, lanes moved, double share)
+static inline lanes with_change(lanes change, lanes moved, real share)
 {
 #ifndef ARRAYS
   if (M > FEW)
@@ -457,7 +457,7 @@ PASS void first_points(const step_points *w, history past, long long steps)
 /* Sizes of the coordinates. */
 PASS void measure_points(const step_points *w, const solver_options *options)
 {
-  const double resolved = part_of_position(options);
+  const real resolved = part_of_position(options);
   for (int i = 0; i < M; i++)
     w->inverse_size[i] = size_of(w, w->drifts[i], i, resolved);
   invert_sizes(options, 1.0, w->inverse_size);

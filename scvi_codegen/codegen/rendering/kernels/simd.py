@@ -217,7 +217,12 @@ class IterationSource:
 
 
 def iteration_source(
-    fixed_point: FixedPointIteration, meaning: Lanes, *, kernels: Sequence[Kernel] | None = None, changes: bool = False
+    fixed_point: FixedPointIteration,
+    meaning: Lanes,
+    *,
+    kernels: Sequence[Kernel] | None = None,
+    changes: bool = False,
+    number: Target = DOUBLE,
 ) -> IterationSource:
     """Return the template data of a fixed-point iteration.
 
@@ -242,7 +247,7 @@ def iteration_source(
             **{name: str(value) for name, value in fixed_point.facts.items()},
         },
         functions=tuple(map(_vector_function, sorted(functions))),
-        tables=tuple(_tables(fixed_point, meaning, changes=changes)),
+        tables=tuple(_tables(fixed_point, meaning, number, changes=changes)),
         kernels=kernels,
         mass=mass,
         damping=damping,
@@ -322,14 +327,14 @@ def _vector_function(name: str) -> str:
     return f"LANES_{'LIBRARY_' * (name in LIBRARY)}FUNCTION{'_OF_TWO' * (name in OF_TWO)}({name})"
 
 
-def _tables(fixed_point: FixedPointIteration, meaning: Lanes, *, changes: bool) -> Iterator[str]:
+def _tables(fixed_point: FixedPointIteration, meaning: Lanes, number: Target, *, changes: bool) -> Iterator[str]:
     one_each = fixed_point.in_groups and not meaning.are_points
     points = len(fixed_point.guess.abscissae) if one_each else 0
     for numbers in (*fixed_point.tables, *(fixed_point.derivatives_tables if changes else ())):
-        yield lane_table(numbers.name, numbers.numbers, points, groups=fixed_point.in_groups)
+        yield lane_table(numbers.name, numbers.numbers, points, groups=fixed_point.in_groups, number=number)
         if numbers.in_two_parts:
-            low = tuple(tuple(map(DOUBLE.rest, x)) if numbers.is_matrix else DOUBLE.rest(x) for x in numbers.numbers)
-            yield lane_table(f"{numbers.name}_LOW", low, points, groups=fixed_point.in_groups)
+            low = tuple(tuple(map(number.rest, x)) if numbers.is_matrix else number.rest(x) for x in numbers.numbers)
+            yield lane_table(f"{numbers.name}_LOW", low, points, groups=fixed_point.in_groups, number=number)
 
 
 def lane_table(
