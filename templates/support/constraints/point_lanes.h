@@ -6,15 +6,7 @@
 #define RATTLE
 #pragma GCC diagnostic ignored "-Wpsabi" /* all functions with vector arguments are static */
 
-#ifdef SINGLE_PRECISION
-#define REGISTER_LANES (VECTOR_BYTES / 4)
-typedef int lane_number;
-#define BUT_SIGN INT_MAX
-#else
-#define REGISTER_LANES (VECTOR_BYTES / 8)
-typedef long long lane_number;
-#define BUT_SIGN LLONG_MAX
-#endif
+#define REGISTER_LANES (VECTOR_BYTES / REAL_BYTES)
 #if POINT_LANES < REGISTER_LANES
 #define LANES POINT_LANES
 #else
@@ -44,7 +36,7 @@ enum {
 #else
 typedef real lanes __attribute__((vector_size(LANE_BYTES)));
 #endif
-typedef lane_number lane_numbers __attribute__((vector_size(LANE_BYTES)));
+typedef real_bits lane_numbers __attribute__((vector_size(LANE_BYTES)));
 
 typedef real number; /* a value of the trajectory */
 typedef int condition;

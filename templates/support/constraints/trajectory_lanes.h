@@ -5,7 +5,6 @@
 #define RATTLE
 #define LANE_FUNCTION static inline __attribute__((always_inline)) /* vectors are not passed to functions */
 #define IN_MEMORY(values) (void)0
-#define BUT_SIGN LLONG_MAX
 #define FIRST_LANE(x) (x)
 #define LAST_LANE(x) (x)
 
@@ -14,7 +13,7 @@ enum {
   GROUP_LANES = DEGREE,
   LAST_GROUP = DEGREE - 1
 };
-typedef long long lane_numbers __attribute__((vector_size(8 * LANES)));
+typedef real_bits lane_numbers __attribute__((vector_size(REAL_BYTES * LANES)));
 typedef lane_numbers condition; /* all bits of the lanes where it holds */
 
 /* Change of an iteration: the largest ratio to the own size, the ratio of the largest to the largest size, and the
