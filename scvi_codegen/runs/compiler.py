@@ -243,6 +243,11 @@ def _in_both_precisions(compiled: Callable[..., Stepper], events: EventLike | Se
 
 def check_precision(precision: str, flags: Sequence[str]) -> None:
     """Raise :class:`MethodError` for an unknown precision, and for flags that would destroy it."""
+    if precision == "single":
+        raise MethodError(
+            "precision='single' is that of ensembles, integrate_ensemble(.., precision='single'), and of C for "
+            "microcontrollers, generate_source(.., embedded='single'): omit it here"
+        )
     if precision not in PRECISIONS:
         raise MethodError(f"unknown precision {precision!r}: use {', '.join(map(repr, PRECISIONS[:-1]))} or {AUTO!r}")
     if precision == DOUBLE_DOUBLE and (worst := [flag for flag in flags if flag in REORDERING_FLAGS]):

@@ -492,6 +492,10 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
                 ``"extremes"`` of q and p, of the ``"energy"``, or numbers of ``"events"`` of the stepper
                 (:meth:`with_events`), changes of sign between successive states. Requires SIMD lanes, no inputs.
             seed, metropolis: as of :meth:`integrate`; trajectory k has stream k of the noise.
+            precision: ``"double"``, or ``"single"`` for twice as many trajectories in SIMD lanes: fixed steps in
+                float32 with compensated sums, so that states have some 45 bits, and are float64. The step size,
+                parameters, constants and the time in forces are rounded to 24 bits (docs/ensembles.md). A trajectory
+                whose step fails is continued in double precision.
 
         Returns:
             An :class:`EnsembleTrajectory`, with ``device`` a
@@ -501,6 +505,8 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
 
         Raises:
             StateError: if a shape, name or number is invalid.
+            MethodError: if the method has no trajectories in SIMD lanes, for ``observe``, ``device`` and single
+                precision.
             BuildError: with ``device`` if there is no GPU, or too little memory on it.
         """
         settings = EnsembleSettings(
@@ -660,8 +666,9 @@ class StepperOfRunTimeSizes(Stepper):
     ) -> Any:
         """Call a method of the stepper that is bound to the arrays of the call."""
         if method in (Stepper.integrate_ensemble, Stepper._ensemble):
-            for argument, operation in (("device", "device"), ("observe", "observe_ensemble")):
-                if named.get(argument) is not None:
+            operations = {"device": "device", "observe": "observe_ensemble", "precision": "single"}
+            for argument, operation in operations.items():
+                if named.get(argument) not in (None, "double"):
                     require(self, operation)
         threads = named.pop("threads", None) if method in PER_STEP else None
         stepper = self if named.get("events") is None else self.with_events(named.pop("events"))

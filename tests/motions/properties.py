@@ -286,6 +286,24 @@ def ensembles(case: Case) -> None:
         _constant_inputs(case, others)
 
 
+def single_precision(case: Case) -> None:
+    """States of trajectories in single precision are within 10 units of rounding of those in double precision."""
+    others, inputs = _others(case, case.setting.trajectories), case.kind == "driven"
+
+    def run(precision: str) -> Any:
+        return ensemble_of(case, others, h=case.h, steps=STEPS, precision=precision)
+
+    if not case.stepper.supports("single") or (inputs and case.stepper.constraints):
+        with pytest.raises(sc.ScviCodegenError, match="precision='single'"):
+            run("single")
+        return
+    single, double = run("single"), run("double")
+    assert single.ok.all()
+    assert case.problem.falls_back or not np.array_equal(single.q, double.q)
+    near(single.q, double.q, 10 * np.finfo(np.float32).eps)
+    near(single.p, double.p, 10 * np.finfo(np.float32).eps)
+
+
 def _constant_inputs(case: Case, others: list[dict[str, float]]) -> None:
     """States of trajectories with constant inputs of their own."""
     inputs = {name: 0.3 - 0.02 * np.arange(len(others)) * k for k, name in enumerate(case.problem.inputs, 1)}
@@ -729,6 +747,7 @@ PROPERTIES: dict[str, tuple[Property, Callable[[Case], bool]]] = {
         lambda case: STOP in case.problem.text["parameters"] and not case.setting.back and _is_accurate(case),
     ),
     "ensembles": (ensembles, lambda case: case.kind not in ("array", "reversible")),
+    "single_precision": (single_precision, lambda case: case.kind in ("plain", "driven", "slowed")),
     "recording": (recording, lambda case: case.kind not in ("array", "driven")),
     "restarts": (restarts, lambda case: case.kind not in ("driven", "reversible")),
     "adaptive_restarts": (adaptive_restarts, lambda case: case.kind == "plain" and _estimates_errors(case)),

@@ -152,6 +152,7 @@ OPERATIONS = {
     "ensembles": lambda s: s.integrate_ensemble(*map(stacked, state_of(s)), h=0.1, steps=3),
     "device": lambda s: s.integrate_ensemble(*map(stacked, state_of(s)), h=0.1, steps=3, device="cuda"),
     "observe_ensemble": lambda s: s.integrate_ensemble(*map(stacked, state_of(s)), h=0.1, steps=3, observe="extremes"),
+    "single": lambda s: s.integrate_ensemble(*map(stacked, state_of(s)), h=0.1, steps=3, precision="single"),
     "checkpoint": lambda s: s.start(*state_of(s), h=0.1, **end_of(s)).checkpoint(),
     "recording": lambda s: sc.record_run(
         s.start(*state_of(s), h=0.1, **end_of(s)), mkdtemp() + "/a.run", steps=None if end_of(s) else 3

@@ -134,9 +134,9 @@ def changing_events(of: Kind, _: Path) -> Any:
     return run
 
 
-def ensembles(of: Kind, _: Path) -> Any:
+def ensembles(of: Kind, _: Path, precision: str = "double") -> Any:
     starts = {name: np.stack([value, value]) for name, value in of.q.items()}
-    return of.stepper().integrate_ensemble(starts, np.zeros((2, 3)), h=0.1, steps=3)
+    return of.stepper().integrate_ensemble(starts, np.zeros((2, 3)), h=0.1, steps=3, precision=precision)
 
 
 def neighbours(of: Kind, _: Path) -> Any:
@@ -214,6 +214,7 @@ FEATURES: dict[str, Callable[[Kind, Path], Any]] = {
     "events": lambda of, _: of.run(events="x - 0.25"),
     "events that change the state": changing_events,
     "ensembles": ensembles,
+    "ensembles in single precision": lambda of, folder: ensembles(of, folder, "single"),
     "lists of neighbours": neighbours,
     "threads within a step": lambda of, _: of.run(threads=2),
     "sizes chosen by each run": other_sizes,

@@ -573,6 +573,8 @@ def render_ensemble(
         source = iteration_source(fixed_point, TRAJECTORIES, kernels=of_steps, number=target)
     else:
         return None
+    if precision == "single":
+        target.check(chain.from_iterable(map(constants, source.kernels)))
     prefix, by_masses = f"{program.prefix}_ensemble", bool(program.rattle and program.rattle.lower_masses)
     velocities = by_masses or (fixed_point is not None and fixed_point.kept is StoredValues.VELOCITIES)
     quantities = program.quantities

@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 from scvi_codegen.codegen.native.arguments import real_array
 from scvi_codegen.codegen.native.cuda import DEVICES, Device, has_device_memory
 from scvi_codegen.codegen.native.options import SolverOptions, checked_options
-from scvi_codegen.common.errors import StateError
+from scvi_codegen.codegen.variants import Lanes
+from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.driver.segments import (
     ALL,
@@ -42,6 +43,9 @@ from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise, check_strengt
 from scvi_codegen.runs.stepping.projection import make_consistent
 from scvi_codegen.runs.stepping.state_functions import neither_or_both
 from scvi_codegen.runs.stepping.step_plan import Adaptive, ErrorControl, KindOfSteps, check_max_step, planned_steps
+
+RANGE = np.finfo(np.float32)
+"""Range of single precision."""
 
 
 def on_processor(value: Any) -> Any:
@@ -131,6 +135,8 @@ class EnsembleSettings:
 
     def check(self, stepper: Any) -> None:
         """Raise an error for arguments that exclude each other, or that the stepper excludes."""
+        if self.precision != "double":
+            self._check_precision(stepper)
         if self.device not in (None, *DEVICES):
             raise StateError(f"device is {self.device!r}: it must be {' or '.join(map(repr, DEVICES))}, or omitted")
         adaptive = True if self.h is None else None
@@ -143,6 +149,37 @@ class EnsembleSettings:
         if self.records_events(stepper):
             check_together(events=stepper.events, device=self.device, observe_ensemble=self.observe)
             require(stepper, "ensemble_events")
+
+    def _check_precision(self, stepper: Any) -> None:
+        """Raise an error for an unknown precision, and for what single precision excludes."""
+        if self.precision != "single":
+            raise StateError(
+                f"precision is {self.precision!r}: ensembles have 'double' and 'single'; compile the stepper with "
+                "precision='double-double' for more digits"
+            )
+        require(stepper, "single")
+        further = {"adaptive": True if self.h is None else None, "error": self.error, "t_eval": self.t_eval}
+        further |= {"events": self.records_events(stepper) or None, "action": stepper.sums_action or None}
+        further |= {"device": self.device, "observe_ensemble": self.observe}
+        check_together(**{"precision='single'": True}, **further)
+        if self.inputs is not None and stepper.interface.constraints:
+            raise StateError("precision='single' is not available with inputs and constraints: omit precision")
+        if stepper._variants[Lanes("single")] is None:
+            raise MethodError(
+                f"precision='single' is not available for '{stepper.title}', which was loaded without its source: "
+                "compile the system, or omit precision"
+            )
+
+    def check_range(self, parameters: Array, *states: Array) -> None:
+        """Raise :class:`StateError` for parameters or states outside the range of the precision."""
+        if self.precision == "single":
+            for values in (parameters, *states):
+                worst = np.abs(values).max(initial=0.0)
+                if worst > RANGE.max or (values is parameters and (np.abs(values[values != 0.0]) < RANGE.tiny).any()):
+                    raise StateError(
+                        f"a parameter or state of size {worst:.3g} is outside the range of single precision, "
+                        f"{RANGE.tiny:.1e} to {RANGE.max:.1e}: choose other units, or precision='double'"
+                    )
 
     def records_events(self, stepper: Any) -> bool:
         """Return whether trajectories record the events of the stepper, which may be counted instead."""
@@ -234,6 +271,7 @@ class Ensemble:
             plan: dict[str, Any] = {"steps": steps, "t_end": t_end, "inputs": inputs, "save_every": save_every}
             fixed = CommonSteps(t0, settings.h, **plan, words=layout.words)
         positions, momenta, values = start_of_ensemble(stepper, q, momenta, t0, parameters)
+        settings.check_range(values, positions, momenta)
         noise = Noise.checked(stepper, settings.seed, settings.metropolis, settings.trajectory, settings.inputs)
         start: dict[str, Any] = {"t0": t0, "q": positions, "p": momenta, "parameters": values, "noise": noise}
         for member in np.unique(values, axis=0) if stepper.interface.temperature is not None else ():

@@ -195,7 +195,7 @@ class LaneRuns(Batch):
     ) -> None:
         super().__init__(binding, ensemble)
         self.fields, self.common, self.width = fields, common, len(binding.new("block *").active)
-        self.number = np.float32 if ensemble.settings.precision == "single" else np.float64
+        self.number: Any = np.float32 if ensemble.settings.precision == "single" else np.float64
         self.needs_velocities = common is not None and bool(binding.constant("NEEDS_VELOCITIES"))
         self.keeps_unknowns = bool(ensemble.stepper.interface.constraints)
 
@@ -261,9 +261,15 @@ class LaneRuns(Batch):
             common.q[row:, j] = common.p[row:, j] = np.nan
             if ended:
                 self.done[j] = step
-                q, p, *low = (self.lanes(name)[..., lane].copy() for name in ("q", "p", "carry_q", "carry_p"))
+                q, p, *low = (
+                    self.lanes(name)[..., lane].astype(np.float64) for name in ("q", "p", "carry_q", "carry_p")
+                )
                 continued = step and common.steps.at(step)[0].h == common.steps.at(step - 1)[0].h
-                unknowns = self.lanes("memory")[..., lane].ravel() if self.keeps_unknowns and continued else None
+                unknowns = (
+                    self.lanes("memory")[..., lane].ravel().astype(np.float64)
+                    if self.keeps_unknowns and continued
+                    else None
+                )
                 self.left.append(Departure(j, step, q, p, (low[0], low[1]), unknowns))
         self.active[:] = 1.0 if ended else self.active
 

@@ -24,6 +24,7 @@ OPERATIONS = {
     "ensemble_events": "integrate_ensemble of a stepper with events",
     "device": "device=",
     "observe_ensemble": "integrate_ensemble(observe=)",
+    "single": "integrate_ensemble(precision='single')",
     "checkpoint": "checkpoint",
     "recording": "record_run",
     "dense_output": "dense output",
@@ -108,7 +109,7 @@ _DERIVATIVES = f"{_FIRST} chaos chaos_ensemble periodic_orbit fit flow"
 _CURVE = "SVI, SCVI or a Gauss method"
 _ACTIONS = "action shadow_energy path"
 _IN_DOUBLE = (
-    "check_growth device observe_ensemble work discrete_lagrangian "
+    "check_growth device observe_ensemble single work discrete_lagrangian "
     f"chaos_ensemble periodic_orbit energy fit flow {_ACTIONS}"
 )
 _RUNS = "chaos chaos_ensemble periodic_orbit fit flow work check_growth"
@@ -118,13 +119,13 @@ FEATURES = {
     for property_, operations, remedy in (
         (
             "in a heat bath",
-            "adaptive error t_eval dense_output events advice device tangent pullback sensitivity hessian "
+            "adaptive error t_eval dense_output events advice device single tangent pullback sensitivity hessian "
             f"{_RUNS} {_ACTIONS}",
             "give h and steps, and use saved states and averages of them; steps alone have derivatives",
         ),
         (
             "with a time transformation",
-            "ensembles device observe_ensemble chaos_ensemble periodic_orbit fit flow",
+            "ensembles device observe_ensemble single chaos_ensemble periodic_orbit fit flow",
             "this requires fixed steps h; compile the stepper without time_transformation",
         ),
         ("with precision='double-double'", _IN_DOUBLE, "omit it, or use precision='double'"),
@@ -135,7 +136,11 @@ FEATURES = {
         ("in transformed time", "advice", "use --tolerance (local error)"),
         ("in transformed time", "adaptive", "give h (fixed step in tau)"),
         ("in transformed time", "inputs", "compile the original system"),
-        ("in transformed time", "device observe_ensemble chaos chaos_ensemble periodic_orbit fit flow", _ORIGINAL),
+        (
+            "in transformed time",
+            "device observe_ensemble single chaos chaos_ensemble periodic_orbit fit flow",
+            _ORIGINAL,
+        ),
         ("in transformed time", _ACTIONS, _ORIGINAL),
         ("in transformed time", "ensemble_events", "integrate each trajectory, or pass stepper.with_events(())"),
         ("with a time transformation", "shadow_energy path", "compile the stepper without time_transformation"),
@@ -157,13 +162,17 @@ FEATURES = {
             "error device observe_ensemble check_growth hessian chaos_ensemble flow advice shadow_energy",
             "make them terminal and restart",
         ),
-        ("with kinks that runs locate", "device observe_ensemble hessian", 'compile it with kinks="as formulas"'),
+        (
+            "with kinks that runs locate",
+            "device observe_ensemble single hessian",
+            'compile it with kinks="as formulas"',
+        ),
         ("where L or H jumps", "shadow_energy", "use energy()"),
         ("where L or H jumps", " ".join(BY_FORMULAS), "use runs, ensembles of runs and their first derivatives"),
         ("with events that set parameters", _DERIVATIVES, "make them terminal, and restart with the new parameters"),
         (
             "with contacts",
-            f"check_growth device observe_ensemble hessian chaos_ensemble flow advice {_ACTIONS}",
+            f"check_growth device observe_ensemble single hessian chaos_ensemble flow advice {_ACTIONS}",
             "use runs and ensembles with h, or with t_end and a tolerance, without it",
         ),
         ("with constraints", "device observe_ensemble", "use coordinates without constraints, or omit it"),
@@ -197,12 +206,12 @@ FEATURES = {
         ),
         (
             "with sizes known at run time",
-            "flow device observe_ensemble",
+            "flow device observe_ensemble single",
             f"pass stepper.with_sizes(..); {SIZES_REQUIRED}",
         ),
         (
             "without trajectories in SIMD lanes",
-            "device observe_ensemble",
+            "device observe_ensemble single",
             "it requires explicit steps or a fixed-point iteration, as of SVI and Gauss methods without constraints; "
             "omit it",
         ),
@@ -228,6 +237,11 @@ FEATURES = {
         ("with t_eval", "device", "give h, steps and save_every"),
         ("with error", "device", "give h and steps (fixed step size)"),
         ("with device", "adaptive", "give h and steps (fixed step size), or omit device"),
+        (
+            "with precision='single'",
+            "adaptive error t_eval events device observe_ensemble action",
+            "give h and steps (fixed step size), and save states; or omit precision",
+        ),
         ("with events", "device observe_ensemble", "count them by observe='events', or pass stepper.with_events(())"),
         ("with t_eval", "observe", "omit observe"),
         ("with observe", "error dense_output", "omit observe"),

@@ -141,7 +141,8 @@ static inline lanes points_total(lanes *x)
 }
 
 /* Weight of a point in sums of changes: in single runs further lanes, of at least two, repeat the last point. */
-#define CHANGES_OF(n) ((weight)((n) < S - 1 ? 1.0 : S > 1 ? 1.0 + POINTS_THERE - S : 2.0))
+#define CHANGES_OF(n) ((weight)((n) < S - 1 ? 1.0 : S > 1 ? 1.0 + POINTS_THERE - S \
+                                                          : 2.0))
 
 /* Value at the first point. */
 static inline number at_first(const lanes *x)
