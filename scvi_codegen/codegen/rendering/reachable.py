@@ -1,9 +1,10 @@
-"""Source of one file as a reader needs it: what exported functions reach, each declaration behind those that it needs.
+"""Files of a source as a reader needs them: what exported functions reach, each declaration behind those that it needs.
 
-The step comes first. Like :mod:`~scvi_codegen.codegen.rendering.own_names` this relies on the layout of the templates,
-where a declaration at file scope begins in the first column, and is not a C parser: a name counts as used wherever it
-occurs other than as a member. The support headers serve all integrators, each of which uses a part of them, and no C
-compiler prints a source without what it does not use.
+The first file has the step and its run, and includes the others. Like
+:mod:`~scvi_codegen.codegen.rendering.own_names` this relies on the layout of the templates, where a declaration at file
+scope begins in the first column, and is not a C parser: a name counts as used wherever it occurs other than as a
+member. The support headers serve all integrators, each of which uses a part of them, and no C compiler prints a source
+without what it does not use.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ CHOICE = re.compile(r"\b[A-Z]{4,}(?:_[A-Z]+)*\b")
 ALIAS = re.compile(r"^#define (\w+)(?: ([A-Za-z_][\w ]*)|\((\w+)\) \3(?: /\*.*\*/)?)$", re.MULTILINE)
 """Macro that is another name, keywords or its argument."""
 UNDEFINED = re.compile(r"^#undef (\w+)$", re.MULTILINE)
+STANDARD = {"#include <float.h>": r"\b(DBL|FLT)_", "#include <limits.h>": r"\b(INT|U?L?LONG)_M"}
+"""Standard headers that not every source uses, and names that they define."""
 MEANINGS = "#define", "#undef", "typedef", "struct"
 """Beginnings of declarations on whose words those depend that mention their names."""
 CHOICES = "/* Choices of this integrator among the alternatives of the support headers. */\n"
@@ -96,6 +99,9 @@ def readable(code: str) -> dict[str, str]:
         name: "\n".join([f"/* {FILES[name][0]} */\n" if name else "", *_lines(file)]).strip("\n")
         for name, file in files.items()
     }
+    for include, names in STANDARD.items():
+        if not any(re.search(names, text) for text in texts.values()):
+            texts[""] = texts[""].replace(f"{include}\n", "")
     return {name: re.sub(r"\n{3,}", "\n\n", text) + "\n" for name, text in texts.items()}
 
 
@@ -231,7 +237,7 @@ def _by_file(parts: Sequence[Part]) -> dict[str, list[Part]]:
     files = {}
     for name, parts_at_end in ends.items():
         file = [part for end in parts_at_end for part in place(end)]
-        declared = {word for part in placed for word in part.names}
+        declared = {word for part in placed if part.lines[-1].endswith(");") for word in part.names}  # defined below
         if file := file + [part for end in parts if end.names & declared for part in place(end)]:
             files[name] = file
     return files
