@@ -43,6 +43,8 @@ OPERATIONS = {
 """Differentiable operations of a kernel, as functions of SymPy."""
 
 
+PLAIN = sympy.Symbol, sympy.Mul, sympy.Function, Intermediate
+"""Factors of numbers that make a product of SymPy as they are."""
 LARGEST_UNROLLED_POWER = 64
 VANISHING = sympy.Rational(1, 2**120)
 """Added to bases of roots that vanish on a side of a kink, so that the rounding error of a root of 0 is 0, not 0/0."""
@@ -298,11 +300,14 @@ def _primitive(total: sympy.Add) -> tuple[sympy.Rational, Sequence[sympy.Expr]]:
     divisor, multiple = math.gcd(*(c.p for c, _ in pairs)), math.lcm(*(c.q for c, _ in pairs))
     if divisor == multiple:  # 1, which has no factor in common with another one
         return sympy.S.One, total.args
-    if not all(isinstance(rest, sympy.Symbol | sympy.Mul | Intermediate) for _, rest in pairs):
+    if not all(isinstance(rest, PLAIN) or rest is sympy.S.One for _, rest in pairs):
         content, primitive = total.primitive()
         return content, primitive.args
     scaled = [(sympy.Integer(c.p // divisor * (multiple // c.q)), rest) for c, rest in pairs]
-    terms = [rest if c == 1 else sympy.Mul._from_args((c, *sympy.Mul.make_args(rest))) for c, rest in scaled]
+    terms = [
+        c if rest is sympy.S.One else rest if c == 1 else sympy.Mul._from_args((c, *sympy.Mul.make_args(rest)))
+        for c, rest in scaled
+    ]
     return sympy.Rational(divisor, multiple), sorted(terms, key=cmp_to_key(sympy.Basic.compare))
 
 

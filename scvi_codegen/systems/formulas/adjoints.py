@@ -13,9 +13,9 @@ from collections.abc import Callable, Mapping
 from heapq import heapify, heappop, heappush
 from typing import TypeAlias
 
-from sympy import Add, Expr, Mul, S
+from sympy import Expr, S
 
-from scvi_codegen.systems.formulas.intermediates import Intermediate, intermediate
+from scvi_codegen.systems.formulas.intermediates import Intermediate, intermediate, product, total
 
 Gradient: TypeAlias = dict[int | Intermediate, Expr]
 """Non-zero derivatives by the index of a variable, or by an intermediate quantity that depends on variables."""
@@ -30,13 +30,13 @@ def gradient_by_adjoints(gradient: Gradient, derived: Derived) -> dict[int, Expr
     heapify(pending)
     while pending:
         _, node = heappop(pending)
-        adjoint = intermediate(Add(*parts.pop(node)))
+        adjoint = intermediate(total(parts.pop(node)))
         for key, derivative in derived(node.definition).items() if adjoint is not S.Zero else ():
             if isinstance(key, Intermediate) and key not in parts:
                 heappush(pending, (-key.number, key))
-            parts.setdefault(key, []).append(Mul(derivative, adjoint))
-    total = {index: Add(*terms) for index, terms in parts.items() if isinstance(index, int)}
-    return {index: entry for index, entry in total.items() if entry is not S.Zero}
+            parts.setdefault(key, []).append(product(derivative, adjoint))
+    entries = {index: total(terms) for index, terms in parts.items() if isinstance(index, int)}
+    return {index: entry for index, entry in entries.items() if entry is not S.Zero}
 
 
 class Elimination:
@@ -84,7 +84,7 @@ class Elimination:
             if node in self.users and entry == self._rank(node):
                 for changed in self._eliminate(node):
                     heappush(queue, self._rank(changed))
-        entries = {(row, key): Add(*terms) for row in self.rows for key, terms in self.parts[row].items()}
+        entries = {(row, key): total(terms) for row in self.rows for key, terms in self.parts[row].items()}
         return {place: entry for place, entry in entries.items() if entry is not S.Zero}
 
     def _rank(self, node: Intermediate) -> tuple[int, int, int, Intermediate]:
@@ -92,14 +92,14 @@ class Elimination:
 
     def _eliminate(self, node: Intermediate) -> list[Intermediate]:
         """Replace a quantity by products of derivatives; return the quantities whose edges changed."""
-        inputs = {key: intermediate(Add(*terms)) for key, terms in self.parts.pop(node).items()}
+        inputs = {key: intermediate(total(terms)) for key, terms in self.parts.pop(node).items()}
         users = self.users.pop(node)
         for user in users:
-            entry = intermediate(Add(*self.parts[user].pop(node)))
+            entry = intermediate(total(self.parts[user].pop(node)))
             for key, derivative in inputs.items():
                 if self.lower and isinstance(key, int) and key > self.last[user]:
                     continue
-                self.parts[user].setdefault(key, []).append(Mul(entry, derivative))
+                self.parts[user].setdefault(key, []).append(product(entry, derivative))
                 if isinstance(key, Intermediate):
                     self.users[key][user] = None
         quantities = [key for key in inputs if isinstance(key, Intermediate)]

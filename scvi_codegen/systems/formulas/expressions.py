@@ -25,7 +25,15 @@ from sympy.core.function import AppliedUndef
 
 from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.systems.formulas.adjoints import Elimination, Gradient, gradient_by_adjoints
-from scvi_codegen.systems.formulas.intermediates import Intermediate, intermediate, intermediates, parts, without_abs
+from scvi_codegen.systems.formulas.intermediates import (
+    Intermediate,
+    intermediate,
+    intermediates,
+    parts,
+    product,
+    total,
+    without_abs,
+)
 from scvi_codegen.systems.formulas.kinks import (
     OF_SYMPY,
     absolute,
@@ -425,9 +433,9 @@ def _combined(pairs: Sequence[tuple[Expr, Gradient]]) -> Gradient:
     parts: dict[int, list[Expr]] = {}
     for factor, derivatives in pairs:
         for index, derivative in derivatives.items():
-            parts.setdefault(index, []).append(derivative if factor is S.One else Mul(factor, derivative))
-    total = {index: Add(*terms) for index, terms in parts.items()}
-    return {index: entry for index, entry in total.items() if entry is not S.Zero}
+            parts.setdefault(index, []).append(derivative if factor is S.One else product(factor, derivative))
+    entries = {index: total(terms) for index, terms in parts.items()}
+    return {index: entry for index, entry in entries.items() if entry is not S.Zero}
 
 
 def _partial(node: Expr, position: int) -> Expr:

@@ -12,12 +12,13 @@ symbols and replacements of an intermediate quantity are therefore computed once
 
 from __future__ import annotations
 
-from collections.abc import Collection, Container, Sequence
+from collections.abc import Collection, Container, Iterable, Sequence
+from functools import cmp_to_key
 from itertools import count
 from typing import Any
 from weakref import WeakValueDictionary
 
-from sympy import Abs, Basic, Expr, S, Symbol
+from sympy import Abs, Add, Basic, Expr, Mul, Rational, S, Symbol, cos, sin
 
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.systems.formulas.kinks import absolute, rint, unit_step
@@ -134,6 +135,54 @@ def intermediate(expression: Expr) -> Expr:
     """
     rest = expression.as_coeff_Mul()[1]
     return expression if rest.is_Atom or isinstance(rest, Intermediate) else Intermediate(expression)
+
+
+_FACTORS = Symbol, Intermediate, sin, cos
+_IN_ORDER = cmp_to_key(Basic.compare)
+
+
+def _factors_of(node: Expr) -> tuple[Expr, tuple[Expr, ...]]:
+    """Return the number in a product, and its other factors."""
+    factors = node.args if node.is_Mul else (node,)
+    return (factors[0], factors[1:]) if isinstance(factors[0], Rational) else (S.One, factors)
+
+
+def product(a: Expr, b: Expr) -> Expr:
+    """Return ``Mul(a, b)``, in a third of its time if no factor is a sum or power, and none occurs twice.
+
+    >>> from sympy.abc import x, y
+    >>> product(2 * x, cos(y)) == Mul(2 * x, cos(y)), product(x, x)
+    (True, x**2)
+    """
+    (number, factors), (other, others) = _factors_of(a), _factors_of(b)
+    factors += others
+    if not all(isinstance(factor, _FACTORS) for factor in factors) or len({*factors}) < len(factors):
+        return Mul(a, b)
+    if S.Zero in (number, other):
+        return S.Zero
+    number = number * other
+    return _node(Mul, () if number is S.One else (number,), factors)
+
+
+def total(terms: Iterable[Expr]) -> Expr:
+    """Return ``Add(*terms)``, in a third of its time if no term is a sum, and no two are alike.
+
+    >>> from sympy.abc import x, y
+    >>> total([2 * x, y, S(3)]) == 2 * x + y + 3, total([x, 2 * x])
+    (True, 3*x)
+    """
+    terms = [term for term in terms if term is not S.Zero]
+    alike = {_factors_of(term)[1] for term in terms}
+    numbers = tuple(term for term in terms if isinstance(term, Rational))
+    written = all(term.is_Mul or isinstance(term, (*_FACTORS, Rational)) for term in terms)
+    if not written or len(alike) < len(terms) or len(numbers) > 1:
+        return Add(*terms)
+    return _node(Add, numbers, [term for term in terms if not isinstance(term, Rational)])
+
+
+def _node(kind: type, number: tuple[Expr, ...], arguments: Sequence[Expr]) -> Expr:
+    """Return a sum or product with its arguments in SymPy's order."""
+    return kind._from_args((*number, *sorted(arguments, key=_IN_ORDER)), is_commutative=True)  # type: ignore[attr-defined]
 
 
 def separated(expressions: Sequence[Expr], variables: Collection[Symbol]) -> tuple[list[Expr], dict[Expr, Symbol]]:

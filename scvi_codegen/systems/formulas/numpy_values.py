@@ -1,7 +1,7 @@
 """Evaluation of formulas by NumPy, also at all elements of loops, without generated code."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import reduce
 from typing import Any
 
@@ -12,8 +12,10 @@ from sympy import Expr, Symbol
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.systems.formulas.expressions import LARGEST, PIECEWISE_CONSTANT
 from scvi_codegen.systems.formulas.indices import Access, Loop, periods_of
-from scvi_codegen.systems.formulas.intermediates import Intermediate, intermediates
+from scvi_codegen.systems.formulas.intermediates import Intermediate, inner_of, intermediates
 
+VARYING = 1e-6
+"""Smallest difference, relative to the formula, of second differences that vary."""
 MAX_ELEMENTS = 5_000_000
 """Maximum number of elements of the loops of a term that are evaluated at once."""
 
@@ -30,6 +32,25 @@ def array_value(expression: Expr, values: dict[Expr, Any]) -> Any:
     for quantity in intermediates(expression, without=values):
         _value_in(quantity, values)
     return _value_in(expression, values)
+
+
+def varies(formula: Expr, variables: Sequence[Symbol], parameters: Collection[Symbol]) -> bool:
+    """Return whether second differences of a formula with intermediate quantities vary, not only with parameters.
+
+    l(.., x_i + 1, ..) - 2 l(.., x_i, ..) + l(.., x_i - 1, ..), which is constant if the second derivative is, is
+    compared at two random points: the derivatives of long formulas take more time. ``False`` if unknown.
+    """
+    if not inner_of(formula):
+        return False
+    generator, shape = np.random.default_rng(0), (2, len(variables), 3)
+    others = sorted(formula.free_symbols, key=str)
+    values = {x: generator.uniform(0.5, 1.5, () if x in parameters else (2, 1, 1)) + np.zeros(shape) for x in others}
+    for x, unit in zip(variables, np.eye(len(variables)), strict=True):
+        values[x] = values.get(x, 0.0) + np.multiply.outer(unit, (-1.0, 0.0, 1.0))
+    with np.errstate(all="ignore"):
+        value = array_value(formula, dict(values)) + np.zeros(shape)
+    first, second = value @ np.array([1.0, -2.0, 1.0])
+    return bool(np.abs(first - second).max() > VARYING * np.abs(value).max())
 
 
 def _value_in(expression: Expr, values: dict[Expr, Any]) -> Any:
@@ -50,7 +71,7 @@ def _node_value(expression: Any, values: dict[Expr, Any]) -> Any:
     if expression.is_Mul:
         return reduce(np.multiply, arguments)
     if expression.is_Pow:
-        return np.power(arguments[0], float(arguments[1]) if expression.exp.is_Number else arguments[1])
+        return np.power(*arguments)
     name = type(expression).__name__
     if name in PIECEWISE_CONSTANT:
         return PIECEWISE_CONSTANT[name][1](*arguments)

@@ -46,6 +46,7 @@ from scvi_codegen.systems.formulas.arrays import ROTATING, parse_coordinate
 from scvi_codegen.systems.formulas.expressions import dot, gradient
 from scvi_codegen.systems.formulas.grammar import Parser, parsed
 from scvi_codegen.systems.formulas.indices import Array, Size
+from scvi_codegen.systems.formulas.numpy_values import varies
 from scvi_codegen.systems.formulas.symbols import DOT, check_name, name_of_key, symbol
 
 AXES = (1, 2, 3)
@@ -609,6 +610,8 @@ def _all_names(member: Homogeneous) -> tuple[str, ...]:
 
 @lru_cache(maxsize=4)
 def _mean_inertia(rates: tuple[Symbol, ...], reduced: Expr, parameters: frozenset[Symbol]) -> Expr:
+    if varies(reduced, rates, parameters):
+        return S.One
     entries = [S.Zero] * len(AXES)
     for i, row in gradient(reduced, rates).items():
         entries[i] = gradient(row, rates).get(i, S.Zero)

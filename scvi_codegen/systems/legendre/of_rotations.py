@@ -18,6 +18,7 @@ from sympy import Add, Expr, Matrix, S, Symbol
 
 from scvi_codegen.systems.derived_expressions import coupled_blocks, inverse_by_minors
 from scvi_codegen.systems.formulas.expressions import gradient, gradient_tuple, hessian
+from scvi_codegen.systems.formulas.numpy_values import varies
 from scvi_codegen.systems.formulas.rotations import RotationNames
 from scvi_codegen.systems.formulas.symbols import symbol
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
@@ -65,6 +66,8 @@ def hamiltonian_of_rotations(system: LagrangianSystem) -> HamiltonianSystem | No
 
 def _inverse_of_constant(energy: Expr, u: Sequence[Symbol], parameters: set[Symbol]) -> Matrix | None:
     """Return the inverse of a block-diagonal Hessian of parameters; ``None`` if it varies or a block is too large."""
+    if varies(energy, u, parameters):
+        return None
     rows = (gradient(row, u) for row in gradient(energy, u).values())  # until one varies: O(n), the Hessian O(n^2)
     if any(not entry.free_symbols <= parameters for row in rows for entry in row.values()):
         return None

@@ -142,7 +142,7 @@ def _generated(system: MechanicalSystem, G: Expr, name: str) -> Symmetry:
     if not conserved(system, motion, [G]):
         velocities = motion.transformed if motion.hamiltonian else motion.arguments[len(q) : 2 * len(q)]
         moved = (*velocities, *motion.forces, sympy.S.One)
-        rate = derivative_along(G, (*q, *p, t), moved).xreplace(motion.numbers)
+        rate = derivative_along(G, (*q, *p, t), moved)
         rate = rate if motion.hamiltonian else rate.xreplace(dict(zip(p, motion.transformed, strict=True)))
         raise SystemDefinitionError(
             f"{G} does not generate a symmetry of '{system.name}': its rate of change, {{G, H}} + "

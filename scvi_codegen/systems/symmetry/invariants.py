@@ -48,6 +48,8 @@ HIGHEST_POWER = 16
 """Highest power of a parameter in a coefficient; larger exponents of the logarithmic fit are rejected."""
 AT_ONCE = 4096
 """Number of points evaluated together, which bounds memory: so many numbers are stored per subexpression."""
+PARTS = 8
+"""Number of parts in which parameters are searched for those that act: formulas are evaluated once for all parts."""
 MORE_POINTS = 12
 """Number of sampled points in excess of the number of columns."""
 MORE_PARAMETERS = 4
@@ -118,15 +120,17 @@ class _Search:
         self.parameters_at: dict[Symbol, Array] = {}
 
     def acting(self, selected: Sequence[int]) -> list[Symbol]:
-        """Return the parameters on which null spaces depend, by bisection: those of a part are changed together."""
+        """Return the parameters on which null spaces depend, by parts: those of one are changed together."""
         parts = [[*self.motion.constants]] if self.motion.constants else []
         while parts:
             first, *spaces = self.null_spaces(selected, 1 + len(parts), parts)
             parts = [part for part, space in zip(parts, spaces, strict=True) if not _equal(first, space)]
             if all(len(part) == 1 for part in parts):
                 break
-            halves = ((part[: len(part) // 2], part[len(part) // 2 :]) for part in parts)
-            parts = [half for pair in halves for half in pair if half]
+            sizes = [-(-len(part) // PARTS) for part in parts]
+            parts = [
+                part[k : k + size] for part, size in zip(parts, sizes, strict=True) for k in range(0, len(part), size)
+            ]
         return [parameter for (parameter,) in parts]
 
     def null_spaces(

@@ -8,6 +8,7 @@ into Cartesian positions of bodies; the forces of term groups are computed for a
 
 import functools
 import math
+import operator
 import random
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -172,7 +173,7 @@ class Rates:
         hamiltonian: whether the system is a Hamiltonian.
         time: t.
         constants: default value by parameter; long numbers of the formula are parameters here.
-        numbers: long numbers by the symbols that replace them.
+        numbers: long numbers by the symbols of their values.
         term_groups: term groups that contribute to the forces.
     """
 
@@ -200,17 +201,24 @@ class Rates:
         for k, argument in enumerate(self.arguments):
             size = 1.5 if k < m else generator.choice(SPREADS, count)
             values[argument] = size * generator.uniform(-1.0, 1.0, count)
+        numbers: dict[Any, Any] = {**values, **self.in_formulas(parameters)}
         with np.errstate(all="ignore"):
             group_forces = array_forces(self.term_groups, self.arguments[:m], values, count)
+            moved = [array_value(e, numbers) + np.zeros(count) for e in (*self.transformed, *self.forces)]
             return self._sample(
-                values, lambda expression: array_value(expression, values) + np.zeros(count), group_forces
+                values, lambda expression: array_value(expression, values) + np.zeros(count), moved, group_forces
             )
+
+    def in_formulas(self, parameters: Mapping[Symbol, Any]) -> dict[Expr, Any]:
+        """Return the values of parameters by the long numbers in formulas that they stand for."""
+        return {sign * number: sign * parameters[x] for x, number in self.numbers.items() for sign in (1, -1)}
 
     def points(self, parameters: Mapping[Symbol, Number], count: int) -> Iterator[Sample]:
         """Yield at most ``count`` points at which the system is defined, in 60 digits."""
         generator = random.Random(SEED)
         moved = (*self.transformed, *self.forces)
-        tape = Tape(moved, (*self.arguments, self.time, *parameters))
+        numbers: dict[Any, Any] = {**parameters, **self.in_formulas(parameters)}
+        tape = Tape(moved, (*self.arguments, self.time, *numbers))
         for attempt in range(ATTEMPTS):
             if count == 0:
                 return
@@ -219,9 +227,9 @@ class Rates:
                 size = 1.5 if k < len(self.momenta) else SPREADS[attempt % len(SPREADS)]
                 values[argument] = mp.mpf(size * generator.uniform(-1.0, 1.0))
             try:
-                computed = dict(zip(moved, tape([values[x] for x in tape.symbols]), strict=True))
+                computed = tape([numbers[x] if x in numbers else values[x] for x in tape.symbols])
                 group_forces = exact_forces(self.term_groups, self.arguments[: len(self.momenta)], values)
-                points = self._sample(values, functools.partial(_value_of, computed, values), group_forces)
+                points = self._sample(values, functools.partial(_value_of, values), computed, group_forces)
             except ArithmeticError:
                 continue
             count -= 1
@@ -238,10 +246,11 @@ class Rates:
                 return points
         return []
 
-    def _sample(self, values: dict[Any, Any], value: Callable[[Expr], Any], group_forces: Sequence[Any]) -> Sample:
+    def _sample(
+        self, values: dict[Any, Any], value: Callable[[Expr], Any], moved: Sequence[Any], group_forces: Sequence[Any]
+    ) -> Sample:
         m = len(self.momenta)
-        transformed, forces = (tuple(map(value, expressions)) for expressions in (self.transformed, self.forces))
-        forces = tuple(force + pull for force, pull in zip(forces, group_forces, strict=True))
+        transformed, forces = tuple(moved[:m]), tuple(map(operator.add, moved[m:], group_forces))
         halves = (self.arguments[:m], self.arguments[m : 2 * m])
         q, second = (tuple(values[argument] for argument in half) for half in halves)
         p, v = (second, transformed) if self.hamiltonian else (transformed, second)
@@ -257,20 +266,15 @@ def drawn_parameters(constants: Mapping[Symbol, float], count: int, *, near: boo
     return {x: math.copysign(1.0, value) * generator.uniform(0.6, 1.7, count) for x, value in constants.items()}
 
 
-def _value_of(computed: Mapping[Expr, Number], values: Mapping[Symbol, Number], expression: Expr) -> Number:
-    if expression in computed:
-        return computed[expression]
+def _value_of(values: Mapping[Symbol, Number], expression: Expr) -> Number:
     return evaluate(expression, {x: values[x] for x in expression.free_symbols})
 
 
 def rates_of(system: MechanicalSystem, term_groups: tuple[TermGroup, ...] = ()) -> Rates:
-    """Return the rates of a system with term groups ``term_groups``; long numbers are replaced by parameters."""
+    """Return the rates of a system with term groups ``term_groups``; long numbers count as parameters."""
     arguments, transformed = forms_of(system).legendre_arguments, forms_of(system).legendre
     forces = with_constraint_forces(system, forms_of(system).momentum_rate)
     numbers = _long_numbers((*transformed, *forces))
-    if numbers:
-        replaced = {sign * number: sign * parameter for parameter, number in numbers.items() for sign in (1, -1)}
-        transformed, forces = (tuple(e.xreplace(replaced) for e in part) for part in (transformed, forces))
     return Rates(
         arguments=(*arguments, *constraint_multipliers(system)),
         momenta=system.momentum_symbols,

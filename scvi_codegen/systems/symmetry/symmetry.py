@@ -361,10 +361,9 @@ class WorkRate:
 def work_rates(system: MechanicalSystem) -> tuple[WorkRate, ...]:
     """Return the power, then the rate of each momentum map that forces or damping change; empty without forces."""
     of_contacts = constraint_power(system) if system.reactions else sympy.S.Zero
-    power = _along(system, system.velocities) + of_contacts
     if not system.forces and system.damping == 0 and of_contacts == 0:
         return ()
-    rates = [WorkRate(name="energy", rate=power)]
+    rates = [WorkRate(name="energy", rate=_along(system, system.velocities) + of_contacts)]
     for symmetry in symmetries(replace(system, forces=(), damping=sympy.S.Zero)):
         direction_symbols = set().union(*(xi.free_symbols for xi in symmetry.direction))
         rate = _along(system, symmetry.direction)

@@ -45,7 +45,7 @@ from sympy import Abs, Add, Expr, Matrix, Rational, S, Symbol, atan2, cos, eye, 
 from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
 from scvi_codegen.systems.contact import ContactLike, contact, friction
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
-from scvi_codegen.systems.formulas.intermediates import intermediate
+from scvi_codegen.systems.formulas.intermediates import intermediate, product, total
 from scvi_codegen.systems.formulas.rotations import Rotation, RotationNames
 from scvi_codegen.systems.formulas.symbols import DOT, default_momenta, symbol
 from scvi_codegen.systems.multibody.trees.tree import (
@@ -77,6 +77,7 @@ class Tree:
         self.gravity = exact_vector(gravity)
         self.joints = {link.joint.name: link.joint for link in links}
         self.leaders = {joint.name: self.leader(joint) for joint in self.joints.values() if joint.kind in SINGLE}
+        self.turns = {link.joint.name: self.turns_of(link.joint) for link in links}
         self.masses = self.of_subtrees([exact_number(link.inertia.mass) for link in links])
         self.weights = self.of_subtrees([exact_number(link.inertia.mass - link.inertia.lift[0]) for link in links])
         self.moments = self.first_moments()
@@ -99,16 +100,24 @@ class Tree:
         """Return the coordinate of a hinge or slide from the zero of the model."""
         return self.coordinate(joint)[0] - exact_number(joint.zero)
 
-    def turned(self, joint: Joint, vector: Matrix, *, back: bool = False) -> Matrix:
-        """Return a vector turned by A, from the frame of the link to that of its parent; ``back``: by A^T."""
+    def turns_of(self, joint: Joint) -> list[list[list[Expr]]]:
+        """Return the factors of A, that of the frame of the parent first."""
         turns = [Matrix(3, 3, rotation_of(joint).entries)] if joint.kind in ("ball", "free") else []
         if joint.kind == "hinge":
             q = self.displacement(joint)
             turns = [Matrix([[cos(q), -sin(q), 0], [sin(q), cos(q), 0], [0, 0, 1]])]
-        if joint.kind != "free":
-            turns.insert(0, exact_matrix(joint.pose.rotation))
-        for turn in turns if back else reversed(turns):
-            vector = as_quantities((turn.T if back else turn) * vector)
+        fixed = [] if joint.kind == "free" else [exact_matrix(joint.pose.rotation)]
+        return [turn.tolist() for turn in (*fixed, *turns)]
+
+    def turned(self, joint: Joint, vector: Matrix, *, back: bool = False) -> Matrix:
+        """Return a vector turned by A, from the frame of the link to that of its parent; ``back``: by A^T."""
+        return Matrix(3, 1, self.components(joint, vector.flat(), back=back))
+
+    def components(self, joint: Joint, vector: Sequence[Expr], *, back: bool = False) -> Sequence[Expr]:
+        """Return the components of a vector that is turned."""
+        for matrix in self.turns[joint.name] if back else reversed(self.turns[joint.name]):
+            rows = zip(*matrix, strict=True) if back else matrix
+            vector = [intermediate(total(map(product, row, vector))) for row in rows]
         return vector
 
     def origin(self, joint: Joint) -> Matrix:
@@ -454,9 +463,10 @@ def _in_parent(tree: Tree, joint: Joint, inertia: Matrix, bias: Matrix) -> tuple
 
 def _turned_twice(tree: Tree, joint: Joint, block: Matrix) -> Matrix:
     """Return A X A^T, where A is the rotation of a joint."""
+    rows = block.tolist()
     for _ in range(2):
-        block = Matrix.hstack(*(tree.turned(joint, block[:, k]) for k in range(3))).T
-    return block
+        rows = [tree.components(joint, column) for column in zip(*rows, strict=True)]
+    return Matrix(rows)
 
 
 def _symmetric(matrix: Matrix) -> Matrix:

@@ -6,7 +6,7 @@ the lift of Magnus and of Kutta and Joukowski. https://mujoco.readthedocs.io/en/
 """
 
 import numpy as np
-from scipy.special import elliprd
+import scipy
 from sympy import Abs, Expr, Matrix, sqrt
 
 from scvi_codegen.common.errors import SystemDefinitionError
@@ -35,7 +35,7 @@ def ellipsoid(r: Vector, coefficients: Vector, rho: float, beta: float, w: Matri
     """
     number, (blunt, slender, angular, kutta, magnus) = exact_number, coefficients
     j, k, volume, (_, middle, largest) = np.roll(r, -1), np.roll(r, -2), 4 / 3 * np.pi * r.prod(), np.sort(r)
-    share, across, d = 2 / 3 * r.prod() * elliprd(j**2, k**2, r**2), j**2 - k**2, 2 / 3 * r.sum()
+    share, across, d = 2 / 3 * r.prod() * scipy.special.elliprd(j**2, k**2, r**2), j**2 - k**2, 2 / 3 * r.sum()
     apart = np.abs(np.roll(share, -1) - np.roll(share, -2))
     below = np.maximum(np.abs(2 * np.abs(across) - (j**2 + k**2) * apart), 1e-14)  # as MuJoCo, 0 of equal axes
     swept, most = 8 / 15 * np.pi * r * np.maximum(j, k) ** 4, 8 / 15 * np.pi * middle * largest**4

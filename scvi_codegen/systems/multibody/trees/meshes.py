@@ -12,8 +12,8 @@ from pathlib import Path
 from xml.etree.ElementTree import Element as Node
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 
 from scvi_codegen.common.errors import closest, imported
 from scvi_codegen.systems.formulas.rotations import matrix_of
@@ -38,8 +38,8 @@ def _inertia(mesh: Element) -> Inertia:
         mesh.refuse("has inertia='convex' and maxhullvert, a hull that is not computed: remove one")
     if rule == "convex" or not len(faces):
         try:
-            rule, faces = "shell" if rule == "shell" else "convex", ConvexHull(corners).simplices
-        except (QhullError, ValueError) as error:
+            rule, faces = "shell" if rule == "shell" else "convex", scipy.spatial.ConvexHull(corners).simplices
+        except (scipy.spatial.QhullError, ValueError) as error:
             mesh.refuse(f"has no convex hull: {str(error).strip().splitlines()[0]}")
     merged = np.unique(corners, axis=0, return_inverse=True)[1].reshape(-1)[faces]
     sides = np.concatenate([merged[:, [i, (i + 1) % 3]] for i in range(3)])
