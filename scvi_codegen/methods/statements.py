@@ -7,6 +7,7 @@ An algorithm is a text in the syntax of Python, of which only the forms below ar
 * ``A @ x[i]`` is the sum over points j of A_nj x_j, ``former(x[i])`` the value at the point before.
 * ``y[i] = mass(x[i])`` is M^-1 x, ``y[k] = solve(x[k])`` the solution of the factorised equations of the constraints,
   ``factorise(G)`` their factorisation.
+* ``y[i] = modes(x[i])``, ``rotated`` and ``momenta`` are V x, U^T x and W x with the matrices of a heat bath.
 * ``y[i] = kernel(x, t + c * h)`` evaluates the kernel of that name.
 * ``for n in TABLE:`` repeats statements for the rows of tables; ``if condition:`` compares numbers of tables. A
   condition that is the name of a feature is decided when the text is read.
@@ -103,7 +104,7 @@ class Assign:
 
 @dataclass(frozen=True, slots=True)
 class Apply:
-    """An operation on all values of a quantity: ``mass``, ``solve``, ``factorise``, ``invert``, or a kernel.
+    """An operation on all values of a quantity: a product or solution, ``factorise``, ``invert``, or a kernel.
 
     Attributes:
         name: of the operation.
@@ -180,7 +181,7 @@ class When:
 Statement: TypeAlias = Assign | Apply | Repeat | When
 
 OPERATORS: dict[type[ast.operator], str] = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
-OF_CONSTRAINTS = ("mass", "solve", "factorise", "invert")
+LINEAR = ("mass", "solve", "modes", "rotated", "momenta")
 COMPARISONS: dict[type[ast.cmpop], str] = {ast.NotEq: "!=", ast.Gt: ">", ast.Eq: "=="}
 FORMS = (
     "statements are x[i] = .., x[i] += .., x[i] -= .., x[i] = kernel(y, t), 'for n in ROWS:' and 'if condition:', "
@@ -245,7 +246,7 @@ class _Reader:
             case ast.Expr(value=ast.Call(func=ast.Name(name), args=[ast.Name(argument)])):
                 yield Apply(name, argument, None)
             case ast.Assign(targets=[target], value=ast.Call(func=ast.Name(name), args=[argument, *time])) if (
-                name in OF_CONSTRAINTS or time
+                name in LINEAR or time
             ):
                 whole = argument.value if isinstance(argument, ast.Subscript) else argument
                 if not isinstance(whole, ast.Name):

@@ -48,7 +48,7 @@ from scvi_codegen.codegen.lowering.stage_groups import (
     lowered_stage_group,
     system_kernel,
 )
-from scvi_codegen.codegen.statements.steps import rattle_texts, splitting_texts
+from scvi_codegen.codegen.statements.steps import bath_texts, rattle_texts, splitting_texts
 from scvi_codegen.codegen.variants import Sums
 from scvi_codegen.common.errors import MethodError
 from scvi_codegen.common.precision import Matrix, Vector, mp
@@ -139,13 +139,14 @@ def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
 
 def step_texts(system: MechanicalSystem, method: Method) -> Mapping[str, str]:
     """Return the statements from which the C of a step is generated, by their titles; none of other steps."""
+    bath = bath_texts(bool(system.bath.noise)) if system.bath else {}
     if not system.constraints:
         splitting = splitting_of(system, method)
-        return splitting_texts(splitting) if splitting else {}
+        return (splitting_texts(splitting) if splitting else {}) | bath
     stages = discretise(system, method)
     extrapolation = _equations(system, method, stages, newton=False, curve=False).extrapolation
     rattle = rattle_of(system, stages, extrapolation)
-    return rattle_texts(rattle) if rattle else {}
+    return (rattle_texts(rattle) if rattle else {}) | bath
 
 
 def summing_splitting(splitting: Splitting, system: MechanicalSystem) -> Splitting:

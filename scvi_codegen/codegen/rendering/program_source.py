@@ -46,7 +46,7 @@ from scvi_codegen.codegen.rendering.text import (
     HeaderRecord,
 )
 from scvi_codegen.codegen.statements.printing import Layout
-from scvi_codegen.codegen.statements.steps import pair_rattle_functions, rattle_functions, splitting_header
+from scvi_codegen.codegen.statements.steps import half_step, pair_rattle_functions, rattle_functions, splitting_header
 
 Embedded: TypeAlias = Literal["double", "single"]
 """Precision of C source for a microcontroller."""
@@ -470,6 +470,8 @@ def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") 
     if context["two_words"]:
         headers |= arithmetic_headers()
     program = context.get("program")
+    if isinstance(program, Program) and program.bath:
+        headers["support/run/exchange_heat.h"] = half_step(program.bath)
     if isinstance(program, Program) and program.rattle:
         features = [name.lower() for name in program.rattle.macros]
         headers["support/constraints/iterate.h"] = rattle_functions(program.rattle.part, features)

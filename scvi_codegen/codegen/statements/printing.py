@@ -85,21 +85,25 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Layout:
-    """C of a step without points: numbers of one or two ``words``, and ``lanes`` if SIMD lanes are trajectories."""
+    """C of a step without points: numbers of one or two ``words``, and ``lanes`` if SIMD lanes are trajectories.
+
+    ``word`` is the type of numbers of one word.
+    """
 
     words: int = 1
     lanes: bool = False
+    word: str = "number"
 
     @property
     def number(self) -> str:
         """Type of a value of the trajectory."""
         pair = "ddl" if self.lanes else "dd"
-        return "number" if self.words == 1 else pair
+        return self.word if self.words == 1 else pair
 
     def type_of(self, quantity: Quantity) -> str:
         """Return the type of a value."""
         if quantity.words == 1:
-            return "number"
+            return self.word
         return "dd" if quantity.uniform else "ddl"
 
     def local(self, name: str, place: Place, words: int, index: str) -> Quantity:
@@ -342,6 +346,9 @@ class Printer:
         quantity, value, at = self.quantity(statement.target.name), self.value(statement.value), statement.target.at
         if statement.operator:
             target = self.layout.read(quantity, at)
+            if quantity.place is Place.STATE and at:
+                increment = value if statement.operator == "+" else negated(value)
+                return f"add_to_state(&{target.text}, &{quantity.low}[{at.text}], {increment.text});"
             if quantity.words == 1 and quantity.place is not Place.MEMORY:
                 return f"{target.text} {statement.operator}= {value.text};"
             value = combine(statement.operator, target, value)

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 from scvi_codegen.codegen.ir.equations import Rattle, Splitting
+from scvi_codegen.codegen.ir.program import HeatBath
 from scvi_codegen.codegen.statements.printing import Layout, Place, PointsAsLanes, Printer, Quantity
 from scvi_codegen.methods.statements import Apply, Assign, Operation, Read, Repeat, Statement, When, read, selected
 
@@ -57,6 +58,12 @@ def rattle_texts(rattle: Rattle) -> dict[str, str]:
     return {title: f"{selected(text, features)}\n" for title, _, _, text in CONSTRAINED[rattle.part]}
 
 
+def bath_texts(noise: bool) -> dict[str, str]:
+    """Return the statements of half a step of a heat bath, with further noise or without, by their title."""
+    title = "half a step of the heat bath, before and after the step, with p - A = W y"
+    return {title: f"{selected(HALF_STEP, ['noise'] * noise)}\n"}
+
+
 def velocities_by_masses(statements: Iterable[Statement]) -> Iterator[Statement]:
     """Yield statements in which velocities are momenta times the inverse masses."""
     for statement in statements:
@@ -101,6 +108,49 @@ static inline void leap_in_pairs(const step_data *step, dd t, dd h, const {kind}
     if split.driven and layout.words == 2:
         first += ["known = 0; /* inputs, which may jump between steps, have changed the last force */"]
     return head + "".join(f"  {line}\n" for line in (*first, *lines, *last)) + "}\n"
+
+
+HALF_STEP = """
+x[i] = p[i] - mean[i] + carry[i]
+y[i] = modes(x)
+r[i] = rotated(xi)
+c[i] = decay[i] * y[i] + strength[i] * r[i]
+if noise:
+    s[i] = root * sigma[i] * eta[i]
+    d[i] = modes(s)
+    c[i] += d[i]
+heat += c[i] * (y[i] + c[i] / 2)
+z[i] = momenta(c)
+p[i] += z[i]
+"""
+"""Half a step of a heat bath: p - A = W y, y <- e^(-k tau) y + (kT (1 - e^(-2 k tau)))^(1/2) U^T xi + tau^(1/2) V sigma
+eta with V = W^-1 (bath.h); decay is e^(-k tau) - 1, and the kinetic energy y^2 / 2."""
+
+
+def half_step(bath: HeatBath) -> str:
+    """Return the function of half a step of a heat bath."""
+    own = {name: Quantity(f"bath->{name}") for name in ("decay", "strength")}
+    own |= {"mean": Quantity("(bath->terms + 1)"), "sigma": Quantity("(bath->terms + BATH_TERMS - STRENGTHS)")}
+    own |= {"xi": Quantity("normals"), "eta": Quantity("(normals + M)"), "carry": Quantity("carry")}
+    own |= {"heat": Quantity("heat", Place.NUMBER), "root": Quantity("bath->root", Place.NUMBER)}
+    own |= {"p": Quantity("p", Place.STATE, low="carry")}
+    sizes, product = [len(block) for block in bath.blocks], ""
+    for b, n in enumerate(sizes):
+        first, factors = sum(sizes[:b]), sum(size**2 for size in sizes[:b])
+        product += f"multiply_block({n}, BLOCK_COORDINATE + {first}, A + {factors}, ARGUMENT, TARGET);\n"
+    matrices = {"modes": "v", "rotated": "turn", "momenta": "w"}.items()
+    operations = {name: product.replace("A +", f"bath->{matrix} +") for name, matrix in matrices}
+    statements = read(HALF_STEP, ["noise"] * bool(bath.sizes["STRENGTHS"]))
+    lines = Printer(own, Layout(word="bath_number"), operations).function_body(statements)
+    return f"""\
+/* Adds half a step to p + carry, by M + STRENGTHS normals; returns the change of the kinetic energy. */
+static inline bath_number exchange_heat(const present_factors *bath, const bath_number *normals, bath_number *p,
+    bath_number *carry)
+{{
+  bath_number heat = {{0}};
+{_indented(lines)}  return heat;
+}}
+"""
 
 
 RATTLE = """

@@ -160,52 +160,29 @@ static int prepare_bath(bath_factors *bath, double t, double h, const double *q,
       largest = fmax(largest, fabs(s[i * n + i]));
     for (int i = 0; i < n; i++) {
       const double rate = fabs(s[i * n + i]) > NO_FRICTION * largest ? s[i * n + i] : 0;
-      bath->decay[first + i] = expm1(-rate * tau);
-      bath->strength[first + i] = sqrt(-temperature * expm1(-2 * rate * tau));
+      bath->decay[BLOCK_COORDINATE[first + i]] = expm1(-rate * tau);
+      bath->strength[BLOCK_COORDINATE[first + i]] = sqrt(-temperature * expm1(-2 * rate * tau));
     }
   }
   return temperature >= 0 && all_finite(bath->terms, BATH_TERMS) && all_finite(bath->strength, M);
 }
 
-static inline bath_number product(int n, const bath_number *x, const bath_number *y)
+/* y = A x of the coordinates of a block. */
+static inline void multiply_block(int n, const int *at, const bath_number *a, const bath_number *x, bath_number *y)
 {
-  bath_number sum = x[0] * y[0];
-  for (int i = 1; i < n; i++)
-    sum += x[i] * y[i];
-  return sum;
+  for (int i = 0; i < n; i++) {
+    bath_number sum = a[i * n] * x[at[0]];
+    for (int k = 1; k < n; k++)
+      sum += a[i * n + k] * x[at[k]];
+    y[at[i]] = sum;
+  }
 }
 
-/* Adds half a step to p + carry, by M + STRENGTHS normals; returns the change of the kinetic energy. */
-static inline bath_number exchange_heat(const present_factors *bath, const bath_number *normals, bath_number *p,
-    bath_number *carry)
+/* x + low += increment, as add_compensated. */
+static inline void add_to_state(bath_number *x, bath_number *low, bath_number increment)
 {
-  const bath_number *w = bath->w, *v = bath->v, *turn = bath->turn;
-  const bath_number *mean = bath->terms + 1, *sigma = bath->terms + BATH_TERMS - STRENGTHS;
-  bath_number heat = {0};
-  for (int b = 0, first = 0, n; b < BLOCKS; b++, w += n * n, v += n * n, turn += n * n, first += n) {
-    const int *at = BLOCK_COORDINATE + first;
-    bath_number x[LARGEST_BLOCK], xi[LARGEST_BLOCK], noise[LARGEST_BLOCK], change[LARGEST_BLOCK];
-    n = BLOCK_SIZE[b];
-    for (int i = 0; i < n; i++) {
-      x[i] = (p[at[i]] - mean[at[i]]) + carry[at[i]];
-      xi[i] = normals[at[i]];
-      if (STRENGTHS)
-        noise[i] = bath->root * sigma[at[i]] * normals[M + at[i]];
-    }
-    for (int i = 0; i < n; i++) {
-      const bath_number y = product(n, v + i * n, x);
-      change[i] = bath->decay[first + i] * y + bath->strength[first + i] * product(n, turn + i * n, xi);
-      if (STRENGTHS)
-        change[i] += product(n, v + i * n, noise);
-      heat += change[i] * (y + change[i] / 2);
-    }
-    for (int i = 0; i < n; i++) { /* as add_compensated */
-      const bath_number increment = product(n, w + i * n, change), old = p[at[i]];
-      const bath_number sum = old + increment, part = sum - old;
-      const bath_number rest = ((old - (sum - part)) + (increment - part)) + carry[at[i]];
-      p[at[i]] = sum + rest;
-      carry[at[i]] = rest - (p[at[i]] - sum);
-    }
-  }
-  return heat;
+  const bath_number sum = *x + increment, part = sum - *x;
+  const bath_number rest = ((*x - (sum - part)) + (increment - part)) + *low;
+  *x = sum + rest;
+  *low = rest - (*x - sum);
 }
