@@ -157,6 +157,14 @@ static int settle(const event_step *step, event_sample *at, contact_terms *of, c
   return discord > CONTACT_ROUNDING ? OK : push(step, at, of, impulse);
 }
 
+/* Whether a contact meets: its gap closes, or is 0 within rounding and it was open. */
+static int is_met(const contact_terms *of, const contact_change *now, const int *closed, int k)
+{
+  const int normal = CONTACTS[k].normal;
+  return normal >= 0 && !of->absent[k] && !now->leaves[k] &&
+      (now->closes[k] || (!closed[k] && fabs(of->value[normal]) <= CONTACT_ROUNDING * of->size[normal]));
+}
+
 /* Impulses of all contacts that meet at a state, by the first law that creates no kinetic energy, and which contacts
  * touch and rest afterwards. */
 static int collide(const event_step *step, event_sample *at, contact_terms *of, const int *closed, contact_change *now)
@@ -166,8 +174,7 @@ static int collide(const event_step *step, event_sample *at, contact_terms *of, 
   int approaches[EVENT_CONTACTS], law = CONTACT_NEWTON, status;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal;
-    approaches[k] = normal >= 0 && !of->absent[k] && !now->leaves[k] &&
-        (now->closes[k] || (!closed[k] && fabs(of->value[normal]) <= CONTACT_ROUNDING * of->size[normal]));
+    approaches[k] = is_met(of, now, closed, k);
     residual = fmax(residual, approaches[k] ? fabs(of->value[normal]) : 0.0);
   }
   status = find_impulses(step, of, approaches, closed, law, impulse);

@@ -69,7 +69,8 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
     now->touches[k] |= closed[k];
     now->rests[k] = mode.sticks || (mode.closed && mode.held) || (now->stops[k] && stops_at(step, &of, k));
     now->rests[k] &= !now->begins[k];
-    approach |= now->closes[k] && !now->leaves[k] && of.rate[CONTACTS[k].normal] < 0.0;
+    approach |= status == OK && is_met(&of, now, closed, k) && /* also one that just does not close yet */
+        of.rate[CONTACTS[k].normal] < (now->closes[k] ? 0.0 : -CONTACT_ROUNDING * of.speed[CONTACTS[k].normal]);
   }
   if (status == OK)
     forces_at(at->t, at->q, at->p, step->own, present, force, step->workspace);
