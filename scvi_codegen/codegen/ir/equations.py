@@ -468,8 +468,10 @@ class ErrorGrowth:
         energy: gradient of the energy at (q, v), on lanes; ``None`` of separable systems, and if it is not conserved.
         conserves_energy: false if forces act or the system depends on time.
         of_velocities: true if accelerations depend on velocities.
-        ends: (points, 8) from accelerations at the points to Taylor's coefficients at the end of a step.
-        tables: of the extrapolation to the end and, ``of_velocities``, from accelerations to tangent vectors.
+        knots: number of times in a step at which the tangent vector is evaluated.
+        end: extrapolation from the points to the end of a step.
+        tables: with eight columns, from values at the points to those at the knots, from accelerations there to tangent
+            vectors, and to Taylor's coefficients at the end of a step.
     """
 
     partials: Kernel
@@ -477,7 +479,8 @@ class ErrorGrowth:
     energy: Kernel | None
     conserves_energy: bool
     of_velocities: bool
-    ends: NumberTable
+    knots: int
+    end: tuple[Number, ...]
     tables: tuple[IterationTable, ...]
 
     @property

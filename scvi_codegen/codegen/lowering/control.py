@@ -8,8 +8,8 @@ section 2.2), in sums that round the same on all platforms.
 Growth of errors along adaptive runs: a tangent vector by Picard iterations.
 
 The variational equation dq'' = F_q dq / m of a separable system, or L_vv dq'' = -E_q dq - E_v dq' with the residual
-E(q, v, a) of the Euler-Lagrange equations, is integrated over each accepted step by collocation at its points (Hairer,
-Norsett & Wanner, Solving ODEs I, sec. II.7 and II.14).
+E(q, v, a) of the Euler-Lagrange equations, is integrated over each accepted step by collocation at Gauss points
+(Hairer, Norsett & Wanner, Solving ODEs I, sec. II.7 and II.14).
 """
 
 import math
@@ -31,18 +31,13 @@ from scvi_codegen.codegen.ir.equations import (
 from scvi_codegen.codegen.ir.kernel import Expression, Kernel, Load, Number, NumberTable, Operation
 from scvi_codegen.codegen.ir.program import Program
 from scvi_codegen.codegen.lowering.derivatives import NOTHING, force_derivatives, vector_product
-from scvi_codegen.codegen.lowering.solvers.tables import (
-    DEGREE_OF_ONE,
-    DEGREE_OF_TWO,
-    INTERPOLATED,
-    pad_matrix,
-    pad_vector,
-)
+from scvi_codegen.codegen.lowering.solvers.tables import DEGREE_OF_ONE, DEGREE_OF_TWO, INTERPOLATED, pad_vector
 from scvi_codegen.codegen.lowering.stage_groups import system_kernel
 from scvi_codegen.common.precision import Matrix, Vector, mp
 from scvi_codegen.methods.controllers import Controller
 from scvi_codegen.methods.controllers.controller import PREDICTIVE
 from scvi_codegen.methods.tables.basis import (
+    cardinal_derivatives,
     cardinal_integrals,
     cardinal_values,
     differentiation_matrix,
@@ -199,47 +194,54 @@ def error_growth_of(system: MechanicalSystem, program: Program) -> ErrorGrowth |
     if kernels is None or kernels[0].values > MOST_DERIVATIVES:
         return None
     partials, product, energy = kernels
-    of_velocities = make is _coupled_growth
+    of_velocities, most = make is _coupled_growth, FEW_KNOTS if len(points) <= FEW_POINTS else COLUMNS
+    knots = gauss_legendre(min(len(points), most)).abscissae
     return ErrorGrowth(
         partials=_with_common_roots(partials),
         product=product,
         energy=energy,
         conserves_energy=not system.changes_energy,
         of_velocities=of_velocities,
-        ends=_taylor_table(points, fixed_point.lanes),
-        tables=_growth_tables(points, fixed_point.lanes, of_velocities=of_velocities),
+        knots=len(knots),
+        end=pad_vector(cardinal_values(points, (mp.one,))[0], fixed_point.lanes),
+        tables=_growth_tables(points, knots, of_velocities=of_velocities),
     )
 
 
-TAYLOR_NUMBERS = 8
-"""Columns of the table from accelerations to Taylor's coefficients: whole vectors of any length."""
+COLUMNS, FEW_KNOTS, FEW_POINTS = 8, 4, 8
+"""Columns of the tables of tangent vectors, one for each knot; numbers of knots and of points in short steps.
+
+Knots are Gauss points: other ones, as every second point of the step, and kicks at the points by Stoermer's method cost
+less, but regular orbits of thousands of steps then show exponential growth.
+"""
 
 
-def _taylor_table(points: Vector, lanes: int) -> NumberTable:
-    """Return the table from h^2 dq'' at the points to h^k dq^(k) / k! at the end; further columns are zero."""
-    end, rates = (mp.one,), differentiation_matrix(points)
-    at_end = cardinal_values(points, end)[0]
+def _growth_tables(points: Vector, knots: Vector, *, of_velocities: bool) -> tuple[IterationTable, ...]:
+    """Return the tables from points to knots, from knots to knots, and to Taylor's coefficients at the end."""
+    end, rates = (mp.one,), differentiation_matrix(knots)
+    at_end = cardinal_values(knots, end)[0]
     slope = tuple(mp.fdot(at_end, column) for column in transpose(rates))
     bend = tuple(mp.fdot(slope, column) for column in transpose(rates))
-    rows = (
-        _twice_integrated(points, end)[0],
-        cardinal_integrals(points, end, mp.zero)[0],
+    taylor = (
+        _twice_integrated(knots, end)[0],
+        cardinal_integrals(knots, end, mp.zero)[0],
         *(tuple(x / k for x in row) for k, row in ((2, at_end), (6, slope), (24, bend))),
     )
-    columns = [pad_vector(column, TAYLOR_NUMBERS) for column in transpose(rows)]
-    return (*columns, *(pad_vector((), TAYLOR_NUMBERS),) * (lanes - len(columns)))
-
-
-def _growth_tables(points: Vector, lanes: int, *, of_velocities: bool) -> tuple[IterationTable, ...]:
-    """Return the extrapolation to the end, and the tables from accelerations to tangent vectors at the points."""
-    at_points = {
-        "TANGENT_INTEGRALS": cardinal_integrals(points, points, mp.zero),
-        "TANGENT_INTEGRALS_TWICE": _twice_integrated(points, points),
-        "VELOCITY_RATE": differentiation_matrix(points),
-    }
-    return (
-        IterationTable("AT_END", pad_vector(cardinal_values(points, (mp.one,))[0], lanes)),
-        *(IterationTable(name, pad_matrix(table, lanes)) for name, table in at_points.items() if of_velocities),
+    tables: list[tuple[str, Matrix, bool]] = [
+        ("KNOT_ABSCISSA", tuple((c,) for c in knots), True),
+        ("KNOT_VALUES", cardinal_values(points, knots), True),
+        ("TANGENT_INTEGRALS_TWICE", _twice_integrated(knots, knots), True),
+        ("TANGENT_END", taylor, False),
+    ]
+    if of_velocities:
+        tables += [
+            ("TANGENT_INTEGRALS", cardinal_integrals(knots, knots, mp.zero), True),
+            ("KNOT_INTEGRALS", cardinal_integrals(points, knots, mp.zero), True),
+            ("KNOT_RATES", cardinal_derivatives(points, knots), True),
+        ]
+    return tuple(
+        IterationTable(name, tuple(pad_vector(column, COLUMNS, repeat=repeat) for column in transpose(rows)))
+        for name, rows, repeat in tables
     )
 
 

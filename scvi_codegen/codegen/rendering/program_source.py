@@ -534,9 +534,8 @@ def _control_context(program: Program, control: Control | None) -> dict[str, obj
     name = f"support/{program.prefix}_predictor.h"
     if not (control and control.predictor and program.fixed_point):
         return {"control": control, "own_headers": {}}
-    text, tables = predictor_text(control.predictor), control.growth.tables if control.growth else ()
-    growth_tables = [lane_table(table.name, table.numbers) for table in tables]
-    return {"control": control, "own_headers": {name: text}, "growth_tables": growth_tables}
+    end = lane_table("AT_END", control.growth.end) if control.growth else ""
+    return {"control": control, "own_headers": {name: predictor_text(control.predictor)}, "growth_end": end}
 
 
 def render_ensemble(

@@ -4,8 +4,8 @@
  * distance from the start and the largest velocity, which depend neither on the origin nor on a gauge. It solves the
  * variational equations along each accepted step,
  *   dq'' = F_q dq / m,      or      L_vv dq'' = -E_q dq - E_v dv   (VARIABLE_ACCELERATIONS),
- * with E(q, v, a) the Euler-Lagrange residual at the points c_n h of the step, whose derivatives are evaluated in SIMD
- * lanes. Their collocation equations
+ * with E(q, v, a) the Euler-Lagrange residual at knots c_n h, which are Gauss points, about half as many as those of the
+ * step; derivatives there are evaluated in SIMD lanes. The collocation equations
  *   dq_n = dq + c_n h dv + h^2 sum_j P_nj dq''_j,      dv_n = dv + h sum_j Q_nj dq''_j
  * are solved by Picard iterations (Hairer, Norsett & Wanner, Solving ODEs I, sec. I.8) from Taylor's polynomial at the
  * end of the step before. In one of `measures_growth` steps the vector is projected on the energy surface (in the
@@ -34,47 +34,70 @@
  * larger limits regular orbits of large steps show exponential growth. */
 #ifdef VARIABLE_ACCELERATIONS
 enum { TANGENT = 2 * M }; /* numbers of a tangent vector on which accelerations depend */
-#define IS_SMALL(change, k, size, rate) ((void)(rate), (change) <= (0.0015 * LESS) * (size))
+#define IS_SMALL(change, k, size, rate) ((void)(rate), (change) <= (0.0003 * LESS) * (size))
 #else
 enum { TANGENT = M };
 #define IS_SMALL(change, k, size, rate) \
   ((change) * ((rate) + (change)) <= (0.004 * LESS) * ((double)((k) * (k) * (k) * (k)) * ((size) * (size))))
 #endif
 
-/* Taylor's coefficients h^k dq^(k) / k!, which TANGENT_END has in eight columns. */
+/* Taylor's coefficients h^k dq^(k) / k!, k < 5, or the knots are columns of the tables: whole vectors of any length. */
 enum { TAYLOR = 5,
-  END_GROUPS = 8 / LANES };
+  COLUMNS = 8,
+  KNOT_GROUPS = (KNOTS + LANES - 1) / LANES,
+  KNOTS_STORED = KNOT_GROUPS * LANES };
 
-/* Tangent vectors at the points of a group, and the derivatives by which they are multiplied. */
-typedef lanes tangent_at_points[TANGENT + GROWTH_DERIVATIVES];
+/* Tangent vectors at the knots of a group, and the derivatives by which they are multiplied. */
+typedef lanes tangent_at_knots[TANGENT + GROWTH_DERIVATIVES];
+
+/* Lanes of a group of columns. */
+static inline lanes columns_of(const double *row, int group)
+{
+  lanes x;
+  memcpy(&x, row + group * LANES, sizeof x);
+  return x;
+}
+
+/* x plus the sums over `rows` values in memory, of which LANES are contiguous and then `apart` apart, times a table. */
+static inline lanes add_rows(
+    lanes x, const double (*table)[COLUMNS], int rows, int group, const double *value, int apart)
+{
+  lanes sum[2] = {x, lanes_of(0.0)};
+#pragma GCC unroll 16
+  for (int j = 0; j < rows; j++)
+    sum[j % 2] += value[j / LANES * apart + j % LANES] * columns_of(table[j], group);
+  return sum[0] + sum[1];
+}
 
 #ifdef VARIABLE_ACCELERATIONS
 typedef struct {
-  tangent_at_points u[GROUPS];
-  lanes mass[GROUPS][MASS];
+  tangent_at_knots u[KNOT_GROUPS];
+  lanes mass[KNOT_GROUPS][MASS];
   double square, inverse; /* h^2, 1 / h */
-} tangent_points;
+} tangent_knots;
 
-/* Computes the derivatives of the accelerations at the points of a step from their velocities in the run's memory. */
+/* Computes the derivatives of the accelerations at the knots of a step from the velocities in the run's memory. */
 static inline void linearise_accelerations(const run_memory *run, const step_data *step, const iteration_data *data,
-    coordinates *X, tangent_points *at)
+    coordinates *X, tangent_knots *at)
 {
-  lanes V[GROUPS][M], scaled[GROUPS][M], u[3 * M];
-  (void)X;
-  lanes_load(run->memory, V);
-  scale(data->position_weight, V, scaled);
-  for (int n = 0; n < GROUPS; n++) {
-    place(step, n, scaled, V, u);
-    for (int i = 0; i < M; i++)
-      u[2 * M + i] = at->inverse * apply(VELOCITY_RATE, n, V, i);
+  lanes u[3 * M];
+  (void)X, (void)data;
+  for (int n = 0; n < KNOT_GROUPS; n++) {
+    for (int i = 0; i < M; i++) {
+      const double *V = run->memory + i * POINTS;
+      u[i] = step->q0[i] + step->h * add_rows(lanes_of(0.0), KNOT_INTEGRALS, KEPT, n, V, LANES);
+      u[M + i] = add_rows(lanes_of(0.0), KNOT_VALUES, KEPT, n, V, LANES);
+      u[2 * M + i] = at->inverse * add_rows(lanes_of(0.0), KNOT_RATES, KEPT, n, V, LANES);
+    }
     memset(at->mass[n], 0, sizeof at->mass[n]);
-    point_derivatives(u, step->t + step->h * ABSCISSA[n], step->parameters, at->u[n] + TANGENT, at->mass[n]);
+    point_derivatives(u, step->t + step->h * columns_of(KNOT_ABSCISSA[0], n), step->parameters, at->u[n] + TANGENT,
+        at->mass[n]);
     factor_mass(at->mass[n]);
   }
 }
 
-/* Accelerations times h^2 of the tangent vectors at the points of a group. */
-static inline void tangent_accelerations(const step_data *step, const tangent_points *at, int n, lanes *a)
+/* Accelerations times h^2 of the tangent vectors at the knots of a group. */
+static inline void tangent_accelerations(const step_data *step, const tangent_knots *at, int n, lanes *a)
 {
   derivative_product(at->u[n], lanes_of(step->t), step->parameters, a);
   solve_mass(at->mass[n], a);
@@ -83,21 +106,27 @@ static inline void tangent_accelerations(const step_data *step, const tangent_po
 }
 #else
 typedef struct {
-  tangent_at_points u[GROUPS];
+  tangent_at_knots u[KNOT_GROUPS];
   double unit[M]; /* h^2 / m */
-} tangent_points;
+} tangent_knots;
 
 static inline void linearise_accelerations(const run_memory *run, const step_data *step, const iteration_data *data,
-    coordinates *X, tangent_points *at)
+    coordinates *X, tangent_knots *at)
 {
+  lanes u[M];
+  const double *x = (const double *)X;
   (void)run;
-  for (int n = 0; n < GROUPS; n++)
-    point_derivatives(X[n], step->t + step->h * ABSCISSA[n], step->parameters, at->u[n] + TANGENT);
+  for (int n = 0; n < KNOT_GROUPS; n++) {
+    for (int i = 0; i < M; i++)
+      u[i] = add_rows(lanes_of(0.0), KNOT_VALUES, KEPT, n, x + i * LANES, M * LANES);
+    point_derivatives(
+        u, step->t + step->h * columns_of(KNOT_ABSCISSA[0], n), step->parameters, at->u[n] + TANGENT);
+  }
   for (int i = 0; i < M; i++)
     at->unit[i] = data->square * data->inverse_mass[i];
 }
 
-static inline void tangent_accelerations(const step_data *step, const tangent_points *at, int n, lanes *a)
+static inline void tangent_accelerations(const step_data *step, const tangent_knots *at, int n, lanes *a)
 {
   derivative_product(at->u[n], lanes_of(step->t), step->parameters, a);
   for (int i = 0; i < M; i++)
@@ -105,11 +134,11 @@ static inline void tangent_accelerations(const step_data *step, const tangent_po
 }
 #endif
 
-/* Tangent vectors at the points by Taylor's polynomial with coefficients s, and its accelerations. */
-static inline void begin_tangents(double (*s)[8], coordinates *a, tangent_points *at)
+/* Tangent vectors at the knots by Taylor's polynomial with coefficients s, and its accelerations. */
+static inline void begin_tangents(double (*s)[8], lanes (*a)[M], tangent_knots *at)
 {
-  for (int n = 0; n < GROUPS; n++) {
-    const lanes c = ABSCISSA[n];
+  for (int n = 0; n < KNOT_GROUPS; n++) {
+    const lanes c = columns_of(KNOT_ABSCISSA[0], n);
     for (int i = 0; i < M; i++) {
       at->u[n][i] = s[i][0] + c * (s[i][1] + c * (s[i][2] + c * (s[i][3] + c * s[i][4])));
 #ifdef VARIABLE_ACCELERATIONS
@@ -120,35 +149,27 @@ static inline void begin_tangents(double (*s)[8], coordinates *a, tangent_points
   }
 }
 
-/* Tangent vectors at the points from accelerations. */
-static inline void place_tangents(double (*s)[8], const double *a, tangent_points *at)
+/* Tangent vectors at the knots from accelerations. */
+static inline void place_tangents(double (*s)[8], double (*a)[KNOTS_STORED], tangent_knots *at)
 {
-  for (int n = 0; n < GROUPS; n++)
+  for (int n = 0; n < KNOT_GROUPS; n++)
     for (int i = 0; i < M; i++) {
+      at->u[n][i] = add_rows(s[i][0] + columns_of(KNOT_ABSCISSA[0], n) * s[i][1], TANGENT_INTEGRALS_TWICE, KNOTS, n, a[i], LANES);
 #ifdef VARIABLE_ACCELERATIONS
-      at->u[n][i] = (s[i][0] + ABSCISSA[n] * s[i][1]) + sum_over_points(TANGENT_INTEGRALS_TWICE, n, a + i * POINTS);
-      at->u[n][M + i] = at->inverse * (s[i][1] + sum_over_points(TANGENT_INTEGRALS, n, a + i * POINTS));
-#else
-      at->u[n][i] = (s[i][0] + DRIFT[n] * s[i][1]) + sum_over_points(PRODUCT, n, a + i * POINTS);
+      at->u[n][M + i] = at->inverse * add_rows(lanes_of(s[i][1]), TANGENT_INTEGRALS, KNOTS, n, a[i], LANES);
 #endif
     }
 }
 
 /* Coefficients at the end of the step from accelerations. */
-static inline void end_tangents(double (*s)[8], const double *a)
+static inline void end_tangents(double (*s)[8], double (*a)[KNOTS_STORED])
 {
   for (int i = 0; i < M; i++) {
     const double q = s[i][0] + s[i][1], v = s[i][1];
-    lanes end[END_GROUPS], column[END_GROUPS];
-    for (int n = 0; n < END_GROUPS; n++)
-      end[n] = lanes_of(0.0);
-#pragma GCC unroll 16
-    for (int j = 0; j < POINTS; j++) {
-      memcpy(column, TANGENT_END[j], sizeof column);
-      for (int n = 0; n < END_GROUPS; n++)
-        end[n] += column[n] * a[i * POINTS + j];
+    for (int n = 0; n < COLUMNS / LANES; n++) {
+      const lanes end = add_rows(lanes_of(0.0), TANGENT_END, KNOTS, n, a[i], LANES);
+      memcpy(s[i] + n * LANES, &end, sizeof end);
     }
-    memcpy(s[i], end, sizeof end);
     s[i][0] += q;
     s[i][1] += v;
   }
@@ -169,10 +190,10 @@ static SELDOM void rescale_tangent(run_memory *run, double h)
 /* Advances the tangent vector by a step; ends the measurement if the iterations diverge. */
 static inline void advance_tangent(run_memory *run, const step_data *step, const iteration_data *data, coordinates *X)
 {
-  double size = 0.0, rate = 0.0, change, stored[M * POINTS];
+  double size = 0.0, rate = 0.0, change, stored[M][KNOTS_STORED];
   int k = 0, is_resolved = 0;
-  tangent_points at;
-  coordinates a[GROUPS], before[GROUPS];
+  tangent_knots at;
+  lanes a[KNOT_GROUPS][M], before[KNOT_GROUPS][M];
   if (step->h != run->tangent_h)
     rescale_tangent(run, step->h);
 #ifdef VARIABLE_ACCELERATIONS
@@ -191,14 +212,15 @@ static inline void advance_tangent(run_memory *run, const step_data *step, const
     if (k > 1)
       place_tangents(run->tangent, stored, &at);
     memcpy(before, a, sizeof before);
-    for (int n = 0; n < GROUPS; n++) {
+    for (int n = 0; n < KNOT_GROUPS; n++) {
       tangent_accelerations(step, &at, n, a[n]);
-      for (int i = 0; i < M; i++)
+      for (int i = 0; i < M; i++) {
         sum += (a[n][i] - before[n][i]) * (a[n][i] - before[n][i]);
+        memcpy(stored[i] + n * LANES, &a[n][i], sizeof(lanes));
+      }
     }
-    lanes_store(a, stored);
     IN_MEMORY(stored);
-    change = lanes_total(sum) * (1.0 / POINTS);
+    change = lanes_total(sum) * (1.0 / KNOTS_STORED);
     is_resolved = IS_SMALL(change, k, size, rate);
   }
   if (!is_resolved)
