@@ -300,8 +300,9 @@ def single_precision(case: Case) -> None:
     single, double = run("single"), run("double")
     assert single.ok.all()
     assert case.problem.falls_back or not np.array_equal(single.q, double.q)
-    near(single.q, double.q, 10 * np.finfo(np.float32).eps)
-    near(single.p, double.p, 10 * np.finfo(np.float32).eps)
+    units = 40 if case.problem.falls_back else 10  # its phase is 100 radians, of which parameters lose 24 bits, too
+    near(single.q, double.q, units * np.finfo(np.float32).eps)
+    near(single.p, double.p, units * np.finfo(np.float32).eps)
 
 
 def _constant_inputs(case: Case, others: list[dict[str, float]]) -> None:

@@ -92,7 +92,7 @@ class FileScope:
             if match["parameters"] and (names := re.findall(r"\bstatic\b[\w ]*?(\w+(?:##\w+)*)\(", match["body"]))
         }
         for match in macros:  # those that end in another one
-            call = re.search(r"(\w+)\(([^()]*)\)$", match["body"])
+            call = re.search(r"(\w+)\(((?:[^()]|\([^()]*\))*)\)$", match["body"])
             if call and (inner := self._makers.get(call[1])) and match["parameters"]:
                 arguments = dict(zip(inner[0], map(str.strip, call[2].split(",")), strict=False))
                 made = ["##".join(arguments.get(part, part) for part in name.split("##")) for name in inner[1]]

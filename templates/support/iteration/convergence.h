@@ -24,7 +24,7 @@
 #define ROUNDING_LEVEL LEVEL(1e-25) /* changes below 3e-13 of the state may be rounding errors */
 #define CERTAIN_ROUNDING LEVEL(1e-28) /* changes below 1e-14 that do not decrease are rounding errors */
 #define STAGNATION 0.25 /* changes above that only if they decreased by less than half in two iterations */
-#define PROGRESS_LEVEL LEVEL(1e-20) /* above 1e-10, iterations that gain less than a factor of 1.4 (two: 2) are abandoned */
+#define PROGRESS_LEVEL LEVEL(1e-20) /* above 1e-10, iterations that gain less than 1.4 (two: 2) are abandoned */
 #define STAGNANT 0.8 /* changes that decrease by less, and by less than half in two iterations, stagnate */
 #define FIRST_ITERATIONS 4 /* but not among the first ones, which need not contract */
 #define LEAST_SQUARED 1e-100 /* squares of smaller numbers, or of small parts of them, may be subnormal */
@@ -146,9 +146,9 @@ static inline void invert_sizes(const solver_options *options, real absolute, nu
 {
   const number largest = largest_number(size);
   add_largest_of_arrays(size);
+  const number least = REAL_EPSILON * largest + REAL_MIN;
   for (int i = 0; i < M; i++)
-    size[i] =
-        (options->absolute ? number_of(absolute) : 1.0 / (size[i] + (REAL_EPSILON * largest + REAL_MIN))) + 0.0 * largest;
+    size[i] = (options->absolute ? number_of(absolute) : 1.0 / (size[i] + least)) + 0.0 * largest;
 }
 
 /* Returns, of inverse sizes, the least where `stagnant` is 1, and those of each coordinate where it is 0. */
