@@ -1,4 +1,5 @@
-/* Kepler problem: Galerkin spectral variational integrator, degree 4, gauss-legendre:4; see kepler_svi_4.h. */
+/* Kepler problem: Galerkin spectral variational integrator, degree 4, gauss-legendre:4; see kepler_svi_4.h. A step:
+ * solve; a run: kepler_svi_4_advance. */
 #include "kepler_svi_4.h"
 
 #include <float.h>

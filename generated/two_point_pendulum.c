@@ -1,5 +1,5 @@
 /* planar pendulum: Spectral-collocation variational integrator, degree 1, chebyshev-lobatto nodes, gauss-legendre:2;
- * see two_point_pendulum.h. */
+ * see two_point_pendulum.h. A step: solve; a run: two_point_pendulum_advance. */
 #include "two_point_pendulum.h"
 
 #include <float.h>

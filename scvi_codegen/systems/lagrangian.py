@@ -13,6 +13,7 @@ from scvi_codegen.common.collection import without_collection
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import FORMULAS, MAPPED, NAMES, NUMBERS, TEXTS, ArgumentType, checks_arguments
+from scvi_codegen.systems.contact import Impacts
 from scvi_codegen.systems.formulas.table import tables_of
 from scvi_codegen.systems.system import MechanicalSystem, tables_of_contacts, zero
 
@@ -34,7 +35,8 @@ JOINTS = ArgumentType(
 PART = ArgumentType("'contact' or 'ignore'", lambda value: value in ("contact", "ignore"))
 RESTITUTION = ArgumentType("a number from 0 to 1", lambda value: isinstance(value, Real) and 0 <= float(value) <= 1)
 PLANES = ArgumentType("'planes' or 'ignore'", lambda value: value in ("planes", "ignore"))
-ROBOT = {"actuated": JOINTS, "limits": PART, "friction": PART, "restitution": RESTITUTION}
+LAWS = ArgumentType("'sequential' or 'simultaneous'", lambda value: value in [*Impacts])
+ROBOT = {"actuated": JOINTS, "limits": PART, "friction": PART, "restitution": RESTITUTION, "impacts": LAWS}
 BODIES = ArgumentType("a System of sympy.physics.mechanics", lambda value: hasattr(value, "actuators"))
 
 
@@ -361,6 +363,7 @@ class LagrangianSystem(MechanicalSystem):
         limits: Literal["contact", "ignore"] = "ignore",
         friction: Literal["contact", "ignore"] = "ignore",
         restitution: float = 0.0,
+        impacts: str = Impacts.SEQUENTIAL,
         check_inertias: bool = True,
         name: str | None = None,
     ) -> LagrangianSystem:
@@ -382,6 +385,8 @@ class LagrangianSystem(MechanicalSystem):
                 ``contacts`` of the system, with the restrictions of these (:func:`~scvi_codegen.contact`);
                 ``"ignore"``: the warning lists them.
             restitution: coefficient of impacts at limits, 0 to 1.
+            impacts: law of those at the same time, ``"sequential"`` or ``"simultaneous"``, see
+                :func:`~scvi_codegen.contact`.
             check_inertias: whether moments of inertia that no body has are an error; otherwise they are integrated as
                 they are written, with a warning.
             name: name of the system; by default that of the robot.
@@ -392,7 +397,7 @@ class LagrangianSystem(MechanicalSystem):
         from scvi_codegen.systems.multibody.trees.urdf import links_of_urdf
 
         robot, links = links_of_urdf(path, floating=floating, parts=_read_parts(limits=limits, friction=friction))
-        return cls._of_tree(path, name or robot, links, gravity, actuated, check_inertias, restitution)
+        return cls._of_tree(path, name or robot, links, gravity, actuated, check_inertias, (restitution, impacts))
 
     @classmethod
     @checks_arguments(SystemDefinitionError, contacts=PLANES, **ROBOT)
@@ -406,6 +411,7 @@ class LagrangianSystem(MechanicalSystem):
         friction: Literal["contact", "ignore"] = "ignore",
         contacts: Literal["planes", "ignore"] = "ignore",
         restitution: float = 0.0,
+        impacts: str = Impacts.SEQUENTIAL,
         actuators: bool = False,
         check_inertias: bool = True,
         folders: Iterable[str | PathLike[str]] = (),
@@ -420,7 +426,7 @@ class LagrangianSystem(MechanicalSystem):
         what is not part of the motion: limits, dry friction, contacts, actuators.
 
         Args:
-            path, actuated, limits, friction, check_inertias: see :meth:`from_urdf`; limits are rigid.
+            path, actuated, limits, friction, impacts, check_inertias: see :meth:`from_urdf`; limits are rigid.
             contacts: ``"planes"`` for contacts of spheres, capsules and boxes with planes, rigid and with sliding
                 friction; the warning has the number of other pairs of geoms that may touch. ``"ignore"``: none.
             restitution: coefficient of impacts of limits and geoms, 0 to 1.
@@ -438,21 +444,31 @@ class LagrangianSystem(MechanicalSystem):
         parts = _read_parts(limits=limits, friction=friction, contacts=contacts)
         with naming_folders(folders):
             model, links, gravity, *others = links_of_mjcf(path, [*parts, *["actuators"] * actuators])
-        return cls._of_tree(path, name or model, links, gravity, actuated, check_inertias, restitution, *others)
+        return cls._of_tree(
+            path, name or model, links, gravity, actuated, check_inertias, (restitution, impacts), *others
+        )
 
     @classmethod
     def _of_tree(
-        cls, path: Any, name: str, links: Any, gravity: Any, actuated: Any, checked: bool, e: float, *others: Any
+        cls, path: Any, name: str, links: Any, gravity: Any, actuated: Any, checked: bool, law: Any, *others: Any
     ) -> LagrangianSystem:
         from scvi_codegen.systems.multibody.trees.closures import conditions_of
         from scvi_codegen.systems.multibody.trees.contacts import contacts_of
-        from scvi_codegen.systems.multibody.trees.energies import system_of_tree
+        from scvi_codegen.systems.multibody.trees.energies import exact_number, system_of_tree
         from scvi_codegen.systems.multibody.trees.tendons import energies_of
 
         try:
             closures, tendons, touches, actuators, keys = others or ((), (), (), (), {})
-            touching = contacts_of(links, touches, e)
-            added = conditions_of(links, closures), checked, energies_of(links, tendons), touching, e, actuators
+            of_impacts = {"restitution": exact_number(law[0]), "impacts": law[1]}
+            touching = contacts_of(links, touches, of_impacts)
+            added = (
+                conditions_of(links, closures),
+                checked,
+                energies_of(links, tendons),
+                touching,
+                of_impacts,
+                actuators,
+            )
             system: LagrangianSystem = system_of_tree(cls, name, links, gravity, actuated, *added, keys=keys)
         except SystemDefinitionError as error:
             raise SystemDefinitionError(f"{path}: {error}") from error

@@ -287,6 +287,9 @@ def test_a_family_has_its_orbits_bifurcations_and_range_and_belongs_to_its_syste
     other = lagrange("pendulum", "x", "x_dot**2/2 + cos(x)")
     with pytest.raises(sc.StateError, match="is one of 'driven oscillator', not of 'pendulum'"):
         sc.page(other, family=family)
+    rows = sc.LagrangianSystem.from_text("rows", ["q[n]"], "sum(i in n, q_dot[i]**2 - q[i]**2)/2")
+    with pytest.raises(sc.StateError, match="'rows' has arrays of run-time sizes: give unroll_sums"):
+        sc.page(rows, family=family)
 
 
 @pytest.mark.usefixtures("without_compiler")

@@ -82,6 +82,18 @@ def test_pairs_of_geoms_are_selected_as_by_mujoco(ball, rest, friction, tmp_path
     assert all(c.name == "geom 'ball' on geom 'floor'" for c in contacts)
 
 
+@pytest.mark.parametrize(
+    ("shape", "parts"), [("capsule", ["end 1", "end 2"]), ("box", [f"corner {k}" for k in range(1, 9)])]
+)
+def test_ends_and_corners_have_their_own_names(shape, parts, tmp_path):
+    ball = BALL.replace('size=".1"', f'type="{shape}" size=".1 .2 .3"')
+    contacts = robot(tmp_path, FLOOR + ball.format(""), **ALL, impacts="simultaneous").contacts
+    assert [c.name for c in contacts] == [f"{part} of geom 'ball' on geom 'floor'" for part in parts]
+    assert {c.impacts for c in contacts} == {"simultaneous"}
+    with pytest.raises(SystemDefinitionError, match="impacts must be 'sequential' or 'simultaneous', not 'both'"):
+        robot(tmp_path, FLOOR, impacts="both")
+
+
 def test_what_is_not_read_of_geoms_is_named_in_one_warning(tmp_path):
     more = BALL.format('condim="6" adhesion="1"')
     more += '<body pos="1 0 0"><freejoint/><geom type="cylinder" size=".1 .1"/></body>'

@@ -49,6 +49,7 @@ from scvi_codegen.interfaces.pictures.recognition import shape_of
 from scvi_codegen.interfaces.pictures.shape import DrawnSystem, shape_of_picture
 from scvi_codegen.runs.stepping.array_interface import read_arrays
 from scvi_codegen.runs.stepping.noise import Noise
+from scvi_codegen.systems.arrays.system import ArraySystem
 from scvi_codegen.systems.formulas.grammar import parse_expression
 from scvi_codegen.systems.formulas.rotations import Rotation, RotationNames, Spin
 from scvi_codegen.systems.formulas.symbols import input_parameters, symbol
@@ -145,6 +146,8 @@ def page(
     arguments = {"ranges": ranges, "speed": speed, "plots": plots, "picture": picture, "family": family}
     settings = {name: value for name, value in arguments.items() if value is not None}
     if SYSTEM_OR_ARRAYS.accepts(model):
+        if family is not None:
+            _check_names(model)
         model = _model_of(model, motion if family is None else {"q": family[0].q, "p": family[0].p, **motion})
     elif motion:
         raise ArgumentError(f"page() takes {', '.join(motion)} for a system alone: change them in the model")
@@ -194,9 +197,19 @@ def page_of(model: Model, document: Mapping[str, Any], settings: Mapping[str, An
     return result
 
 
+def _check_names(system: Any) -> None:
+    """Raise :class:`StateError` for a system with arrays of run-time sizes, whose families are not shown."""
+    if isinstance(system, ArraySystem):
+        raise StateError(
+            f"a page with family= requires named coordinates, and '{system.name}' has arrays of run-time sizes: give "
+            "unroll_sums(system, sizes) and a family of this system, or omit family="
+        )
+
+
 def _begun_at(model: Model, family: Family) -> Model:
     """Return a model that begins at the first orbit of a family, with its speed and the range of its parameter."""
     first, page, name = family[0], dict(model.page), model.system.name
+    _check_names(model.system)
     if first.stepper.interface.system != name:
         raise StateError(f"the family is one of '{first.stepper.interface.system}', not of '{name}'")
     if family.parameter is not None:

@@ -17,7 +17,7 @@ from scvi_codegen.methods import specification_of
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 from scvi_codegen.systems.system import MechanicalSystem
 
-ARGUMENTS = ("name", "actuated", "limits", "friction", "restitution", "check_inertias")
+ARGUMENTS = ("name", "actuated", "limits", "friction", "restitution", "impacts", "check_inertias")
 ROBOT_KEYS = ("robot", "time_transformation", *ARGUMENTS)
 FORMAT_KEYS = {True: ("floating", "gravity"), False: ("contacts", "actuators", "keyframe")}
 """Those of URDF files (true) and of MJCF files."""

@@ -8,10 +8,11 @@ A sphere of radius r at the point x of a link, above the plane through o with th
 Directions in which it cannot slip, as those across the plane of a planar robot, are omitted.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from sympy import Expr, Matrix
+from sympy import Matrix
 
 from scvi_codegen.systems.contact import ContactLike, contact
 from scvi_codegen.systems.formulas.intermediates import intermediate
@@ -41,12 +42,12 @@ class Touch:
     friction: float | None
 
 
-def contacts_of(links: Sequence[Link], touches: Iterable[Touch], restitution: float) -> list[ContactLike]:
-    """Return the contacts of spheres with planes."""
-    return [_contact(links, touch, exact_number(restitution)) for touch in touches]
+def contacts_of(links: Sequence[Link], touches: Iterable[Touch], law: Mapping[str, Any]) -> list[ContactLike]:
+    """Return the contacts of spheres with planes; ``law``: restitution and law of their impacts."""
+    return [_contact(links, touch, law) for touch in touches]
 
 
-def _contact(links: Sequence[Link], touch: Touch, restitution: Expr) -> ContactLike:
+def _contact(links: Sequence[Link], touch: Touch, law: Mapping[str, Any]) -> ContactLike:
     ends = (touch.link, Pose(touch.center)), (-1, touch.plane)
     (position, axes), (origin, directions) = frames_in_common(links, ends)
     radius, normal = exact_number(touch.radius), directions[:, 2]
@@ -57,4 +58,4 @@ def _contact(links: Sequence[Link], touch: Touch, restitution: Expr) -> ContactL
     slips = [rate.xreplace(arm) for rate in rates if rate != 0]
     slip = slips[0] if len(slips) == 1 else slips or None
     mu = exact_number(touch.friction or 0) if slips else None
-    return contact(gap, slip=slip, friction=mu, restitution=restitution, name=touch.name)
+    return contact(gap, slip=slip, friction=mu, name=touch.name, **law)

@@ -34,9 +34,10 @@ G. Rodriguez, A. Jain, K. Kreutz-Delgado, A spatial operator algebra for manipul
 Robotics Research 10 (1991), 371-381; R. Featherstone, Rigid Body Dynamics Algorithms, Springer 2008, chapters 3, 4, 7.
 """
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -253,23 +254,22 @@ class Tree:
                     loads[Symbol(f"_load_{len(loads)}", real=True)] = intermediate(load)
         yield from (part.xreplace(loads) for part in gradient_tuple(Add(*power), rates))
 
-    def contacts(self, restitution: float) -> Iterator[ContactLike]:
+    def contacts(self, law: Mapping[str, Any]) -> Iterator[ContactLike]:
         """Yield the contacts of joints with limits, and the dry friction of joints.
 
         A hinge or slide has the gaps q - low and high - q. A rotation R by an angle a <= high, with cos a = (tr R -
         1)/2, has the gap (cos a - cos high)/sin high, which is smooth at a = 0.
         """
-        e = exact_number(restitution)
         for joint in self.joints.values():
             low, high = joint.limits or (0.0, 0.0)
             of = f"limit of joint '{joint.label}' of the range {low:g} to {high:g}"
             if joint.limits is not None and joint.kind in SINGLE:
                 q = self.coordinate(joint)[0]
-                yield contact(q - exact_number(low), restitution=e, name=f"lower {of}")
-                yield contact(exact_number(high) - q, restitution=e, name=f"upper {of}")
+                yield contact(q - exact_number(low), name=f"lower {of}", **law)
+                yield contact(exact_number(high) - q, name=f"upper {of}", **law)
             elif high and high < np.pi:
                 cosine, edge = Matrix(3, 3, rotation_of(joint).entries).trace() / 2 - S.Half, exact_number(high)
-                yield contact((cosine - cos(edge)) / sin(edge), restitution=e, name=of)
+                yield contact((cosine - cos(edge)) / sin(edge), name=of, **law)
             for rate in self.rates(joint) if joint.dry_friction else ():
                 limit = exact_number(joint.dry_friction)
                 yield friction(rate, limit=limit, name=f"dry friction of joint '{joint.label}'")
@@ -358,7 +358,7 @@ def system_of_tree(
     check_inertias: bool = True,
     tendons: tuple[Expr, Expr, Expr] = (S.Zero, S.Zero, S.Zero),
     touching: Sequence[ContactLike] = (),
-    restitution: float = 0.0,
+    law: Mapping[str, Any] = MappingProxyType({}),
     actuators: Sequence[Any] = (),
     **own: Any,
 ) -> Any:
@@ -368,7 +368,7 @@ def system_of_tree(
         if check_inertias:
             raise SystemDefinitionError(f"{problem}, or integrate it as it is written by check_inertias=False")
         warn(problem, SystemDefinitionWarning)
-    contacts = *tree.contacts(restitution), *touching
+    contacts = *tree.contacts(law), *touching
 
     def made(**fields: Any) -> Any:
         members = fields.get("rotations", ())

@@ -14,6 +14,9 @@ from scvi_codegen.systems.multibody.trees.contacts import Touch
 from scvi_codegen.systems.multibody.trees.document import Element
 from scvi_codegen.systems.multibody.trees.tree import Link, Pose, Vector
 
+PARTS = {"capsule": "end", "box": "corner"}
+"""Names of the spheres of geoms that have several."""
+
 
 class Geom(NamedTuple):
     """Shape of a body: its element, its link, and its pose in the frame of that."""
@@ -86,7 +89,9 @@ class Pair(NamedTuple):
         """Yield the contacts of spheres with a plane, which is fixed to the world."""
         plane, body = sorted(self.geoms, key=lambda geom: geom.shape != "plane")
         friction = self.friction if self.dimensions > 1 else None
-        for center, radius in body.spheres() if plane.shape == "plane" else ():
+        spheres = body.spheres() if plane.shape == "plane" else []
+        for number, (center, radius) in enumerate(spheres, start=1):
             at = body.pose.position + body.pose.rotation @ center
             world = at_reference(links, plane.link) @ plane.pose
-            yield Touch(f"{body.title} on {plane.title}", body.link, at, radius, world, friction)
+            part = f"{PARTS[body.shape]} {number} of " if len(spheres) > 1 else ""
+            yield Touch(f"{part}{body.title} on {plane.title}", body.link, at, radius, world, friction)
