@@ -55,7 +55,8 @@ def splitting_texts(split: Splitting) -> dict[str, str]:
 def rattle_texts(rattle: Rattle) -> dict[str, str]:
     """Return the statements of a constrained step, by titles."""
     features = [name.lower() for name in rattle.macros]
-    return {title: f"{selected(text, features)}\n" for title, _, _, text in CONSTRAINED[rattle.part]}
+    texts = {title: selected(text, features) for title, _, _, text in CONSTRAINED[rattle.part]}
+    return {title: f"{text}\n" for title, text in texts.items() if text}
 
 
 def bath_texts(noise: bool) -> dict[str, str]:
@@ -142,15 +143,12 @@ def half_step(bath: HeatBath) -> str:
     operations = {name: product.replace("A +", f"bath->{matrix} +") for name, matrix in matrices}
     statements = read(HALF_STEP, ["noise"] * bool(bath.sizes["STRENGTHS"]))
     lines = Printer(own, Layout(word="bath_number"), operations).function_body(statements)
-    return f"""\
-/* Adds half a step to p + carry, by M + STRENGTHS normals; returns the change of the kinetic energy. */
-static inline bath_number exchange_heat(const present_factors *bath, const bath_number *normals, bath_number *p,
-    bath_number *carry)
-{{
-  bath_number heat = {{0}};
-{_indented(lines)}  return heat;
-}}
-"""
+    head = "const present_factors *bath, const bath_number *normals, bath_number *p, bath_number *carry"
+    return _function(
+        "Adds half a step to p + carry, by M + STRENGTHS normals; returns the change of the kinetic energy",
+        f"static inline bath_number exchange_heat({head})",
+        *("bath_number heat = {0};", *lines, "return heat;"),
+    )
 
 
 RATTLE = """
@@ -219,6 +217,21 @@ else:
     f[i] = former(force[i])
 f[col(e)] += former(derivative[e]) * lam[row(e)]
 """
+MOVE = """
+if velocity_forces:
+    at[i] = former(u[i])
+    if momentum_terms:
+        velocity[i] = base_v[i] + h * (RATTLE_VELOCITY @ a[i]) - RATTLE_VELOCITY_SHIFT @ w[i]
+    else:
+        velocity[i] = base_v[i] + h * (RATTLE_VELOCITY @ a[i])
+"""
+SHIFTS = """
+if momentum_terms:
+    s[i] = shift[i]
+    m[i] = mass(s)
+    turned[i] = m[i] - w[i]
+    w[i] = m[i]
+"""
 BEGIN = """
 if momentum_terms:
     shifted[i] = forced[i] + (RATTLE_SHIFT @ w[i])
@@ -240,7 +253,8 @@ if momentum_terms:
 else:
     z[i] = v0[i] + push[i]
 """
-"""Forces with reactions; accelerations of the guess, and positions without forces; velocities z of the curve."""
+"""Forces with reactions; their arguments; w of momenta; accelerations of the guess, and positions without forces;
+velocities z of the curve."""
 
 COUPLED_FORCES = """
 f[i] = force[i]
@@ -305,6 +319,8 @@ def _of_constraints() -> dict[str, Quantity]:
     """Return the quantities of a constrained step, which the headers declare."""
     memory = {name: Quantity(f"now->{name}", Place.MEMORY) for name in "auwvyp"}
     memory |= {name: Quantity(name, Place.MEMORY) for name in ("forced", "all", "z")}
+    memory |= {"at": Quantity("now->at", Place.MEMORY), "velocity": Quantity("now->v", Place.MEMORY)}
+    memory |= {"shift": Quantity("now->A", Place.MEMORY), "u": Quantity("now->u", Place.MEMORY, first="step->q0")}
     groups = {name: Quantity(f"now->{name}", Place.GROUPS) for name in ("base", "base_v", "base_p")}
     start = {name: Quantity(f"step->{name}", uniform=True) for name in ("q0", "p0", "carry_q")}
     start |= {name: Quantity(f"now->{name}", uniform=True) for name in ("v0", "last_p")}
@@ -329,6 +345,8 @@ UNKNOWNS = ", number (*z)[GROUP_LANES]"
 CONSTRAINED = {
     "rattle": (
         ("An iteration for the positions u and multipliers lam at the points", *ITERATE, RATTLE),
+        ("Positions and velocities at all points but the last", "move_points", "", MOVE),
+        ("Shifts w of the velocities by momentum terms, and their changes", "find_shifts", "", SHIFTS),
         (
             "Accelerations of the guess, positions without them",
             "begin_points",
@@ -360,15 +378,12 @@ def rattle_functions(part: str, features: Sequence[str]) -> str:
         printer = Printer({name: own[name] for name in own if name != "w"}, PointsAsLanes(), VARYING_MASS)
     functions = []
     for title, name, arguments, text in CONSTRAINED[part]:
+        if not selected(text, features):
+            continue
         lines = replace(printer, locals={}).function_of_points(read(text, features))
         first = "const real scale = 1 / (step->h * step->h);" if "scale" in text else "(void)step;"
-        functions.append(f"""\
-/* {title}. */
-static inline void {name}(const step_data *step, rattle_step *now{arguments})
-{{
-  {first}
-{_indented(lines)}}}
-""")
+        head = f"static inline void {name}(const step_data *step, rattle_step *now{arguments})"
+        functions.append(_function(title, head, first, *lines))
     return "\n".join(functions)
 
 
@@ -394,35 +409,32 @@ def pair_rattle_functions() -> str:
     own = {name: words[name] for name in ("derivative", "scale", "hh", "zero")}
     own |= {name: pairs[name] for name in ("r", "gh", "lam", "moved", "u")}
     corrections = Printer(own, PointsAsLanes(2), OF_POINTS).function_of_points(read(PAIR_CORRECTIONS))
-    memory = "real (*r)[GROUP_LANES], real (*g_high)[GROUP_LANES]"
-    return (
-        f"""\
-/* F + G^T lambda at all points but the last. */
-static inline void all_pair_forces(rattle_pairs *at)
-{{
-{_indented(forces.function_of_points(read(FORCES)))}}}
-
-/* Residuals r of the positions and g of the constraints, and h^2 R a + h c v0. */
-static inline void find_pair_residuals(const solved_step *solved, rattle_pairs *at, {memory})
-{{
-  const dd square = dd_multiply(at->h, at->h);
-"""
-        + _indented(residuals)
-        + f"""\
-  IN_MEMORY(*r);
-  IN_MEMORY(*g_high);
-}}
-
-/* Corrects the multipliers, and replaces r by the correction of the positions. */
-static inline void correct_points(const rattle_step *now, rattle_pairs *at, factors *l, {memory})
-{{
-  const int factorised = 1;
-  const real hh = at->h.high * at->h.high, scale = 1 / hh;
-  (void)factorised;
-"""
-        + _indented([line.replace("(step->h * step->h)", "hh") for line in corrections])
-        + "}\n"
+    corrections = [line.replace("(step->h * step->h)", "hh") for line in corrections]
+    scales = "const real hh = at->h.high * at->h.high, scale = 1 / hh;"
+    head, memory = "static inline void", "real (*r)[GROUP_LANES], real (*g_high)[GROUP_LANES]"
+    functions = (
+        _function(
+            "F + G^T lambda at all points but the last",
+            f"{head} all_pair_forces(rattle_pairs *at)",
+            *forces.function_of_points(read(FORCES)),
+        ),
+        _function(
+            "Residuals r of the positions and g of the constraints, and h^2 R a + h c v0",
+            f"{head} find_pair_residuals(const solved_step *solved, rattle_pairs *at, {memory})",
+            *("const dd square = dd_multiply(at->h, at->h);", *residuals, "IN_MEMORY(*r);", "IN_MEMORY(*g_high);"),
+        ),
+        _function(
+            "Corrects the multipliers, and replaces r by the correction of the positions",
+            f"{head} correct_points(const rattle_step *now, rattle_pairs *at, factors *l, {memory})",
+            *("const int factorised = 1;", scales, "(void)factorised;", *corrections),
+        ),
     )
+    return "\n".join(functions)
+
+
+def _function(purpose: str, head: str, *lines: str) -> str:
+    """Return a function from its lines."""
+    return f"/* {purpose}. */\n{head}\n{{\n{_indented(lines)}}}\n"
 
 
 def _indented(lines: Iterable[str]) -> str:

@@ -49,13 +49,6 @@ typedef struct {
   lanes base[M][GROUPS];
 } rattle_step;
 
-/* factor table w of momentum terms. */
-#ifdef MOMENTUM_TERMS
-#define OF_MOMENTA(factor, table, w, g) ((factor) * times(table, DEGREE, w, g))
-#else
-#define OF_MOMENTA(factor, table, w, g) lanes_of(0)
-#endif
-
 /* Constants of a run. */
 typedef struct {
   number inverse_mass[INVERSE_MASSES];
@@ -107,6 +100,8 @@ static void prepare_rattle(const step_data *step, rattle_data *data)
 #endif
 }
 
+#include "iterate.h"
+
 #ifdef VELOCITY_FORCES
 /* Forces at the point of a lane. */
 LANE_FUNCTION void force_of_lane(const step_data *step, const rattle_step *now, int n, number *force)
@@ -119,17 +114,6 @@ LANE_FUNCTION void force_of_lane(const step_data *step, const rattle_step *now, 
   for (int i = 0; i < M; i++)
     u[M + i] = now->v[i][n];
   constrained_force(u, step->t + RATTLE_ABSCISSA[n] * step->h, step->parameters, force);
-}
-
-/* Positions and velocities at all points but the last, of u and f. */
-static inline void move_points(const step_data *step, rattle_step *now)
-{
-  for (int i = 0; i < M; i++)
-    for (int g = 0; g < GROUPS; g++) {
-      const lanes v = now->base_v[i][g] + step->h * times(RATTLE_VELOCITY, DEGREE, now->a[i], g);
-      store(now->at[i], g, former(now->u[i], step->q0[i], g));
-      store(now->v[i], g, v - OF_MOMENTA(1, RATTLE_VELOCITY_SHIFT, now->w[i], g));
-    }
 }
 #else
 LANE_FUNCTION void force_of_lane(const step_data *step, const rattle_step *now, int n, number *force)
@@ -156,16 +140,7 @@ static inline __attribute__((flatten)) void evaluate_momenta(const step_data *st
     for (int i = 0; i < M; i++)
       now->A[i][n] = A[i] - now->first_A[i];
   }
-  for (int g = 0; g < GROUPS; g++) {
-    lanes A[M], w[M];
-    for (int i = 0; i < M; i++)
-      A[i] = load(now->A[i], g);
-    find_accelerations(now->inverse_mass, A, w);
-    for (int i = 0; i < M; i++) {
-      store(now->change[i], g, w[i] - load(now->w[i], g));
-      store(now->w[i], g, w[i]);
-    }
-  }
+  find_shifts(step, now);
   IN_MEMORY(now->change);
   IN_MEMORY(now->w);
 }
@@ -219,8 +194,6 @@ static inline void term_sizes(const step_data *step, rattle_step *now, int react
     force[i] = FIRST_FORCE(now, i);
   find_term_sizes(step, force, now->first_derivative, reactions ? now->lambda : NULL, now->inverse_mass, size);
 }
-
-#include "iterate.h"
 
 /* Values at the first point, and v0. */
 static inline void begin_first(const step_data *step, rattle_step *now)
