@@ -196,6 +196,36 @@ def test_steps_together_are_those_one_by_one(sums: str, method: Any) -> None:
         assert ends[1:] == ends[:1] * 3
 
 
+def leapfrog(q: Any, v: Any, h: float, steps: int, forces: Callable[[Any], Any]) -> Any:
+    """Return the positions after steps of Stoermer-Verlet with unit masses, by NumPy in extended precision."""
+    q, v = q.astype(np.longdouble), v.astype(np.longdouble)
+    for _ in range(steps):
+        v = v + h / 2 * forces(q)
+        q = q + h * v
+        v = v + h / 2 * forces(q)
+    return q.astype(float)
+
+
+@pytest.mark.parametrize("method", ["stoermer-verlet", "svi:2"])
+def test_periodic_lattice_of_three_axes(method: str) -> None:
+    text = "sum(i in L periodic, j in M periodic, k in N periodic, u_dot[i,j,k]**2/2 - u[i,j,k]**4/4 - ("
+    text += "(u[i+1,j,k] - u[i,j,k])**2 + (u[i,j+1,k] - u[i,j,k])**2 + (u[i,j,k+1] - u[i,j,k])**2)/2)"
+    system = sc.LagrangianSystem.from_text(name="lattice", coordinates=["u[L, M, N]"], lagrangian=text)
+    q, v = np.random.default_rng(1).normal(size=(2, 5, 3, 4))
+
+    def forces(u: Any) -> Any:
+        return sum(np.roll(u, way, axis) - u for axis in range(3) for way in (1, -1)) - u**3
+
+    run = sc.compile_stepper(system, method).start(q, velocity=v, h=0.01)
+    run.advance(20)
+    np.testing.assert_allclose(
+        np.reshape(run.q, q.shape),
+        leapfrog(q, v, 0.01, 20, forces),
+        rtol=0,
+        atol=1e-13 if method == "stoermer-verlet" else 2e-3,
+    )
+
+
 @pytest.mark.rotated
 def test_newton_iteration_with_threads() -> None:
     """The last bits of a large step from q = 0 depend on the order in which inner products are summed."""

@@ -383,7 +383,7 @@ class Nest:
         text = ""
         for place, axis in zip(access.places, access.array.axes, strict=True):
             here = self.index(place)
-            first = text if text.isidentifier() or text.endswith(")") else f"({text})"
+            first = text if re.fullmatch(r"\w+(\([^()]*\))?", text) else f"({text})"
             text = f"{first} * {size_text(axis)} + {here}" if text else here
         return text or "0"
 
