@@ -440,14 +440,16 @@ int NAME(multipliers)(long long count, const real *t, const real *q, const real 
 #ifdef MASKED_CONSTRAINTS
 
 /* Masked constraints at a state, for the choice of their modes and for impacts: values g, rates G v + .., second rates
- * without forces of these constraints, the rounding sizes of g, the matrix W = G M^-1 G^T by rows, G by rows, then the
- * coefficients of the contacts. M^-1 includes the reactions of the other constraints. Parameters with masks of 0, and of 1. */
+ * without forces of these constraints, rounding errors of g, the matrix W = G M^-1 G^T by rows, G by rows, then the
+ * coefficients of the contacts. M^-1 includes the reactions of the other constraints. Parameters with masks of 0, and
+ * of 1. */
 int NAME(contact_terms)(real t, const real *q, const real *p, const real *idle, const real *imposed, real *terms,
     real *workspace)
 {
   enum { FIRST = CONSTRAINTS - MASKED };
   saddle *at = saddle_in(workspace);
-  real *rate = terms + MASKED, *second = rate + MASKED, *size = second + MASKED, *W = size + MASKED, *G = W + MASKED * MASKED;
+  real *rate = terms + MASKED, *second = rate + MASKED, *size = second + MASKED, *W = size + MASKED;
+  real *G = W + MASKED * MASKED;
   real u[2 * M], g[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES], value[M + 2 * CONSTRAINTS], right[CONSTRAINTS] = {0};
   real x[M], y[CONSTRAINTS];
   int status = find_velocity(t, q, p, idle, u + M, workspace);

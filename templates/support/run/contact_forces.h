@@ -134,12 +134,12 @@ static real discord_of(const contact_terms *of, const real *rates, const real *m
   return largest;
 }
 
-/* Solves for the forces of the rows in given modes with after = right + W f = 0 in imposed rows, if these are dependent
- * those next to `near`, or if that is NULL those of least norm, friction relative to its limit; returns by how much they contradict each other, or such
+/* Solves for the forces of the rows in given modes with after = right + W f = 0 in imposed rows, those of least norm,
+ * friction relative to its limit, if these are dependent; returns by how much they contradict each other, or such
  * forces differ in the rates, relative to these. If `imposed` is not NULL, it becomes 1 for rows to impose, which are
  * independent. */
-static real solve_contacts(const contact_terms *of, const contact_mode *mode, const real *right, const real *near,
-    real *force, real *after, int *imposed)
+static real solve_contacts(const contact_terms *of, const contact_mode *mode, const real *right, real *force,
+    real *after, int *imposed)
 {
   contact_unknowns in;
   real matrix[CONTACT_ROWS][CONTACT_ROWS + 1];
@@ -149,11 +149,10 @@ static real solve_contacts(const contact_terms *of, const contact_mode *mode, co
   find_unknowns(of, mode, &in, force);
   const int count = in.count, dependent = reduce_equations(of, &in, right, force, matrix, independent);
   for (int i = 0; i < count; i++) {
-    x[i] = independent[i] ? matrix[i][count] / matrix[i][i] : 0.0;
-    least[i] = x[i] - (near ? near[in.row[i]] : 0.0);
+    least[i] = x[i] = independent[i] ? matrix[i][count] / matrix[i][i] : 0.0;
     weight[i] = 1.0;
   }
-  for (int pass = near != NULL; pass < 2 && dependent; pass++) {
+  for (int pass = 0; pass < 2 && dependent; pass++) {
     reduce_norm(matrix, count, independent, weight, least);
     for (int i = 0; i < count; i++) {
       moved[in.row[i]] = least[i];
@@ -165,8 +164,6 @@ static real solve_contacts(const contact_terms *of, const contact_mode *mode, co
     }
   }
   memset(moved, 0, sizeof moved);
-  for (int i = 0; i < count && near; i++)
-    least[i] += near[in.row[i]];
   for (int i = 0; i < count; i++)
     for (int r = 0; r < CONTACT_ROWS; r++) {
       force[r] += in.column[i][r] * least[i];
@@ -205,7 +202,7 @@ static int forces_at(real t, const real *q, const real *p, const real *parameter
   for (int k = 0; k < EVENT_MODES; k++)
     modes[k] = parameters[MODE_PLACE[k]];
   modes_at(&of, modes, mode);
-  if (status != OK || solve_contacts(&of, mode, of.second, NULL, force, after, NULL) > CONTACT_OUTSIDE)
+  if (status != OK || solve_contacts(&of, mode, of.second, force, after, NULL) > CONTACT_OUTSIDE)
     memset(force, 0, BYTES(CONTACT_ROWS));
   return status;
 }

@@ -10,7 +10,6 @@ enum {
 
 #define CONTACT_APART 1e-5 /* part of their size by which the rates of two motions differ */
 #define CONTACT_ASIDE 1e-9 /* largest angle between friction and slip in space */
-#define CONTACT_UNRELAXED 1e-6 /* part of its limit by which the friction of a relaxation may exceed it */
 #define CONTACT_COMPLIANCE 1e-3 /* of friction at the start of a relaxation */
 
 /* Modes among which those of contacts are chosen, and their conditions on the rates right + W f of the rows: second
@@ -19,9 +18,7 @@ enum {
 typedef struct {
   const contact_terms *of;
   const real *right;
-  const real *scale; /* of the rates of impacts, NULL: 0 */
-  const real *near; /* relaxed impulses if redundant ones are next to these, in their cones but for a part */
-  real relaxed[CONTACT_ROWS];
+  const real *scale; /* of the rates, NULL: 0 */
   int is_strict; /* slips that begin have a rate */
   int is_relaxed; /* contacts at their limit do not stick */
   int is_free[EVENT_CONTACTS], rests[EVENT_CONTACTS], begins[EVENT_CONTACTS], limit[EVENT_CONTACTS];
@@ -64,12 +61,11 @@ static real rounding_at_row(const contact_problem *in, const real *after, int ro
 static int is_consistent(const contact_problem *in, const contact_mode *mode, real *force, real *after)
 {
   const contact_terms *const of = in->of;
-  if (solve_contacts(of, mode, in->right, in->near, force, after, NULL) > CONTACT_ROUNDING)
+  if (solve_contacts(of, mode, in->right, force, after, NULL) > CONTACT_ROUNDING)
     return 0;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
     const real small = rounding_at_row(in, after, normal < 0 ? slip : normal);
-    const real excess = in->near ? CONTACT_UNRELAXED * friction_limit(of, k, in->limit[k], force) : 0.0;
     real begin = 0.0, moves = 0.0, aside;
     if (in->is_free[k])
       continue;
@@ -85,7 +81,7 @@ static int is_consistent(const contact_problem *in, const contact_mode *mode, re
     }
     aside = slips == 2 ? mode[k].direction[0] * after[slip + 1] - mode[k].direction[1] * after[slip] : 0.0;
     if ((mode[k].sticks || mode[k].held) && /* the friction of one that is held is at most at its limit */
-        (length_of(force + slip, slips) - friction_limit(of, k, in->limit[k], force) - excess) *
+        (length_of(force + slip, slips) - friction_limit(of, k, in->limit[k], force)) *
                 of->W[slip * (CONTACT_ROWS + 1)] >
             (in->is_relaxed && mode[k].sticks ? -small : small))
       return 0;
@@ -103,7 +99,7 @@ static int rank_of(const contact_problem *in, const contact_mode *mode)
 {
   real force[CONTACT_ROWS], after[CONTACT_ROWS];
   int imposed[CONTACT_ROWS] = {0}, rank = 0;
-  solve_contacts(in->of, mode, in->right, NULL, force, after, imposed);
+  solve_contacts(in->of, mode, in->right, force, after, imposed);
   for (int r = 0; r < CONTACT_ROWS; r++)
     rank += imposed[r];
   return rank;
@@ -138,12 +134,13 @@ static void relax(const contact_problem *in, real compliance, int sweeps, real *
   const contact_mode *const role = in->role;
   real strongest = 0.0;
   for (int moves = 1; moves && sweeps > 0; sweeps--) {
+    real before[CONTACT_ROWS];
+    memcpy(before, force, sizeof before);
     moves = 0;
     for (int k = 0; k < EVENT_CONTACTS; k++) {
       const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
       real diagonal = normal < 0 ? 0.0 : of->W[normal * (CONTACT_ROWS + 1)], oblique = diagonal, trace = 0.0;
       real bound, size, friction[2] = {0.0, 0.0};
-      const real before[3] = {normal < 0 ? 0.0 : force[normal], slips > 0 ? force[slip] : 0.0, slips > 1 ? force[slip + 1] : 0.0};
       for (int i = 0; i < slips; i++) {
         trace += of->W[(slip + i) * (CONTACT_ROWS + 1)];
         if (normal >= 0 && !role[k].sticks)
@@ -163,11 +160,9 @@ static void relax(const contact_problem *in, real compliance, int sweeps, real *
       size = length_of(friction, slips);
       for (int i = 0; i < slips; i++)
         force[slip + i] = friction[i] * (role[k].sticks && size > bound ? bound / size : 1.0);
-      for (int i = normal < 0; i <= slips; i++) {
-        const real now = force[i == 0 ? normal : slip + i - 1];
-        moves |= fabs(now - before[i]) > DBL_EPSILON * fabs(now);
-      }
     }
+    for (int r = 0; r < CONTACT_ROWS; r++)
+      moves |= fabs(force[r] - before[r]) > DBL_EPSILON * fabs(force[r]);
   }
 }
 
@@ -324,14 +319,7 @@ static int relax_modes(contact_problem *in, real *force, contact_mode *best)
   memcpy(in->limit, limit, sizeof limit);
   memcpy(in->role, role, sizeof role);
   in->is_strict = 0;
-  if (found || enumerate_modes(in, NULL, NULL, CONTACT_MODES, best))
-    return 1;
-  if (!in->scale) /* forces last, and are those of least norm */
-    return 0;
-  relax(in, 0.0, CONTACT_SWEEPS << CONTACT_TRIALS, force);
-  memcpy(in->relaxed, force, sizeof in->relaxed);
-  in->near = in->relaxed;
-  return enumerate_modes(in, NULL, NULL, CONTACT_MODES, best);
+  return found || enumerate_modes(in, NULL, NULL, CONTACT_MODES, best);
 }
 
 /* Notes why no motion is possible; contact k, or all. */
@@ -390,7 +378,7 @@ static int choose_modes(const event_step *step, const contact_terms *of, const c
     const int paradox = painleve(&in, &entry);
     return refuse(step, CONTACT_WITHOUT_MODE, paradox, paradox < 0 ? 0.0 : entry);
   }
-  solve_contacts(of, best, of->second, NULL, force, second, imposed);
+  solve_contacts(of, best, of->second, force, second, imposed);
   step->watch->ambiguous |= enumerate_modes(&in, best, second, CONTACT_OTHERS, other);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential;

@@ -59,7 +59,7 @@ static int slips_at(const event_step *step, const event_sample *at, contact_term
   if (!slips || *status != OK)
     return 0;
   modes_at(of, modes, mode);
-  return solve_contacts(of, mode, of->second, NULL, force, second, NULL) <= CONTACT_ROUNDING;
+  return solve_contacts(of, mode, of->second, force, second, NULL) <= CONTACT_ROUNDING;
 }
 
 /* Directions in a part of a step of slips that begin, by the midpoint rule: friction is opposite to w + (part/2) w', w'

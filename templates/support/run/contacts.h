@@ -29,7 +29,7 @@ static int find_outside(const event_step *step, const contact_terms *of, real pa
   real force[CONTACT_ROWS], after[CONTACT_ROWS];
   int first;
   modes_at(of, step->watch->mode, mode);
-  first = solve_contacts(of, mode, of->second, NULL, force, after, NULL) > CONTACT_OUTSIDE ? EVENT_CONTACTS : -1;
+  first = solve_contacts(of, mode, of->second, force, after, NULL) > CONTACT_OUTSIDE ? EVENT_CONTACTS : -1;
   for (int k = EVENT_CONTACTS - 1; k >= 0; k--) {
     const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
     const int row = normal < 0 ? slip : normal; /* those of open contacts may be undefined */
