@@ -272,6 +272,18 @@ def test_feet_on_straight_legs_are_not_held_by_others() -> None:
     assert (gaps.min() > -1e-12, np.diff(run.energy()).max() < 1e-9) == (True, True)
 
 
+@pytest.mark.second
+@pytest.mark.filterwarnings("ignore:the contacts depend")
+@pytest.mark.parametrize(("speed", "stop"), [(0.0, 0.0), (0.2, 0.2 * np.sqrt(0.2 / G))])
+def test_a_box_without_restitution_falls_flat_and_rests_at_once(speed: float, stop: float) -> None:
+    """All forces are 0 after the impact if it does not slide, which sticks below v_x = mu v."""
+    start = {"velocity": [speed, 0, 0], "h": 0.05, "t_end": 0.5}
+    run = box(friction=0.3).integrate([0, HEIGHT + 0.1, 0], **start)
+    assert run.contact_modes[1:] == [(pytest.approx(np.sqrt(0.2 / G), abs=1e-13), ("stick", "stick"))]
+    assert run.q[-1] == pytest.approx([stop, HEIGHT, 0], abs=1e-13)
+    assert run.velocity[-1] == pytest.approx([0, 0, 0], abs=1e-13)
+
+
 def test_contacts_that_contradict_each_other_are_refused_or_slip() -> None:
     """A block on two belts, one of which accelerates: the stronger one carries it, w = t/10, the other slips."""
     belts = [sc.friction("x_dot", limit=1), sc.friction("x_dot - t/10", limit=2)]

@@ -174,6 +174,68 @@ def test_a_free_body_falls_on_four_feet_and_rests(steps, seeds, tmp_path):
         assert normal[-1].sum() == pytest.approx(3.4 * 9.81)
 
 
+def fallen(floor, feet, folder, start, velocity, *, e=0.0, **steps):
+    """Return the run of a file to its end, which ends with energies that never grew."""
+    (folder / "fallen.xml").write_text(f"<mujoco><worldbody>{floor}{feet}</worldbody></mujoco>")
+    system = sc.LagrangianSystem.from_mjcf(folder / "fallen.xml", contacts="planes", restitution=e)
+    stepper = sc.compile_stepper(system, "svi:2")
+    for k in steps["steps"]:
+        run = stepper.integrate(start, velocity=velocity, t_end=2.0, **k)
+        assert np.diff(run.energy()).max() < 1e-9
+        yield run
+
+
+GROUND = '<geom type="plane" size="5 5 .1" friction=".8"/>'
+THREE = f"""<body pos="0 0 .15"><freejoint name="seat"/><geom type="box" size=".3 .12 .05" mass="3" contype="0"
+conaffinity="0"/>{"".join(map(FOOT.format, (".125 .173", "-.25 0", ".125 -.173")))}</body>"""
+
+
+@pytest.mark.filterwarnings("ignore:a transition has several motions")
+@pytest.mark.filterwarnings("ignore:the contacts depend")
+@pytest.mark.rotated
+@pytest.mark.parametrize("e", [0.0, 0.3])
+def test_a_stool_on_three_feet_falls_bounces_and_rests(e, tmp_path):
+    """Flat without restitution it stops where it lands, x = v t; self-similar rebounds of two feet are at the limit."""
+    start = {"x_seat": 0, "y_seat": 0, "z_seat": 0.15, "R_seat": [1, 0, 0, 0]}
+    velocity, ends = {"x_seat": 0.3, "y_seat": 0, "z_seat": 0, "omega_seat": [0, 0, 0]}, []
+    for run in fallen(GROUND, THREE, tmp_path, start, velocity, e=e, steps=({"h": 0.005}, {"tolerance": 1e-7})):
+        assert run.contact_modes[-1][1] == ("stick",) * 3
+        assert np.abs(run.velocity[-1]).max() < 1e-10
+        ends.append(run.q[-1, :3])
+    assert ends[0] == pytest.approx(ends[1], abs=1e-6)
+    assert ends[0][2] == pytest.approx(0.13, abs=1e-12)
+    if e == 0:
+        assert ends[0][:2] == pytest.approx([0.3 * np.sqrt(0.04 / 9.81), 0], abs=1e-12)
+
+
+LEGS = "".join(f"""<body pos="{x} 0 0"><joint name="h{i}" axis="0 1 0" damping=".5" stiffness="60"/><geom type="capsule"
+fromto="0 0 0 0 0 -.2" size=".02" mass=".4" contype="0" conaffinity="0"/><body pos="0 0 -.2"><joint name="k{i}"
+axis="0 1 0" damping=".5" stiffness="60"/><geom type="capsule" fromto="0 0 0 0 0 -.2" size=".015" mass=".2" contype="0"
+conaffinity="0"/><geom type="sphere" pos="0 0 -.2" size=".02" mass=".05" friction=".8"/></body></body>"""
+for i, x in enumerate((-0.25, 0, 0.25)))  # fmt: skip
+WALKER = f"""<body pos="0 0 .43"><joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
+<joint name="p" axis="0 1 0"/><geom type="box" size=".25 .1 .05" mass="6" contype="0" conaffinity="0"/>{LEGS}</body>"""
+
+
+@pytest.mark.filterwarnings("ignore:a transition has several motions")
+@pytest.mark.filterwarnings("ignore:the contacts depend")
+@pytest.mark.rotated
+@pytest.mark.parametrize(("speed", "changes"), [(0.0, 2), (0.1, None)])
+def test_a_robot_lands_on_straight_legs(speed, changes, tmp_path):
+    """Gaps of three feet are of rank two where knees are straight, and almost so in the oscillation about it."""
+    names, ends = ["x", "z", "p", "h0", "k0", "h1", "k1", "h2", "k2"], []
+    start, velocity = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0.0) | {"x": speed}
+    for run in fallen(GROUND, WALKER, tmp_path, start, velocity, steps=({"h": 0.005}, {"h": 0.002})):
+        normal, slip = np.moveaxis(run.contact_forces(), -1, 0)
+        assert changes in (None, len(run.contact_modes))
+        assert (np.abs(slip) <= 0.8 * normal * (1 + 1e-9) + 1e-6).all()
+        ends.append(run.q[-1])
+    assert ends[0] == pytest.approx(ends[1], abs=2e-6)
+    if changes:  # at rest
+        assert ends[0] == pytest.approx([0, -0.01, *[0] * 7], abs=1e-12)
+        assert normal[-1].sum() == pytest.approx(7.95 * 9.81)
+
+
 @pytest.mark.filterwarnings("ignore:a transition has several motions")
 @pytest.mark.rotated
 def test_modes_with_forces_outside_of_their_cones_are_refused(tmp_path):
