@@ -282,9 +282,13 @@ def test_small_motions_on_a_rod_are_not_reported(angle, unit, tolerance):
 @pytest.mark.rotated
 @pytest.mark.parametrize(("q", "t_end"), [([2.5, -2.0], 30.0), ([2.5, -2.0], 40.0), ([2.4, -2.0], 40.0)])
 def test_reported_growth_has_the_number_of_digits_left(q, t_end):
-    """Compare the number with the difference from a method of another order: three double pendulums, 5 to 9 digits."""
+    """Compare the number with the largest difference from methods of other orders: double pendulums, 5 to 9 digits.
+
+    A single difference may be small: that of two rounding errors, which have any size below the reported one.
+    """
     with pytest.warns(sc.AccuracyWarning, match=r"leaves about (\d) digits at t = .* \(estimated\)") as warned:
         run = stepper_of(PENDULUM).integrate(q, [0.0, 0.0], t_end=t_end)
     digits = int(re.search(r"about (\d) digits", str(warned[0].message))[1])
-    other = stepper_of(PENDULUM, "svi:12").integrate(q, [0.0, 0.0], t_end=t_end, check_growth=False)
-    assert digits - 1 < -np.log10(np.abs(run.q[-1] - other.q[-1]).max()) < digits + 2.5
+    methods = (stepper_of(PENDULUM, method) for method in ("svi:6", "svi:10", "svi:12"))
+    others = [stepper.integrate(q, [0.0, 0.0], t_end=t_end, check_growth=False).q[-1] for stepper in methods]
+    assert digits - 1 < -np.log10(np.abs(run.q[-1] - others).max()) < digits + 2.5
