@@ -217,8 +217,8 @@ less, but regular orbits of thousands of steps then show exponential growth.
 
 
 def _growth_tables(points: Vector, knots: Vector, *, of_velocities: bool) -> tuple[IterationTable, ...]:
-    """Return the tables from points to knots, from knots to knots, and to Taylor's coefficients at the end."""
-    end, rates = (mp.one,), differentiation_matrix(knots)
+    """Return the tables from points to knots of a step and its halves, between knots, and to Taylor's coefficients."""
+    end, rates, half = (mp.one,), differentiation_matrix(knots), mp.one / 2
     at_end = cardinal_values(knots, end)[0]
     slope = tuple(mp.fdot(at_end, column) for column in transpose(rates))
     bend = tuple(mp.fdot(slope, column) for column in transpose(rates))
@@ -227,22 +227,22 @@ def _growth_tables(points: Vector, knots: Vector, *, of_velocities: bool) -> tup
         cardinal_integrals(knots, end, mp.zero)[0],
         *(tuple(x / k for x in row) for k, row in ((2, at_end), (6, slope), (24, bend))),
     )
-    tables: list[tuple[str, Matrix, bool]] = [
-        ("KNOT_ABSCISSA", tuple((c,) for c in knots), True),
-        ("KNOT_VALUES", cardinal_values(points, knots), True),
-        ("TANGENT_INTEGRALS_TWICE", _twice_integrated(knots, knots), True),
-        ("TANGENT_END", taylor, False),
-    ]
+    parts = [tuple(start + size * c for c in knots) for start, size in ((0, 1), (0, half), (half, half))]
+
+    def columns(*tables: Matrix, repeat: bool = True) -> NumberTable:
+        return tuple(pad_vector(column, COLUMNS, repeat=repeat) for table in tables for column in transpose(table))
+
+    tables = {
+        "KNOT_ABSCISSA": columns(*(transpose((part,)) for part in parts)),
+        "KNOT_VALUES": columns(*(cardinal_values(points, part) for part in parts)),
+        "TANGENT_INTEGRALS_TWICE": columns(_twice_integrated(knots, knots)),
+        "TANGENT_END": columns(taylor, repeat=False),
+    }
     if of_velocities:
-        tables += [
-            ("TANGENT_INTEGRALS", cardinal_integrals(knots, knots, mp.zero), True),
-            ("KNOT_INTEGRALS", cardinal_integrals(points, knots, mp.zero), True),
-            ("KNOT_RATES", cardinal_derivatives(points, knots), True),
-        ]
-    return tuple(
-        IterationTable(name, tuple(pad_vector(column, COLUMNS, repeat=repeat) for column in transpose(rows)))
-        for name, rows, repeat in tables
-    )
+        tables["TANGENT_INTEGRALS"] = columns(cardinal_integrals(knots, knots, mp.zero))
+        tables["KNOT_INTEGRALS"] = columns(*(cardinal_integrals(points, part, mp.zero) for part in parts))
+        tables["KNOT_RATES"] = columns(*(cardinal_derivatives(points, part) for part in parts))
+    return tuple(IterationTable(name, table) for name, table in tables.items())
 
 
 def _separable_growth(system: LagrangianSystem) -> tuple[Kernel, Kernel, None]:

@@ -8,7 +8,7 @@
  * step; derivatives there are evaluated in SIMD lanes. The collocation equations
  *   dq_n = dq + c_n h dv + h^2 sum_j P_nj dq''_j,      dv_n = dv + h sum_j Q_nj dq''_j
  * are solved by Picard iterations (Hairer, Norsett & Wanner, Solving ODEs I, sec. I.8) from Taylor's polynomial at the
- * end of the step before. In one of `measures_growth` steps the vector is projected on the energy surface (in the
+ * end of the step before; in two halves of a step if all are measured. In one of `measures_growth` steps the vector is projected on the energy surface (in the
  * metric of the sizes of the motion): its part along the gradient of the energy, which is conserved, grows by the error
  * of the iterations only. Requires: the iteration, the tables, the kernels point_derivatives and derivative_product;
  * with VARIABLE_ACCELERATIONS energy_gradient. */
@@ -76,21 +76,25 @@ typedef struct {
   double square, inverse; /* h^2, 1 / h */
 } tangent_knots;
 
-/* Computes the derivatives of the accelerations at the knots of a step from the velocities in the run's memory. */
+/* Computes the derivatives of the accelerations at the knots of a part of a step from the velocities in the run's memory.
+ */
 static inline void linearise_accelerations(const run_memory *run, const step_data *step, const iteration_data *data,
-    coordinates *X, tangent_knots *at)
+    coordinates *X, int part, double h, tangent_knots *at)
 {
+  const double inverse = 1.0 / step->h;
   lanes u[3 * M];
   (void)X, (void)data;
+  at->square = h * h;
+  at->inverse = 1.0 / h;
   for (int n = 0; n < KNOT_GROUPS; n++) {
     for (int i = 0; i < M; i++) {
       const double *V = run->memory + i * POINTS;
-      u[i] = step->q0[i] + step->h * add_rows(lanes_of(0.0), KNOT_INTEGRALS, KEPT, n, V, LANES);
-      u[M + i] = add_rows(lanes_of(0.0), KNOT_VALUES, KEPT, n, V, LANES);
-      u[2 * M + i] = at->inverse * add_rows(lanes_of(0.0), KNOT_RATES, KEPT, n, V, LANES);
+      u[i] = step->q0[i] + step->h * add_rows(lanes_of(0.0), KNOT_INTEGRALS + part * KEPT, KEPT, n, V, LANES);
+      u[M + i] = add_rows(lanes_of(0.0), KNOT_VALUES + part * KEPT, KEPT, n, V, LANES);
+      u[2 * M + i] = inverse * add_rows(lanes_of(0.0), KNOT_RATES + part * KEPT, KEPT, n, V, LANES);
     }
     memset(at->mass[n], 0, sizeof at->mass[n]);
-    point_derivatives(u, step->t + step->h * columns_of(KNOT_ABSCISSA[0], n), step->parameters, at->u[n] + TANGENT,
+    point_derivatives(u, step->t + step->h * columns_of(KNOT_ABSCISSA[part], n), step->parameters, at->u[n] + TANGENT,
         at->mass[n]);
     factor_mass(at->mass[n]);
   }
@@ -111,19 +115,19 @@ typedef struct {
 } tangent_knots;
 
 static inline void linearise_accelerations(const run_memory *run, const step_data *step, const iteration_data *data,
-    coordinates *X, tangent_knots *at)
+    coordinates *X, int part, double h, tangent_knots *at)
 {
   lanes u[M];
   const double *x = (const double *)X;
   (void)run;
   for (int n = 0; n < KNOT_GROUPS; n++) {
     for (int i = 0; i < M; i++)
-      u[i] = add_rows(lanes_of(0.0), KNOT_VALUES, KEPT, n, x + i * LANES, M * LANES);
+      u[i] = add_rows(lanes_of(0.0), KNOT_VALUES + part * KEPT, KEPT, n, x + i * LANES, M * LANES);
     point_derivatives(
-        u, step->t + step->h * columns_of(KNOT_ABSCISSA[0], n), step->parameters, at->u[n] + TANGENT);
+        u, step->t + step->h * columns_of(KNOT_ABSCISSA[part], n), step->parameters, at->u[n] + TANGENT);
   }
   for (int i = 0; i < M; i++)
-    at->unit[i] = data->square * data->inverse_mass[i];
+    at->unit[i] = h * h * data->inverse_mass[i];
 }
 
 static inline void tangent_accelerations(const step_data *step, const tangent_knots *at, int n, lanes *a)
@@ -187,25 +191,23 @@ static SELDOM void rescale_tangent(run_memory *run, double h)
   run->tangent_h = h;
 }
 
-/* Advances the tangent vector by a step; ends the measurement if the iterations diverge. */
-static inline void advance_tangent(run_memory *run, const step_data *step, const iteration_data *data, coordinates *X)
+/* Advances the tangent vector by a step, of size h, or by one of its halves (part 1 or 2); ends the measurement if the
+ * iterations diverge. */
+static inline void advance_tangent(
+    run_memory *run, const step_data *step, const iteration_data *data, coordinates *X, int part, double h)
 {
   double size = 0.0, rate = 0.0, change, stored[M][KNOTS_STORED];
   int k = 0, is_resolved = 0;
   tangent_knots at;
   lanes a[KNOT_GROUPS][M], before[KNOT_GROUPS][M];
-  if (step->h != run->tangent_h)
-    rescale_tangent(run, step->h);
-#ifdef VARIABLE_ACCELERATIONS
-  at.square = step->h * step->h;
-  at.inverse = 1.0 / step->h;
-#endif
+  if (h != run->tangent_h)
+    rescale_tangent(run, h);
   for (int i = 0; i < M; i++) {
     const double *of = run->tangent[i];
     size += of[0] * of[0] + 0.25 * (of[1] * of[1]);
     rate += 4.0 * (of[2] * of[2]) + 36.0 * (of[3] * of[3]);
   }
-  linearise_accelerations(run, step, data, X, &at);
+  linearise_accelerations(run, step, data, X, part, h, &at);
   begin_tangents(run->tangent, a, &at);
   while (!is_resolved && k++ < MOST_ITERATIONS) {
     lanes sum = lanes_of(0.0);
@@ -276,7 +278,7 @@ static inline void end_gradient(const run_memory *run, const step_data *step, co
 static inline void sample_growth(run_memory *run, const step_data *step, const iteration_data *data, const double *dq,
     const double *dp)
 {
-  const double inverse = 1.0 / step->h;
+  const double inverse = 1.0 / run->tangent_h;
   double q[M], v[M], tangent_v[M], by_q[M], by_v[M], q2 = 0.0, v2 = 0.0, dq2 = 0.0, dv2 = 0.0;
   double size, growth, logarithm_q;
 #ifdef ENERGY_CONSERVED
@@ -305,7 +307,7 @@ static inline void sample_growth(run_memory *run, const step_data *step, const i
   for (int i = 0; i < M; i++) {
     run->tangent[i][0] -= along * q2 * by_q[i];
     tangent_v[i] -= along * v2 * by_v[i];
-    run->tangent[i][1] = step->h * tangent_v[i];
+    run->tangent[i][1] = run->tangent_h * tangent_v[i];
   }
 #endif
   for (int i = 0; i < M; i++) {
@@ -347,7 +349,11 @@ static __attribute__((noinline)) void measure_growth(run_memory *run, const step
 #endif
     }
   }
-  advance_tangent(run, step, data, X);
+  if (run->measures_growth == 1) {
+    advance_tangent(run, step, data, X, 1, 0.5 * step->h);
+    advance_tangent(run, step, data, X, 2, 0.5 * step->h);
+  } else
+    advance_tangent(run, step, data, X, 0, step->h);
   if (run->measures_growth && run->tangent_steps++ % run->measures_growth == 0)
     sample_growth(run, step, data, dq, dp);
 }
