@@ -1,12 +1,13 @@
 """Intermediate quantities: derivatives, replacements and steps against formulas that are written out."""
 
 from dataclasses import replace
+from itertools import combinations_with_replacement
 from pathlib import Path
 
 import numpy as np
 import pytest
 import sympy
-from sympy import Symbol, cos, exp, sin, sqrt
+from sympy import Add, Mul, Rational, S, Symbol, cos, exp, sin, sqrt, symbols
 
 import scvi_codegen as sc
 from scvi_codegen.codegen.ir.arithmetic import lower_kernel
@@ -14,8 +15,15 @@ from scvi_codegen.common.cache import identity
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.precision import mp
 from scvi_codegen.systems.formulas.expressions import evaluate, gradient, hessian, jacobian, unsupported_part
-from scvi_codegen.systems.formulas.intermediates import intermediate, intermediates, written_out, written_size
-from scvi_codegen.systems.formulas.numpy_values import array_value
+from scvi_codegen.systems.formulas.intermediates import (
+    intermediate,
+    intermediates,
+    product,
+    total,
+    written_out,
+    written_size,
+)
+from scvi_codegen.systems.formulas.numpy_values import array_value, varies
 
 X, Y, Z = VARIABLES = tuple(Symbol(name, real=True) for name in "xyz")
 POINT = {X: mp.mpf("0.3"), Y: mp.mpf("-0.7"), Z: mp.mpf("1.1")}
@@ -136,3 +144,24 @@ def test_steps_are_those_of_the_lagrangian_written_out(tmp_path, method, solver,
         run = sc.compile_stepper(each, method, solver=solver).integrate(start, velocity=speed, **options)
         ends.append(np.concatenate([run.q[-1], run.p[-1]]))
     np.testing.assert_allclose(ends[0], ends[1], rtol=2e-12, atol=2e-12)
+
+
+def test_products_and_sums_are_those_of_sympy() -> None:
+    x, y = symbols("x y", real=True)
+    parts = [S.Zero, S.One, Rational(-3, 7), x, y, 2 * x, cos(x), -sin(y), x**2, 1 / x, x + y, 2 * (x + y), sqrt(2)]
+    parts += [intermediate(x + y), -intermediate(x * y), x * cos(x), Rational(5, 3) * intermediate(x * y) * y]
+    for a, b, c in combinations_with_replacement(parts, 3):
+        assert product(a, b).args == Mul(a, b).args
+        assert product(product(a, b), c) == Mul(Mul(a, b), c)
+        assert total([a, b, c]) == Add(a, b, c)
+        assert total([c, a, b]).args == Add(a, b, c).args
+
+
+def test_variation_of_second_differences() -> None:
+    x, y, m = symbols("x y m", real=True)
+    square = intermediate(x + y) ** 2
+    assert not varies(m * square, [x], {m})
+    assert varies(m * square, [x], set())
+    assert varies(cos(y) * square, [x], {m})
+    assert varies(square**2, [x], {m})
+    assert not varies(x**4, [x], {m})  # without intermediate quantities derivatives are computed

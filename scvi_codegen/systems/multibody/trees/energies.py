@@ -180,7 +180,7 @@ class Tree:
             velocity = as_quantities(v + w.cross(exact_vector(link.inertia.center)))
             momenta.append(exact_number(link.inertia.mass) * velocity)
             terms.append(velocity.dot(momenta[-1]) / 2)
-            terms.append((w.T * exact_matrix(link.inertia.matrix) * w)[0] / 2)
+            terms.append(times(times(w.T, exact_matrix(link.inertia.matrix)), w)[0] / 2)
             terms.append(self.of_rates(link.joint, (link.joint.armature,)))
         return Add(*terms, *self.free_bases(momenta))
 
@@ -323,6 +323,12 @@ def integral(coefficients: Sequence[float], x: Expr) -> Expr:
     return Add(*(exact_number(c) * x**k / k for k, c in enumerate(coefficients, 2)))
 
 
+def times(a: Matrix, b: Matrix) -> Matrix:
+    """Return the product of matrices, faster than SymPy, which converts their entries."""
+    columns = [*zip(*b.tolist(), strict=True)]
+    return Matrix([[total(map(product, row, column)) for column in columns] for row in a.tolist()])
+
+
 def as_quantities(vector: Matrix) -> Matrix:
     """Return a vector of intermediate quantities."""
     return vector.applyfunc(intermediate)
@@ -428,7 +434,7 @@ def dual_energy(tree: Tree) -> Expr:
             innovation = intermediate(momentum - bias[axis])
             gain = as_quantities(inertia[:, axis] / pivot)
             terms.append(innovation**2 / (2 * pivot))
-            inertia = as_quantities(_symmetric(inertia - gain * inertia[:, axis].T))
+            inertia = as_quantities(_symmetric(inertia - times(gain, inertia[:, axis].T)))
             bias = as_quantities(bias + gain * innovation)
             if gain[axis] == 1:
                 bias[axis] = momentum
@@ -455,10 +461,10 @@ def _in_parent(tree: Tree, joint: Joint, inertia: Matrix, bias: Matrix) -> tuple
     angular, mixed, linear = (
         _turned_twice(tree, joint, block) for block in (inertia[:3, :3], inertia[:3, 3:], inertia[3:, 3:])
     )
-    moved = as_quantities(mixed + arm * linear)
-    angular += mixed * arm.T + arm * moved.T
+    moved = as_quantities(mixed + times(arm, linear))
+    angular += times(mixed, arm.T) + times(arm, moved.T)
     torque, force = (tree.turned(joint, part) for part in (bias[:3, :], bias[3:, :]))
-    return Matrix([[angular, moved], [moved.T, linear]]), Matrix([torque + arm * force, force])
+    return Matrix([[angular, moved], [moved.T, linear]]), Matrix([torque + times(arm, force), force])
 
 
 def _turned_twice(tree: Tree, joint: Joint, block: Matrix) -> Matrix:
