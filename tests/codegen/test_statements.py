@@ -54,6 +54,12 @@ def test_steps_without_points_have_no_sums_over_them():
             without_points(text, Layout(), q=Quantity("q", uniform=True))
 
 
+@pytest.mark.parametrize(("operator", "increment"), [("+", "x[i]"), ("-", "-x[i]")])
+def test_increments_of_states_are_compensated_sums(operator, increment):
+    lines = without_points(f"p0[i] {operator}= x[i]", Layout(), x=Quantity("x", uniform=True))
+    assert lines[1] == f"  add_to_state(&step->p0[i], &step->low_p0[i], {increment});"
+
+
 def test_features_are_decided_when_a_text_is_read():
     text = "if fast:\n    if not known:\n        q[i] += h\nelse:\n    q[i] -= h"
     assert selected(text, ["fast"]) == "if not known:\n    q[i] += h"

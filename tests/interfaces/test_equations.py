@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import sympy
 from notation import lagrange
+from scipy.linalg import expm
 from sympy import sin, sqrt
 
 import scvi_codegen as sc
@@ -90,3 +91,28 @@ def test_statements_of_constraints_are_those_of_their_masses():
     assert "momentum_terms" not in first
     assert "invert(masses)" in second
     assert not sc.derive(PENDULUM, "svi:2").statements
+
+
+def test_printed_half_step_of_a_heat_bath_is_exact():
+    """Its lines with columns of normals: E p of exp(-R M^-1 tau), and noise of fluctuation and dissipation."""
+    bath = {"damping": 0.0, "dissipation": "g*x_dot**2/2", "temperature": "kT", "parameters": {"kT": 1.3, "g": 0.7}}
+    system = sc.LagrangianSystem.from_text(
+        "pair", coordinates=["x", "y"], lagrangian="x_dot**2 + x_dot*y_dot/2 + y_dot**2/2 - x**2", **bath
+    )
+    (text,) = sc.derive(system, "svi:2").statements.values()
+    M, R, tau, kT = np.array([[2, 0.5], [0.5, 1]]), np.diag([0.7, 0]), 0.4, 1.3
+    L = np.linalg.cholesky(M)
+    rates, U = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, R).T))
+    decay, matrices = np.expm1(-tau * rates)[:, np.newaxis], {"modes": np.linalg.inv(L @ U), "rotated": U.T}
+    values = {name: (lambda x, A=A: A @ x) for name, A in (matrices | {"momenta": L @ U}).items()}
+    values |= {"mean": 0.5, "carry": 0.0, "decay": decay, "strength": np.sqrt(-kT * decay * (2 + decay)), "heat": 0.0}
+    exact = expm(-tau * R @ np.linalg.inv(M))
+
+    def half_step(p, xi):
+        now = values | {"p": 0.5 + p, "xi": xi}
+        exec(text.replace("[i]", ""), now)
+        return now["p"] - 0.5
+
+    assert np.abs(half_step(np.eye(2), np.zeros((2, 2))) - exact).max() < 1e-14
+    noise = half_step(np.zeros((2, 2)), np.eye(2))
+    assert np.abs(noise @ noise.T - kT * (M - exact @ M @ exact.T)).max() < 1e-14

@@ -85,10 +85,7 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Layout:
-    """C of a step without points: numbers of one or two ``words``, and ``lanes`` if SIMD lanes are trajectories.
-
-    ``word`` is the type of numbers of one word.
-    """
+    """C of a step without points: numbers of one ``word`` or of two; with ``lanes`` trajectories are SIMD lanes."""
 
     words: int = 1
     lanes: bool = False
@@ -97,8 +94,7 @@ class Layout:
     @property
     def number(self) -> str:
         """Type of a value of the trajectory."""
-        pair = "ddl" if self.lanes else "dd"
-        return self.word if self.words == 1 else pair
+        return self.type_of(Quantity("", words=self.words, uniform=not self.lanes))
 
     def type_of(self, quantity: Quantity) -> str:
         """Return the type of a value."""
@@ -142,9 +138,7 @@ class PointsAsLanes(Layout):
 
     def type_of(self, quantity: Quantity) -> str:
         """Return the type of a value."""
-        if quantity.words == 1:
-            return "lanes"
-        return "ddl"
+        return "lanes" if quantity.words == 1 else "ddl"
 
     def local(self, name: str, place: Place, words: int, index: str) -> Quantity:
         """Return a quantity that only the statements use, a vector."""

@@ -81,34 +81,25 @@ def velocities_by_masses(statements: Iterable[Statement]) -> Iterator[Statement]
 def splitting_header(split: Splitting, layout: Layout, *, action: bool) -> str:
     """Return the header with the function that computes the increments of a step of a splitting method."""
     lines = splitting_step(split, layout, action=action)
-    if layout.words == 1:
-        head = """\
-/* Computes the increments of one step. F is the last force; it is that of the first kick if `known`. Of a run that sums
- * the action, acted[0] is L at v = 0 at the last kick, and acted[1] the action of the step divided by h. */
-SPLITTING void leap(const step_data *step, const solver_data *data, int known, number *F, number *dq, number *dp,
-    number *acted)
-{
-"""
-        first = ["memset(dq, 0, sizeof(number) * M);", "memset(dp, 0, sizeof(number) * M);"]
-        first += ["acted[1] = 0;"] if action else ["(void)acted;"]
-        first += [] if split.by_masses or split.bodies else ["(void)data;"]
-        first += [] if split.leaps else ["(void)known, (void)F;"]
-        last: list[str] = []
-    else:
-        kind, zero = layout.number, f"{layout.number}_word({'lanes_of(0.0)' if layout.lanes else '0.0'})"
-        head = f"""\
-/* Computes the increments of one step in pairs. F is the last force; it is that of the first kick if `known`. */
-static inline void leap_in_pairs(const step_data *step, dd t, dd h, const {kind} *inverse_mass, int known, {kind} *F,
-    number *dq, number *dp)
-{{
-"""
-        first = [f"{kind} q[M], p[M];", "for (int i = 0; i < M; i++)", f"  q[i] = p[i] = {zero};"]
-        first += [] if split.leaps else ["(void)known, (void)F;"]
-        words = [f"  d{x}[i] = {x}[i].high, d{x}[M + i] = {x}[i].low;" for x in "qp"]
-        last = ["for (int i = 0; i < M; i++) {", *words, "}"]
+    purpose = "Computes the increments of one step{}. F is the last force; it is that of the first kick if `known`"
+    first = [] if split.leaps else ["(void)known, (void)F;"]
     if split.driven and layout.words == 2:
         first += ["known = 0; /* inputs, which may jump between steps, have changed the last force */"]
-    return head + "".join(f"  {line}\n" for line in (*first, *lines, *last)) + "}\n"
+    if layout.words == 1:
+        acted = ", and if the action is summed\n * acted[1], its part over h, and acted[0], the last L at v = 0"
+        arguments = "const solver_data *data, int known, number *F, number *dq, number *dp,\n    number *acted"
+        starts = ["memset(dq, 0, sizeof(number) * M);", "memset(dp, 0, sizeof(number) * M);"]
+        starts += ["acted[1] = 0;"] if action else ["(void)acted;"]
+        starts += [] if split.by_masses or split.bodies else ["(void)data;"]
+        head = f"SPLITTING void leap(const step_data *step, {arguments})"
+        return _function(purpose.format(acted), head, *starts, *first, *lines)
+    kind, zero = layout.number, f"{layout.number}_word({'lanes_of(0.0)' if layout.lanes else '0.0'})"
+    arguments = f"dd t, dd h, const {kind} *inverse_mass, int known, {kind} *F,\n    number *dq, number *dp"
+    starts = [f"{kind} q[M], p[M];", "for (int i = 0; i < M; i++)", f"  q[i] = p[i] = {zero};"]
+    words = [f"  d{x}[i] = {x}[i].high, d{x}[M + i] = {x}[i].low;" for x in "qp"]
+    head = f"static inline void leap_in_pairs(const step_data *step, {arguments})"
+    ends = ["for (int i = 0; i < M; i++) {", *words, "}"]
+    return _function(purpose.format(" in pairs"), head, *starts, *first, *lines, *ends)
 
 
 HALF_STEP = """

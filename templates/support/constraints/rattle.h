@@ -116,15 +116,6 @@ LANE_FUNCTION void force_of_lane(const step_data *step, const rattle_step *now, 
   constrained_force(u, step->t + RATTLE_ABSCISSA[n] * step->h, step->parameters, force);
 }
 #else
-LANE_FUNCTION void force_of_lane(const step_data *step, const rattle_step *now, int n, number *force)
-{
-  number u[M];
-#pragma GCC unroll 64
-  for (int i = 0; i < M; i++)
-    u[i] = now->u[i][n];
-  constrained_force(u, step->t + RATTLE_ABSCISSA[n + 1] * step->h, step->parameters, force);
-}
-
 #define move_points(step, now) (void)0
 #endif
 
@@ -159,7 +150,11 @@ static __attribute__((flatten)) void evaluate_points(const step_data *step, ratt
 #pragma GCC unroll 64
     for (int i = 0; i < M; i++)
       u[i] = now->u[i][n];
+#ifdef VELOCITY_FORCES
     force_of_lane(step, now, n, force);
+#else
+    constrained_force(u, t, step->parameters, force);
+#endif
     constraints(u, t, step->parameters, g, derivative);
 #pragma GCC unroll 64
     for (int i = 0; i < M; i++)
@@ -180,18 +175,16 @@ static inline void former_derivatives(const rattle_step *now, int g, lanes *deri
     derivative[e] = former(now->derivative[e], now->first_derivative[e], g);
 }
 
-#ifdef VELOCITY_FORCES
-#define FIRST_FORCE(now, i) (now)->force[i][0]
-#else
-#define FIRST_FORCE(now, i) (now)->first_force[i]
-#endif
-
 /* Sizes of the terms of the displacements, with reactions if requested. */
 static inline void term_sizes(const step_data *step, rattle_step *now, int reactions, number *size)
 {
+#ifdef VELOCITY_FORCES
   number force[M];
   for (int i = 0; i < M; i++)
-    force[i] = FIRST_FORCE(now, i);
+    force[i] = now->force[i][0];
+#else
+  const number *force = now->first_force;
+#endif
   find_term_sizes(step, force, now->first_derivative, reactions ? now->lambda : NULL, now->inverse_mass, size);
 }
 

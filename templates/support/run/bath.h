@@ -132,12 +132,10 @@ static inline void project_on_tangents(int block, int n, const double *entries, 
 /* Computes the factors of half a step of h; returns 0 if kT < 0 or the mass matrix is not positive definite. */
 static int prepare_bath(bath_factors *bath, double t, double h, const double *q, const double *parameters)
 {
+  memset(bath, 0, sizeof *bath);
   const double temperature = (bath_terms(q, t, parameters, bath->terms), bath->terms[0]);
   const double *mass = bath->terms + 1 + M, *friction = mass + BATH_MASS_ENTRIES;
   double *w = bath->w, *v = bath->v, *turn = bath->turn;
-  memset(w, 0, sizeof bath->w);
-  memset(v, 0, sizeof bath->v);
-  memset(turn, 0, sizeof bath->turn);
   const double tau = fabs(h) / 2;
   bath->root = sqrt(tau);
   for (int b = 0, first = 0, n; b < BLOCKS; b++, w += n * n, v += n * n, turn += n * n, first += n) {

@@ -26,7 +26,7 @@ from scvi_codegen.interfaces.derivation.notation import events_text
 def derive(model_name: str, latex: bool, radicals: bool, output: str | None, html: str | None, **choices: Any) -> None:
     """Print the equations of one step of MODEL: unknowns, stage equations, end state.
 
-    Of explicit and of constrained steps also the statements that the C is generated from.
+    Of explicit and constrained steps and of heat baths also the statements that the C is generated from.
 
     --html writes a self-contained page with the whole derivation: equations of motion, trial curve, tables, equations
     with the paper's numbers, Jacobian, operation counts, and the C code next to its formulas.
