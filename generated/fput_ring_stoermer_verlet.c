@@ -136,9 +136,30 @@ static inline void describe_coordinate_arrays(const problem *arrays, coordinate_
   end = append_array(&all[0], end, size_N, 1);
 }
 
+enum { LEAPS = 2 };
+static const double KICK[2] = {0.5, 0.5};
+static const double DRIFT[2] = {1.0, 0.0};
+static const double KICK_ABSCISSA[2] = {0.0, 1.0};
+#define NO_ERROR_ESTIMATE
+enum { EQUAL_MASSES = 1 }; /* for all parameters */
+#define TOGETHER 128 /* steps that are checked at once */
+
+#define ROWS
+enum { REACH = 1, CHUNKED_ROWS = 1, FUSED = 1, FRESH = 1 };
+#define share_rows share_force_0
+
+static long long rows_of(const problem *arrays)
+{
+  const long long size_N = arrays->size[0];
+  (void)arrays;
+  return size_N;
+}
+
+#include "support/arrays/array_splitting.h"
+
 /* sum(i in N periodic, -beta*(q[i+1] - q[i])**4/4 - (q[i+1] - q[i])**2/2) */
-static void add_force_0(const problem *arrays, const lanes *restrict X, times t, double by, lanes *restrict F,
-    const window *here)
+static void add_force_0(const problem *arrays, const lanes *X, times t, double by, lanes *F, const window *here,
+    sweep *of)
 {
   const long long size_N = arrays->size[0];
   const long long start_q = 0;
@@ -163,8 +184,9 @@ static void add_force_0(const problem *arrays, const lanes *restrict X, times t,
     lanes *restrict row_0 = F + start_q + 0;
     add_ends(row_0, values[0], -1.0, part_0, common_0);
     add_ends(row_0, values[0], +1.0, part_1, common_0);
-    for (long long at = common_0.first; at < common_0.end; at++)
-      row_0[at] = row_0[at] - values[0][at - part_0.first] + values[0][at - part_1.first];
+    const addend added[] = {{values[0] + (common_0.first - part_0.first), -1.0}, {values[0] +
+        (common_0.first - part_1.first), +1.0}};
+    complete_sums(of, row_0, common_0, added, 2);
   }
 }
 
@@ -188,32 +210,11 @@ static void add_forces(const run_memory *run, const problem *arrays, const doubl
     const section tasks = share_of(run, tasks_in(&how, round));
     for (long long k = tasks.first; k < tasks.end; k++) {
       const window here = window_of(&how, round, k);
-      add_force_0(arrays, X, t, by, F, &here);
+      add_force_0(arrays, X, t, by, F, &here, NULL);
     }
     wait_at_barrier(run);
   }
 }
-
-enum { LEAPS = 2 };
-static const double KICK[2] = {0.5, 0.5};
-static const double DRIFT[2] = {1.0, 0.0};
-static const double KICK_ABSCISSA[2] = {0.0, 1.0};
-#define NO_ERROR_ESTIMATE
-enum { EQUAL_MASSES = 1 }; /* for all parameters */
-#define TOGETHER 128 /* steps that are checked at once */
-
-#define ROWS
-enum { REACH = 1, CHUNKED_ROWS = 1, BEFORE_CHUNKS = 0 };
-#define share_rows share_force_0
-
-static long long rows_of(const problem *arrays)
-{
-  const long long size_N = arrays->size[0];
-  (void)arrays;
-  return size_N;
-}
-
-#include "support/arrays/array_splitting.h"
 
 static void prepare_rows(const sweep *of, section rows)
 {
@@ -221,12 +222,12 @@ static void prepare_rows(const sweep *of, section rows)
   (void)of, (void)rows, (void)here;
 }
 
-static void add_rows(const sweep *of, section rows)
+static void add_rows(sweep *of, section rows)
 {
   window here;
   (void)of, (void)rows, (void)here;
   here = window_of_rows(share_force_0(of->run, of->arrays, of->work->n), rows);
-  add_force_0(of->arrays, of->X, of->t, of->by, of->F, &here);
+  add_force_0(of->arrays, of->X, of->t, of->by, of->F, &here, of);
 }
 
 static void complete_rows(const sweep *of, section rows)

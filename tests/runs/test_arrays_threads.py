@@ -226,6 +226,34 @@ def test_periodic_lattice_of_three_axes(method: str) -> None:
     )
 
 
+@pytest.mark.tiers(0, 1)
+@pytest.mark.parametrize("before", ["", " - sum(i in N, q[i]**4/4)"])
+@pytest.mark.parametrize("boundary", ["periodic", "free"])
+@pytest.mark.parametrize("sums", ["compensated", "plain"])
+def test_coordinates_are_continued_behind_their_last_force(sums: str, boundary: str, before: str) -> None:
+    """In chunks, ends and blocks of all sizes; two threads keep the forces of 1500 coordinates."""
+    span = "N periodic" if boundary == "periodic" else "N-1"
+    text = f"sum(i in N, q_dot[i]**2/2){before} - sum(i in {span}, (q[i+1] - q[i])**4/4 + (q[i+1] - q[i])**2/2)"
+    system = sc.LagrangianSystem.from_text(name="chain", coordinates=["q[N]"], lagrangian=text)
+    stepper = sc.compile_stepper(system, "stoermer-verlet", sums=sums)
+
+    def forces(q: Any) -> Any:
+        d = np.roll(q, -1) - q
+        pull = d**3 + d
+        pull[-1] *= boundary == "periodic"
+        return pull - np.roll(pull, 1) - q**3 * bool(before)
+
+    for count in (2, 3, 7, 8, 9, 33, 513, 1000, 1500, 2100):
+        q, v = np.random.default_rng(count).normal(size=(2, count))
+        runs = [stepper.start(q, velocity=v, h=0.02, threads=threads) for threads in (1, 2)]
+        for run in runs:
+            run.advance(50)
+        if sums == "compensated":
+            assert [np.asarray(run.p).tobytes() for run in runs] == [np.asarray(runs[0].p).tobytes()] * 2
+        for run in runs:
+            np.testing.assert_allclose(run.q, leapfrog(q, v, 0.02, 50, forces), rtol=0, atol=4e-14)
+
+
 @pytest.mark.rotated
 def test_newton_iteration_with_threads() -> None:
     """The last bits of a large step from q = 0 depend on the order in which inner products are summed."""

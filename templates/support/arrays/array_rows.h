@@ -2,10 +2,17 @@
 
 /* Kicks in one pass over the rows of lattices, the elements with the same first index. Forces couple rows at most REACH
  * apart, so that a row is continued as soon as those of the next rows are added. Blocks of rows are the tasks of the
- * forces: even ones before their odd neighbours, as in add_forces, so that sums round alike. Requires: arrays.h,
- * continue_section, CHUNK, REACH, CHUNKED_ROWS (rows are the innermost loop), BEFORE_CHUNKS (rows before the chunks of
- * values in the first block), rows_of, share_rows, describe_coordinate_arrays; add_rows, which adds the forces that
- * couple rows, prepare_rows and complete_rows, which add others before and behind. */
+ * forces: even ones before their odd neighbours, as in add_forces, so that sums round alike. FUSED: add_rows continues
+ * coordinates where it adds their last forces, in the same loop over a chunk; FRESH: the forces are 0 before. Requires:
+ * arrays.h, continue_section, CHUNK, REACH, CHUNKED_ROWS (rows are the innermost loop), rows_of, share_rows,
+ * describe_coordinate_arrays; add_rows, which adds the forces that couple rows, prepare_rows and complete_rows, which add
+ * others before and behind. */
+enum {
+  MOST_ADDENDS = 4, /* values that complete_sums adds to a coordinate */
+  ALIGNED = 4, /* numbers in a SIMD register */
+  BORDER = (REACH + ALIGNED - 1) / ALIGNED * ALIGNED /* at least REACH */
+};
+
 typedef struct {
   const run_memory *run;
   const problem *arrays;
@@ -16,10 +23,12 @@ typedef struct {
   sharing how;
   long long rows;
   coordinate_array array[COORDINATE_ARRAYS];
+  section own; /* rows that no other block changes, but for those that are continued */
 } sweep;
 
+static sharing share_rows(const run_memory *run, const problem *arrays, long long n);
 static void prepare_rows(const sweep *of, section rows);
-static void add_rows(const sweep *of, section rows);
+static void add_rows(sweep *of, section rows);
 static void complete_rows(const sweep *of, section rows);
 
 /* Forces that couple no rows, before or behind the others; then also the continuation. Rows may be beyond both ends. */
@@ -54,28 +63,53 @@ static section block_of(const sweep *of, long long block)
   return rows;
 }
 
-/* Adds the forces of a block, in parts that begin with a chunk of values, and continues its rows, but for the first and
- * the last ones. */
-static void sweep_block(const sweep *of, long long block)
+/* Adds the last values to consecutive coordinates, and continues those of this block that are behind. */
+static inline __attribute__((always_inline)) void complete_sums(sweep *of, double *F, section here, const addend *added,
+    int addends)
+{
+  double *const row = F + here.first;
+  section inside = {here.end, here.end};
+  addend moved[MOST_ADDENDS];
+  if (of && (of->then->starts || !of->then->ends || !ends_with_a_kick())) { /* else the forces are stored */
+    inside = overlap(here, of->own);
+    inside.first = (inside.first + ALIGNED - 1) / ALIGNED * ALIGNED;
+    inside.end = between(inside.first, inside.end / ALIGNED * ALIGNED, inside.end);
+  }
+  for (long long i = 0; i < between(here.first, inside.first, here.end) - here.first; i++)
+    row[i] = plus(row[i], added, addends, i);
+  for (long long i = between(here.first, inside.end, here.end) - here.first; i < here.end - here.first; i++)
+    row[i] = plus(row[i], added, addends, i);
+  if (inside.first == inside.end)
+    return;
+  const section before = {of->own.first, inside.first};
+  if (before.first < before.end)
+    continue_section(of->run, of->work, before, *of->then);
+  for (int k = 0; k < addends; k++)
+    moved[k] = (addend){added[k].values + (inside.first - here.first), added[k].sign};
+  continue_part(of->run, of->work, inside, *of->then, moved, addends, FRESH);
+  of->own.first = inside.end;
+}
+
+/* Adds the forces of a block, in parts, and continues its rows, but for the first and the last ones. */
+static void sweep_block(sweep *of, long long block)
 {
   const section rows = block_of(of, block);
   const long long inner = (of->array[0].end - of->array[0].first) / of->rows;
-  const long long few = CHUNKED_ROWS ? CHUNK : SECTION / (inner + 1) + 1;
-  long long end = part_of(of->how.of, block, of->how.blocks).first + (block == 0) * BEFORE_CHUNKS;
-  section done = {rows.first + REACH, rows.first + REACH};
-  for (long long first = rows.first; first < rows.end; first = end) {
-    end = end + few < rows.end ? end + few : rows.end;
+  const long long few = CHUNKED_ROWS ? rows.end - rows.first : SECTION / (inner + 1) + 1;
+  of->own = (section){rows.first + REACH, rows.end - REACH};
+  for (long long first = rows.first, end; first < rows.end; first = end) {
+    end = first + few < rows.end ? first + few : rows.end;
     const section here = {first, end};
     add_rows(of, here);
-    done.end = end - REACH;
+    const section done = {of->own.first, end - REACH};
     if (done.end > done.first) {
       treat_rows(of, done, 1);
-      done.first = done.end;
+      of->own.first = done.end;
     }
   }
 }
 
-static void sweep_even(const sweep *of, long long block)
+static void sweep_even(sweep *of, long long block)
 {
   const section rows = block_of(of, block), all = {rows.first - REACH, rows.end + REACH};
   treat_rows(of, all, 0);
@@ -83,7 +117,7 @@ static void sweep_even(const sweep *of, long long block)
 }
 
 /* An odd block, whose neighbours are done, and the rows between it and these. */
-static void sweep_odd(const sweep *of, long long block)
+static void sweep_odd(sweep *of, long long block)
 {
   const section rows = block_of(of, block), inside = {rows.first + REACH, rows.end - REACH};
   const section before = {rows.first - REACH, rows.first + REACH}, behind = {rows.end - REACH, rows.end + REACH};
@@ -91,6 +125,19 @@ static void sweep_odd(const sweep *of, long long block)
   sweep_block(of, block);
   treat_rows(of, before, 1);
   treat_rows(of, behind, 1);
+}
+
+/* All rows as one block, whose ends are last. */
+static int sweep_alone(sweep *of)
+{
+  const section all = {0, of->rows}, first = {0, BORDER};
+  of->own = (section){BORDER, of->rows - REACH};
+  prepare_rows(of, all);
+  add_rows(of, all);
+  const section last = {of->own.first, of->rows};
+  continue_section(of->run, of->work, last, *of->then);
+  continue_section(of->run, of->work, first, *of->then);
+  return 1;
 }
 
 /* Adds `by` times the forces at X to F, and continues all coordinates; returns 0 if there are too few rows. */
@@ -108,6 +155,8 @@ static int kick_by_rows(const run_memory *run, const problem *arrays, const work
       .how = share_rows(run, arrays, work->n),
       .rows = rows_of(arrays)};
   const long long blocks = of.how.blocks;
+  if (FUSED && blocks == 1 && threads_of(run) == 1 && of.rows >= 2 * BORDER)
+    return sweep_alone(&of);
   if (blocks == 1 || (of.how.of.end - of.how.of.first) / blocks < 2 * REACH)
     return 0;
   describe_coordinate_arrays(arrays, of.array);

@@ -7,8 +7,9 @@
  * step. Within a step the increments are in the memory of the compensation terms. Infinite and undefined numbers remain
  * in a state, so that many steps are checked at once; if one fails, they are repeated one by one. With PLAIN_SUMS
  * increments are added to the state at once, and their rounding errors are dropped; the kicks at the end of a step and
- * at the start of the next one are one where steps are checked together. Requires: arrays.h, add_forces, LEAPS,
- * TOGETHER, EQUAL_MASSES, the tables; with ROWS array_rows.h. */
+ * at the start of the next one are one where steps are checked together. Requires: arrays.h, LEAPS, TOGETHER,
+ * EQUAL_MASSES, the tables, later add_forces; with ROWS array_rows.h. */
+static void add_forces(const run_memory *run, const problem *arrays, const double *X, double t, double by, double *F);
 
 /* Workspace: positions of the next kick, forces at the end of a step; the state before steps that are checked. */
 typedef struct {
@@ -49,76 +50,104 @@ static inline int ends_with_a_kick(void)
   return KICK[0] != 0.0 && KICK[LEAPS - 1] != 0.0 && DRIFT[LEAPS - 1] == 0.0;
 }
 
-/* Continues `count` coordinates. Forces that were used in both steps become 0 for the next ones. */
+/* Values that are added to consecutive coordinates, with a sign. */
+typedef struct {
+  const double *values;
+  double sign;
+} addend;
+
+static inline __attribute__((always_inline)) double plus(double x, const addend *added, int addends, long long i)
+{
+  for (int k = 0; k < addends; k++)
+    x += added[k].sign * added[k].values[i];
+  return x;
+}
+
+/* Continues `count` coordinates behind the last forces, `addends` values of each. Forces that were used in both steps
+ * become 0 for the next ones, as they are before if `fresh`. */
 static inline __attribute__((always_inline)) void continue_coordinates(double *restrict q, double *restrict p,
     double *restrict dq, double *restrict dp, double *restrict X, double *restrict F,
-    const double *restrict inverse_mass, long long count, continuation by)
+    const double *restrict inverse_mass, long long count, continuation by, const addend *added, int addends, int fresh)
 {
+  const int forces = by.starts || (by.ends && ends_with_a_kick()); /* F, else increments that have them */
 #ifdef PLAIN_SUMS
-  (void)dq, (void)dp, (void)X;
+  (void)dq, (void)dp, (void)X, (void)fresh;
   for (long long i = 0; i < count; i++) {
-    if ((by.ends && ends_with_a_kick()) || by.starts)
+    if (forces)
       p[i] += (by.starts ? by.start : by.end) * F[i];
+    else if (addends)
+      p[i] = plus(p[i], added, addends, i);
     if (by.starts)
       F[i] = 0.0;
     if (by.moves)
       q[i] += by.drift * (inverse_mass[EQUAL_MASSES ? 0 : i] * p[i]);
   }
 #else
-  for (long long i = 0; i < count; i++) {
-    double at = q[i], moving = p[i], more_q = dq[i], more_p = dp[i];
+  for (long long i = 0; i < count && (by.ends || by.starts || addends); i++) {
+    double moving = p[i], more_p = forces ? dp[i] : plus(dp[i], added, addends, i);
+    double force = forces && !fresh ? plus(F[i], added, addends, i) : 0.0;
+    if (forces && fresh)
+      force = plus(added[0].sign * added[0].values[i], added + 1, addends - 1, i);
     if (by.ends) {
-      if (ends_with_a_kick())
-        more_p += by.end * F[i];
+      if (forces)
+        more_p += by.end * force;
       add_increment(&moving, &more_p);
       p[i] = moving;
     }
     if (by.starts) {
-      more_p += by.start * F[i];
-      F[i] = 0.0;
+      more_p += by.start * force;
+      if (!fresh)
+        F[i] = 0.0;
     }
-    if (by.ends || by.starts)
-      dp[i] = more_p;
-    if (by.moves) {
-      more_q += by.drift * (inverse_mass[EQUAL_MASSES ? 0 : i] * (moving + more_p));
-      if (by.arrives) {
-        add_increment(&at, &more_q);
-        q[i] = at;
-      } else
-        X[i] = at + more_q;
-      dq[i] = more_q;
-    }
+    dp[i] = more_p;
+  }
+  for (long long i = 0; i < count && by.moves; i++) { /* apart, so that sums of more elements overlap in time */
+    double at = q[i], more_q = dq[i] + by.drift * (inverse_mass[EQUAL_MASSES ? 0 : i] * (p[i] + dp[i]));
+    if (by.arrives) {
+      add_increment(&at, &more_q);
+      q[i] = at;
+    } else
+      X[i] = at + more_q;
+    dq[i] = more_q;
   }
 #endif
 }
 
-/* Continues the coordinates of a section; the flags are constants of each loop. */
-static void continue_section(const run_memory *run, const work_arrays *work, section here, continuation by)
+/* Continues up to SECTION coordinates; the flags are constants of each loop. */
+static inline __attribute__((always_inline)) void continue_part(const run_memory *run, const work_arrays *work,
+    section here, continuation by, const addend *added, int addends, int fresh)
 {
-  for (long long first = here.first, count; first < here.end; first += count) {
-    const double *masses = run->inverse_mass + (work->equal_masses ? 0 : first);
-    count = here.end - first < SECTION ? here.end - first : SECTION;
+  const long long first = here.first;
+  const double *masses = run->inverse_mass + (work->equal_masses ? 0 : first);
 #define CONTINUE(ends, starts, moves, arrives)                                                                      \
   continue_coordinates(run->q + first, run->p + first, run->carry_q + first, run->carry_p + first, work->X + first, \
-      work->F + first, masses, count, (continuation){ends, starts, moves, arrives, by.end, by.start, by.drift})
-    if ((LEAPS > 2 || !ends_with_a_kick()) && by.moves && !by.arrives) {
-      if (by.ends)
-        CONTINUE(1, 1, 1, 0);
-      else if (by.starts)
-        CONTINUE(0, 1, 1, 0);
-      else
-        CONTINUE(0, 0, 1, 0);
-    } else if (by.ends && by.starts)
-      CONTINUE(1, 1, 1, 1);
-    else if (by.ends && by.moves)
-      CONTINUE(1, 0, 1, 1);
-    else if (by.ends)
-      CONTINUE(1, 0, 0, 0);
+      work->F + first, masses, here.end - first,                                                                    \
+      (continuation){ends, starts, moves, arrives, by.end, by.start, by.drift}, added, addends, fresh)
+  if ((LEAPS > 2 || !ends_with_a_kick()) && by.moves && !by.arrives) {
+    if (by.ends)
+      CONTINUE(1, 1, 1, 0);
     else if (by.starts)
-      CONTINUE(0, 1, 1, 1);
+      CONTINUE(0, 1, 1, 0);
     else
-      CONTINUE(0, 0, 1, 1);
+      CONTINUE(0, 0, 1, 0);
+  } else if (by.ends && by.starts)
+    CONTINUE(1, 1, 1, 1);
+  else if (by.ends && by.moves)
+    CONTINUE(1, 0, 1, 1);
+  else if (by.ends)
+    CONTINUE(1, 0, 0, 0);
+  else if (by.starts)
+    CONTINUE(0, 1, 1, 1);
+  else
+    CONTINUE(0, 0, 1, 1);
 #undef CONTINUE
+}
+
+static void continue_section(const run_memory *run, const work_arrays *work, section here, continuation by)
+{
+  for (section part = here; part.first < here.end; part.first = part.end) {
+    part.end = here.end - part.first < SECTION ? here.end : part.first + SECTION;
+    continue_part(run, work, part, by, NULL, 0, 0);
   }
 }
 

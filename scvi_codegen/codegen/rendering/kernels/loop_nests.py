@@ -161,6 +161,7 @@ class Nest:
         source: array that they are read from; empty if there are none.
         chunked: whether all values of a part are computed before any is added, in loops without conflicts, which a
             compiler vectorises.
+        fused: whether coordinates are continued where the last values are added (complete_sums).
         sharing: how threads share it; without sharing, one task covers all.
     """
 
@@ -172,10 +173,11 @@ class Nest:
         source: str,
         *,
         chunked: bool = False,
+        fused: bool = False,
         sharing: Sharing = Sharing.ALONE,
     ) -> None:
         self.layout, self.rolled, self.scalar, self.source = layout, rolled, scalar, source
-        self.chunked, self.sharing = chunked, sharing
+        self.chunked, self.fused, self.sharing = chunked, fused, sharing
         self.levels = {loop.index: depth for depth, loop in enumerate(rolled.loops, 1)}
         self.loops = {loop.index: loop for loop in rolled.loops}
         self.scalars = len(layout.parameters)
@@ -287,13 +289,15 @@ class Nest:
 
         At both ends they are added target by target, so that the sums of an element have the order of separate loops.
         """
-        lines, ends, row, value = [], [], "", ""
+        lines, ends, addends, row, value = [], [], [], "", ""
         for k in targets:
             access = self.rolled.writes[k]
             shift = self.index(access.places[-1]).removeprefix(f"index_{loop.index}")
             lines.append(f"const section part_{k} = {{begin{shift}, end{shift}}};")
             sign, number = self.signed[k]
             value += f" {sign} values[{number}][at - part_{k}.first]"
+            moved = f"(common_{targets[0]}.first - part_{k}.first)"
+            addends.append(f"{{values[{number}] + {moved}, {sign}1.0}}")
             ends.append(f"add_ends(row_{targets[0]}, values[{number}], {sign}1.0, part_{k}, common_{targets[0]});")
             row = self.place_of(replace(access, places=(*access.places[:-1], Place())))
         common = f"part_{targets[0]}"
@@ -302,6 +306,9 @@ class Nest:
         lines.append(f"const section common_{targets[0]} = {common};")
         lines.append(f"lanes *restrict row_{targets[0]} = F + {row};")
         lines += ends
+        if self.fused:
+            lines.append(f"const addend added[] = {{{', '.join(addends)}}};")
+            return [*lines, f"complete_sums(of, row_{targets[0]}, common_{targets[0]}, added, {len(targets)});"]
         head = f"for (long long at = common_{targets[0]}.first; at < common_{targets[0]}.end; at++)"
         return [*lines, head, f"  row_{targets[0]}[at] = row_{targets[0]}[at]{value};"]
 

@@ -39,11 +39,16 @@ def _reach(layout: Layout, rolled: RolledKernel) -> int | None:
     return max(abs(row.base.number) for row in rows) if along and whole else None
 
 
-def rows_text(layout: Layout, forces: Sequence[RolledKernel]) -> tuple[str, str] | None:
+MOST_ADDENDS = 4
+"""Largest number of values that are added to an element in the loop that continues it (array_rows.h)."""
+
+
+def rows_text(layout: Layout, forces: Sequence[RolledKernel]) -> tuple[str, str, str] | None:
     """Return constants and functions of forces row by row, for templates/support/arrays/array_rows.h.
 
-    ``None`` unless all coordinates have the same first axis, and at most one term group couples rows, at a distance.
-    In other loops over rows functions of a library must not occur, since vectors of them round differently.
+    Then the name of the group that continues coordinates itself, or nothing. ``None`` unless all coordinates have the
+    same first axis, and at most one term group couples rows, at a distance. In other loops over rows
+    functions of a library must not occur, since vectors of them round differently.
     """
     axes = {array.axes[:1] for array in layout.coordinates}
     reaches = [reach for rolled in forces if (reach := _reach(layout, rolled)) is not None]
@@ -54,29 +59,29 @@ def rows_text(layout: Layout, forces: Sequence[RolledKernel]) -> tuple[str, str]
     others = [rolled.kernel for rolled in (*before, *behind) if len(rolled.loops) == 1]
     if any(sharing_of(rolled) is not Sharing.IN_TURN for rolled in forces) or loop_functions(others):
         return None
-    chunked, first = len(coupling.loops) == 1, min(access.places[0].base.number for access in coupling.reads)
-    constants = {
-        "REACH": reaches[lead],
-        "CHUNKED_ROWS": int(chunked),
-        "BEFORE_CHUNKS": -min(0, first) if chunked and coupling.loops[0].periodic else 0,
-    }
+    # in a lattice of one axis the terms behind an element of all targets neither read nor change it
+    writes, chunked = coupling.writes, len(coupling.loops) == 1
+    fused = chunked and not behind and len(layout.coordinates) == 1 and {*coupling.reads} <= {*writes}
+    fused &= 1 < len(writes) <= MOST_ADDENDS and all(len(target.places) == 1 for target in writes)
+    constants = {"REACH": reaches[lead], "CHUNKED_ROWS": int(chunked), "FUSED": int(fused), "FRESH": int(not before)}
     rows = function_of_sizes(layout, "static long long rows_of(const problem *arrays)", [f"return {size_text(axis)};"])
     constants_text = f"enum {{ {', '.join(f'{name} = {number}' for name, number in constants.items())} }};"
     parts = (("prepare", before), ("add", (coupling,)), ("complete", behind))
     return (
         f"{constants_text}\n#define share_rows share_{coupling.kernel.name}\n\n{rows}",
-        "\n\n".join(_part(*part) for part in parts),
+        "\n\n".join(_part(*part, fused=fused and name == "add") for part in parts for name in part[:1]),
+        coupling.kernel.name if fused else "",
     )
 
 
-def _part(name: str, forces: Sequence[RolledKernel]) -> str:
+def _part(name: str, forces: Sequence[RolledKernel], *, fused: bool) -> str:
     """Return the function of some term groups."""
-    head = f"static void {name}_rows(const sweep *of, section rows)"
+    head = f"static void {name}_rows({'' if name == 'add' else 'const '}sweep *of, section rows)"
     lines = [head, "{", "  window here;", "  (void)of, (void)rows, (void)here;"]
     for rolled in forces:
         group = rolled.kernel.name
         lines.append(f"  here = window_of_rows(share_{group}(of->run, of->arrays, of->work->n), rows);")
-        lines.append(f"  add_{group}(of->arrays, of->X, of->t, of->by, of->F, &here);")
+        lines.append(f"  add_{group}(of->arrays, of->X, of->t, of->by, of->F, &here{', of' if fused else ''});")
     return "\n".join([*lines, "}"])
 
 
@@ -100,6 +105,7 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
     """Return the template's context for the program of a system of arrays."""
     loops, constrained, pairs = program.loops, program.loops.constrained, _circulants(program)
     sums, fixed_point, layout = _convolutions(program), program.fixed_point, program.layout
+    rows = rows_text(layout, loops.forces) if program.splitting and not (pairs or sums) else None
     lengths = [*map(product_text, layout.fields)]
     terms = [(rolled, rolled.scalar) for rolled in loops.forces if rolled.scalar]
     terms += [(rolled, rolled.kernel) for rolled in loops.constants]
@@ -114,7 +120,7 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
         "program": program,
         "most_threads": 1 if constrained else MOST_THREADS,
         "cut": is_divided((*scalars, *(rolled.kernel for rolled in loops.applied))),
-        "forces": [_force_text(program, rolled) for rolled in loops.applied],
+        "forces": [_force_text(program, rolled, rows[2] if rows else "") for rolled in loops.applied],
         "energies": [_energy_text(program, rolled, scalar, declared=rolled in pairs) for rolled, scalar in terms],
         "masses": [_mass_text(program, rolled) for rolled in constants],
         "lists": [(name, _list_text(program, count, lengths)) for name, count, lengths in loops.neighbours],
@@ -150,7 +156,7 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
         ),
         "maps": describing_function(layout, "maps", "momentum_map", [*_map_texts(program)]),
         "hot": "static",
-        "rows": rows_text(program.layout, loops.forces) if program.splitting and not (pairs or sums) else None,
+        "rows": rows,
         "waves": _lattice_context(program) if _on_lattices(program) else None,
         "arrays": function_of_sizes(
             layout,
@@ -256,11 +262,11 @@ def _step_work(program: ArrayProgram) -> int:
     return (iteration + linear) * program.fixed_point.lanes + waves + STEP_VECTORS
 
 
-def _force_text(program: ArrayProgram, rolled: RolledKernel) -> str:
+def _force_text(program: ArrayProgram, rolled: RolledKernel, fused_group: str) -> str:
     """Return a function that adds to the forces; for an explicit method, with a factor."""
-    explicit = program.fixed_point is None
+    explicit, fused = program.fixed_point is None, rolled.kernel.name == fused_group
     chunked, sharing = explicit and bool(rolled.loops), sharing_of(rolled)
-    nest = Nest(program.layout, rolled, "lanes", "X", chunked=chunked, sharing=sharing)
+    nest = Nest(program.layout, rolled, "lanes", "X", chunked=chunked, fused=fused, sharing=sharing)
     slots = range(len(rolled.writes))
     inner = [nest.is_innermost(target) for target in rolled.writes]
 
@@ -284,15 +290,10 @@ def _force_text(program: ArrayProgram, rolled: RolledKernel) -> str:
     zero = [] if all(inner) else ["const lanes zero = {0};"]
     factor = ["double by"] if explicit else []
     direction = [f"const lanes *{DIRECTION}"] if rolled.along else []
-    arguments = [
-        "const problem *arrays",
-        "const lanes *restrict X",
-        "times t",
-        *direction,
-        *factor,
-        "lanes *restrict F",
-    ]
+    alone = "" if fused else "restrict "  # X and F may be the state that is continued
+    arguments = ["const problem *arrays", f"const lanes *{alone}X", "times t", *direction, *factor, f"lanes *{alone}F"]
     arguments += ["const window *here", *(["const images *sums"] if _has_sums(rolled) else [])]
+    arguments += ["sweep *of"] if fused else []
     if sharing is Sharing.BY_PLACES:
         zero.append("const int whole = here->whole;")
     body = ["(void)arrays, (void)here;", *zero, *lines]
