@@ -65,22 +65,25 @@ def test_a_single_file_computes_the_same_bits(tmp_path):
 
 
 @pytest.mark.rotated
-@pytest.mark.parametrize(("method", "lines"), [("stoermer-verlet", 250), ("composition:4", 260), ("svi:2", 3000)])
-def test_the_source_is_the_step_and_its_run(method, lines, tmp_path):
+@pytest.mark.parametrize(
+    ("name", "method", "lines"),
+    [("kepler", "stoermer-verlet", 250), ("kepler", "composition:4", 260), ("double-pendulum", "svi:2", 3000)],
+)
+def test_the_source_is_the_step_and_its_run(name, method, lines, tmp_path):
     """The source ends with fixed steps; it and the files that it includes define what the header declares."""
-    model = model_of("kepler", method=sc.as_method(method), h=0.01)
-    folder = sc.generate_package(model, tmp_path / "kepler_run")
-    code = (folder / "kepler_run.c").read_text()
+    model = model_of(name, method=sc.as_method(method), h=0.01)
+    folder = sc.generate_package(model, tmp_path / "own_run")
+    code = (folder / "own_run.c").read_text()
     assert code.count("\n") <= lines
-    assert code.index("solve(") < code.index("kepler_run_advance(") < code.index('#include "kepler_run_mechanics.h"')
-    assert "kepler_run_energy(" not in code
+    assert code.index("solve(") < code.index("own_run_advance(") < code.index('#include "own_run_mechanics.h"')
+    assert "own_run_energy(" not in code
     assert "advance_to(" not in code
-    declared = re.findall(r"^\w[\w *]*?\b(kepler_run_\w+)\(", (folder / "kepler_run.h").read_text(), re.MULTILINE)
+    declared = re.findall(r"^\w[\w *]*?\b(own_run_\w+)\(", (folder / "own_run.h").read_text(), re.MULTILINE)
     assert len(declared) >= 10
     (folder / "all.c").write_text(
-        f'#include "kepler_run.h"\nint main(void) {{ return !({" && ".join(f"(long){name}" for name in declared)}); }}'
+        f'#include "own_run.h"\nint main(void) {{ return !({" && ".join(f"(long){name}" for name in declared)}); }}'
     )
-    command = [needs("gcc"), "-std=c99", "-Werror", "all.c", "kepler_run.c", "-lm", "-o", "all"]
+    command = [needs("gcc"), "-std=c99", "-Werror", "all.c", "own_run.c", "-lm", "-o", "all"]
     subprocess.run(command, cwd=folder, check=True)
     subprocess.run([folder / "all"], check=True)
     ours, other = sc.load_package(folder), sc.compile_stepper(model.system, model.method)
@@ -89,7 +92,7 @@ def test_the_source_is_the_step_and_its_run(method, lines, tmp_path):
         lambda of: of.step(q, p, 0.1),
         lambda of: of.velocity(q, of.momentum(q, p)),
         lambda of: of.energy(q, p),
-        lambda of: of.momentum_maps(q, p),
+        lambda of: of.momentum_maps(q, p) if name == "kepler" else 0,
         lambda of: of.integrate(q, p, h=0.1, steps=50).p,
         lambda of: of.integrate(q, p, t_end=2.0).q[-1] if method == "svi:2" else 0,
         lambda of: of.discrete_lagrangian(q, q + 0.1, 0.1) if method != "composition:4" else 0,

@@ -108,7 +108,8 @@ def readable(code: str) -> dict[str, str]:
 def _without_aliases(code: str) -> str:
     """Return a source with other names, or its argument, in place of each macro that is nothing else."""
     for name, body, _ in ALIAS.findall(code):
-        if len(re.findall(rf"^#.*\b{name}\b", code, re.MULTILINE)) == 1:  # no condition, and no other definition
+        mentions = rf"^#(?:define {name}\b|(?:undef|if|ifn?def|elif) .*\b{name}\b)"
+        if len(re.findall(mentions, code, re.MULTILINE)) == 1:  # no condition, and no other definition
             used = rf"(?<!#define )\b{name}\b"
             code = re.sub(used, body, code) if body else re.sub(rf"{used}\(([^()]*)\)", r"\1", code)
     return code
