@@ -286,6 +286,15 @@ def test_adaptive_steps_keep_the_tolerance_at_powers_that_are_not_whole(method, 
     assert abs(start.q[-1, 0] - 0.25) < bound
 
 
+def test_a_ball_that_returns_to_a_kink_in_its_first_step_does_not_rest_there():
+    """It falls with x'' = -3/2 from x = 0, v to -v at t = 4v/3, and then moves by x'' = 1/2 - x."""
+    ball = lagrange("ball", "x", "x_dot**2/2 - abs(x) - x/2 - x**2*unit_step(-x)/2")
+    run, t = sc.compile_stepper(ball, "svi:8").integrate([0.0], [1.0], t_end=2.0), 2.0 / 3.0
+    expected = 4 * np.cos(t) / 3 - 5 * np.sin(t) / 3
+    assert np.abs(run.q[:2]).max() < 1e-15
+    assert run.tangent([0.0, 1.0])[-1, 0] == pytest.approx(expected, abs=1e-12)
+
+
 @pytest.mark.parametrize("constraint", ["y = x**2/4", "y = positive_part(x)**2 + x**2/4"])
 def test_derivatives_of_rest_on_a_constraint(constraint):
     """At rest momenta are rounding of constraint forces; at a kink the derivatives are undefined, by name."""

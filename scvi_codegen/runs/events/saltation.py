@@ -63,6 +63,9 @@ CONTINUOUS = 1e-9
 """Largest difference of the rates of both sides of a kink that is rounding: the flow has no jump there."""
 AT_KINK = 1e-9
 """Part of the distance from a kink at the start of an iteration below which its end is at the kink."""
+SOON, LEAVES = 1e-6, 1e-4
+"""Part of a step by which states move straight on, and change of u by a whole one, relative to other values of u, by
+which a state leaves a kink, as a ball that returns to it at the end of its first step."""
 BEYOND = 2.0**1000
 """Mode of a side, beyond all values of u."""
 WEIGHTS = np.array([1.0, -9.0, 45.0]) / 60.0
@@ -131,11 +134,16 @@ def check_sides(stepper: Integrator, states: Array, t: Sequence[float], h: float
     if not any(isinstance(event, Kink) for event in stepper.searched):
         return
     positions, momenta = np.split(states, 2, axis=1)
-    at = zip(positions, momenta, t, strict=True)
+    at, soon = [*zip(positions, momenta, t, strict=True)], SOON * h
     before, *at_rest = (abs(_event_values(stepper, q, p, time, parameters)) for q, p, time in at)
+    moved = ((q + soon * stepper.velocity(q, p, time, parameters), p, time + soon) for q, p, time in at[1:])
+    rates = np.max([abs(_event_values(stepper, *state, parameters)) for state in moved], axis=0) / SOON
     after, q, p = np.max(at_rest, axis=0), positions[-1], momenta[-1]
     for kink in stepper.searched:
-        if isinstance(kink, Kink) and after[n := _number(stepper, kink)] <= AT_KINK * before[n]:
+        if not isinstance(kink, Kink):
+            continue
+        n = _number(stepper, kink)
+        if after[n] <= AT_KINK * before[n] and rates[n] <= LEAVES * before[n]:
             column = np.arange(len(parameters)) == stepper.interface.parameters.index(kink.mode)
             sides = (np.where(column, side, parameters) for side in (-BEYOND, BEYOND))
             below, above = (stepper.jacobian(q, p, h, t[-1], at) for at in sides)

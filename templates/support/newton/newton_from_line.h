@@ -19,6 +19,7 @@ static int line_from(const step_data *step, newton_data *data)
  * at one size to those at a larger one, in few iterations each. */
 /* Iterations to a root near the initial guess: with frozen factors multipliers converge after positions. */
 #define NEARBY_ITERATIONS (SITES > M ? 12 : 8)
+#define CONTINUED_ITERATIONS 12 /* from the stages at a smaller size: with frozen factors convergence is linear */
 #define LEAST_ADVANCE REAL(0.00390625) /* of the step size: the branch ends, or turns back */
 
 /* Follows the branch from the stages at the line to those at step->h, with the results of newton. Returns
@@ -35,7 +36,7 @@ static SELDOM int follow_branch(const step_data *step, newton_data *data, real *
     part.h = reached + advance < 1 ? (reached + advance) * step->h : step->h;
     *keep = 0;
     status = newton(&part, data, NULL, NULL, dp, keep, options, report);
-    if (status == OK && report->iterations - before <= NEARBY_ITERATIONS) {
+    if (status == OK && report->iterations - before <= CONTINUED_ITERATIONS) {
       memcpy(z, data->z, sizeof z);
       reached += advance;
       advance = 2 * advance < 1 - reached ? 2 * advance : 1 - reached;
