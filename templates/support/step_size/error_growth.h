@@ -22,11 +22,11 @@
 #ifdef ENERGY_CONSERVED
 #define LESS 1.0
 #define KNOWN(growth) ((growth) >= LARGEST_GROWTH)
-#define START(x, change) (x)
+#define INITIAL(x, change) (x)
 #else
 #define LESS 0.0016 /* no projection reduces the error */
 #define KNOWN(growth) (fabs(growth) >= LARGEST_GROWTH) /* damping reduces errors */
-#define START(x, change) ((x) + (change)) /* motions often start at rest at the origin */
+#define INITIAL(x, change) ((x) + (change)) /* motions often start at rest at the origin */
 #endif
 
 /* Iteration k ends if its change of h^2 dq'' leaves errors that are small beside the vector, by squares of both: where
@@ -341,11 +341,11 @@ static __attribute__((noinline)) void measure_growth(run_memory *run, const step
 #endif
     for (int i = 0; i < M; i++) {
       run->growth_start[i] = step->q0[i];
-      run->tangent[i][0] = START(step->q0[i], dq[i]) * cos(i);
+      run->tangent[i][0] = INITIAL(step->q0[i], dq[i]) * cos(i);
 #ifdef VARIABLE_ACCELERATIONS
-      run->tangent[i][1] = START(step->h * at_start(V, i), dq[i]) * cos(i + 1);
+      run->tangent[i][1] = INITIAL(step->h * at_start(V, i), dq[i]) * cos(i + 1);
 #else
-      run->tangent[i][1] = START(step->h * data->inverse_mass[i] * step->p0[i], dq[i]) * cos(i + 1);
+      run->tangent[i][1] = INITIAL(step->h * data->inverse_mass[i] * step->p0[i], dq[i]) * cos(i + 1);
 #endif
     }
   }
