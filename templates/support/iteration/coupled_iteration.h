@@ -11,6 +11,9 @@
 /* The mass matrices are those of the first of MASS_AGE iterations, which is at extrapolated points: their errors are
  * small and affect only the convergence rate. Requires: the kernel value_lanes. */
 enum { MASS_AGE = 16 };
+#ifndef PROJECTED
+#define COSTLY_POINTS /* their evaluation takes longer than a table of the predictor */
+#endif
 #include "secants.h"
 #endif
 

@@ -55,6 +55,7 @@ step_control NAME(default_step_control)(void)
 #define HOT static
 #define AMPLIFIED 1e-14 /* last update beyond which unknowns do not resolve errors in two words */
 #define SHORT_STEPS_FAIL 0
+#define LEVELS_OUTSIDE 0
 #define LEVELS_INSIDE 0 /* no predictor from a rejected step */
 
 static inline real smaller(real a, real b)
@@ -90,20 +91,48 @@ static real attempt(run_memory *run, step_data *step, const solver_data *data, i
 #define LEVELS_INSIDE INSIDE
 #endif
 #define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */
+#ifdef COSTLY_POINTS
+#define LEVELS_OUTSIDE MOST_UP /* by which the curve of a pilot is extrapolated */
+#else
+#define LEVELS_OUTSIDE 0
+#endif
+
+#ifdef COSTLY_POINTS
+/* Table of the last step of a run, whose size is not on the grid, from the curve of the step before; or, if inside < 0,
+ * of a trial in the search for the first step, from that of one that was shorter by -inside levels. Returns 0 without a
+ * curve. */
+static SELDOM int tables_off_grid(const run_memory *run, const step_data *step, int inside, lanes *table)
+{
+  const int begins_there = inside < 0;
+  const long long level = run->grid_level + (begins_there ? inside : -run->change);
+  if (!begins_there && run->guess <= 0)
+    return 0;
+  tabulate(begins_there ? 0.0 : 1.0, fabs(step->h) / size_of_level(level), table);
+  return 1;
+}
+#endif
 
 /* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
- * failed. afresh: without the predictor; inside: levels above this one of a rejected step, whose curve is stored, or 0;
- * rough: 1 without low words. */
+ * failed. afresh: without the predictor of the grid; inside: levels above this one of a rejected step, or minus those
+ * below of a pilot, whose curve is stored, or 0; rough: 1 without low words. */
 static inline __attribute__((always_inline)) double attempt_at(run_memory *run, step_data *step,
     const solver_data *data, int afresh, int inside, long long *guess, double *dq, double *dp,
     const error_limits *limits, double least, const solver_options *options, solver_report *report, int rough)
 {
   struct predictor_tables_of tables = {NULL, NULL, NULL};
   int status;
+#ifdef COSTLY_POINTS
+  lanes table[POINTS * GROUPS];
+#endif
   step->tables = &tables;
   if (inside > 0) {
     tables.alone = PREDICTOR_INSIDE[inside - 1];
     *guess = 1;
+#ifdef COSTLY_POINTS
+  } else if (afresh || inside < 0) {
+    tables.alone = table;
+    *guess = tables_off_grid(run, step, inside, table);
+#endif
   } else
     *guess = afresh || run->guess < 0 || !choose_tables(run, &tables) ? 0 : run->guess;
 #ifdef NEWTON_KRYLOV
@@ -115,7 +144,7 @@ static inline __attribute__((always_inline)) double attempt_at(run_memory *run, 
 #endif
   (void)rough;
   step->tables = NULL;
-  if (inside > 0) /* the step before is no longer stored */
+  if (inside != 0) /* the step before is no longer stored */
     *guess = 1;
   if (status != OK)
     return INFINITY;
@@ -192,7 +221,8 @@ typedef struct {
   real length; /* step size; 0 before the first trial */
   real pilot; /* that of the largest trial so far, in the search for the first step, that was solved */
   int last; /* 1 if the step ends at t_end */
-  int inside; /* levels above this one of a rejected step, whose curve is stored; 0: none */
+  int inside; /* levels above this one of a rejected step, whose curve is stored, or minus those below of a pilot; 0:
+               * none */
 #ifdef RATTLE
   int failures; /* trials of the step that failed */
 #endif
@@ -363,6 +393,11 @@ static SELDOM int levels_of_first(const trial *now, real h, real span)
 static inline void try_pilot(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   try_step(run, now, 0, options, report);
+  if (now->inside < 0) {
+    now->inside = 0;
+    if (!(now->error < INFINITY))
+      try_step(run, now, 0, options, report);
+  }
   if (now->error < INFINITY && now->length > now->pilot) {
     now->pilot = now->length;
     begin_motion(run);
@@ -430,6 +465,7 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
     shorter = now->error;
     memcpy(v, run->largest_v, sizeof v);
     run->grid_level += up;
+    now->inside = up <= LEVELS_OUTSIDE && now->error < INFINITY ? -up : 0;
     if (up > 0)
       try_pilot(run, now, options, report);
   }
