@@ -5,8 +5,8 @@
  * forces: even ones before their odd neighbours, as in add_forces, so that sums round alike. FUSED: add_rows continues
  * coordinates where it adds their last forces, in the same loop over a chunk; FRESH: the forces are 0 before. Requires:
  * arrays.h, continue_section, CHUNK, REACH, CHUNKED_ROWS (rows are the innermost loop), rows_of, share_rows,
- * describe_coordinate_arrays; add_rows, which adds the forces that couple rows, prepare_rows and complete_rows, which add
- * others before and behind. */
+ * describe_coordinate_arrays; add_rows, which adds the forces that couple rows, prepare_rows and complete_rows, which
+ * add others before and behind. */
 enum {
   MOST_ADDENDS = 4, /* values that complete_sums adds to a coordinate */
   ALIGNED = 4, /* numbers in a SIMD register */
