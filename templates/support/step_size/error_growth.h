@@ -4,14 +4,14 @@
  * distance from the start and the largest velocity, which depend neither on the origin nor on a gauge. It solves the
  * variational equations along each accepted step,
  *   dq'' = F_q dq / m,      or      L_vv dq'' = -E_q dq - E_v dv   (VARIABLE_ACCELERATIONS),
- * with E(q, v, a) the Euler-Lagrange residual at knots c_n h, which are Gauss points, about half as many as those of the
- * step; derivatives there are evaluated in SIMD lanes. The collocation equations
+ * with E(q, v, a) the Euler-Lagrange residual at knots c_n h, which are Gauss points, about half as many as those of
+ * the step; derivatives there are evaluated in SIMD lanes. The collocation equations
  *   dq_n = dq + c_n h dv + h^2 sum_j P_nj dq''_j,      dv_n = dv + h sum_j Q_nj dq''_j
  * are solved by Picard iterations (Hairer, Norsett & Wanner, Solving ODEs I, sec. I.8) from Taylor's polynomial at the
- * end of the step before; in two halves of a step if all are measured. In one of `measures_growth` steps the vector is projected on the energy surface (in the
- * metric of the sizes of the motion): its part along the gradient of the energy, which is conserved, grows by the error
- * of the iterations only. Requires: the iteration, the tables, the kernels point_derivatives and derivative_product;
- * with VARIABLE_ACCELERATIONS energy_gradient. */
+ * end of the step before; in two halves of a step if all are measured. In one of `measures_growth` steps the vector is
+ * projected on the energy surface (in the metric of the sizes of the motion): its part along the gradient of the
+ * energy, which is conserved, grows by the error of the iterations only. Requires: the iteration, the tables, the
+ * kernels point_derivatives and derivative_product; with VARIABLE_ACCELERATIONS energy_gradient. */
 
 #define LEAST_GROWTH 9.9 /* logarithm: of less, the difference to the mean is not measured */
 #define LARGEST_GROWTH 100.0 /* logarithm: beyond it the growth is known; below the reciprocal numbers underflow */
@@ -76,8 +76,7 @@ typedef struct {
   double square, inverse; /* h^2, 1 / h */
 } tangent_knots;
 
-/* Computes the derivatives of the accelerations at the knots of a part of a step from the velocities in the run's memory.
- */
+/* Computes the derivatives of the accelerations at the knots of a part of a step, with the velocities of the run. */
 static inline void linearise_accelerations(const run_memory *run, const step_data *step, const iteration_data *data,
     coordinates *X, int part, double h, tangent_knots *at)
 {
@@ -158,7 +157,8 @@ static inline void place_tangents(double (*s)[8], double (*a)[KNOTS_STORED], tan
 {
   for (int n = 0; n < KNOT_GROUPS; n++)
     for (int i = 0; i < M; i++) {
-      at->u[n][i] = add_rows(s[i][0] + columns_of(KNOT_ABSCISSA[0], n) * s[i][1], TANGENT_INTEGRALS_TWICE, KNOTS, n, a[i], LANES);
+      const lanes linear = s[i][0] + columns_of(KNOT_ABSCISSA[0], n) * s[i][1];
+      at->u[n][i] = add_rows(linear, TANGENT_INTEGRALS_TWICE, KNOTS, n, a[i], LANES);
 #ifdef VARIABLE_ACCELERATIONS
       at->u[n][M + i] = at->inverse * add_rows(lanes_of(s[i][1]), TANGENT_INTEGRALS, KNOTS, n, a[i], LANES);
 #endif
