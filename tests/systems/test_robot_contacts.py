@@ -239,11 +239,11 @@ def test_a_robot_lands_on_straight_legs(speed, changes, tmp_path):
 @pytest.mark.filterwarnings("ignore:a transition has several motions")
 @pytest.mark.rotated
 def test_modes_with_forces_outside_of_their_cones_are_refused(tmp_path):
-    """Without the passes that choose modes anew where a projection turns slow slips."""
+    """With a bound of normal forces that none satisfies after the last choice of modes."""
     (tmp_path / "stool.xml").write_text(STOOL)
     own = sc.compile_stepper(sc.LagrangianSystem.from_mjcf(tmp_path / "stool.xml", contacts="planes"), "svi:2")
-    stepper = planted(own, "pass <= EVENT_CONTACTS", "pass < 1")
+    stepper = planted(own, "force[normal] >= -small;", "force[normal] >= 1e9;")
     velocity = {"x_seat": 0.3, "y_seat": 0.1, "z_seat": 0.0, "omega_seat": np.random.default_rng(1).normal(size=3) / 2}
     start = {"x_seat": 0, "y_seat": 0, "z_seat": 0.3, "R_seat": [1, 0, 0, 0]}
-    with pytest.raises(sc.ContactError, match=r"contact 4 .* pulls, or exceeds its friction, at t = 0\.22 "):
+    with pytest.raises(sc.ContactError, match=r"contact \d .* pulls, or exceeds its friction, at t = 0\.\d+ "):
         stepper.integrate(start, velocity=velocity, t_end=0.4, h=0.005)
