@@ -54,7 +54,11 @@ def test_cached_derivations_are_not_repeated(made):
 def test_ensemble_source_is_generated_on_demand_and_cached(made, tmp_path, monkeypatch):
     written: list[str] = []
     render = pipeline.render_ensemble
-    monkeypatch.setattr(pipeline, "render_ensemble", lambda program: written.append(program.prefix) or render(program))
+    monkeypatch.setattr(
+        pipeline,
+        "render_ensemble",
+        lambda program, **options: written.append(program.prefix) or render(program, **options),
+    )
     stepper = sc.compile_stepper(spring(), sc.SVI(2))
     stepper.integrate([1.0], [0.0], h=0.1, steps=3)
     assert (len(written), len(list((tmp_path / "texts").iterdir()))) == (0, 2)
