@@ -356,7 +356,7 @@ def test_failed_steps_are_repeated_in_halves():
         except sc.StepFailedError:
             return halved(*halved(q, p, h / 2, level + 1), h / 2, level + 1)
 
-    for q, p in np.random.default_rng(0).normal(size=(60, 2, 1)) * [[2], [6]]:
+    for q, p in np.random.default_rng(0).normal(size=(60, 2, 1)) * [[4], [12]]:
         run = stepper.integrate(q, p, h=0.6, steps=1, parameters={"kT": 0, "g": 0})
         assert np.array_equal((run.q[1], run.p[1]), halved(q, p, 0.6))
     assert levels == {0, 1, 2}

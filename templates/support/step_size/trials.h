@@ -655,6 +655,13 @@ static inline int needs_momenta(run_memory *run, const trial *now)
   return DOUBTS && !by_newton(now) && (run->steps_to_compare > 0 || (shorter && changes_little(now)));
 }
 
+/* Solves a part of a step without a predictor, and adds its increments. */
+static SELDOM int add_part(step_data *part, const solver_options *options, real *dq, real *dp)
+{
+  MEMORY_OF_HALVES(memory, part);
+  return add_step(part, memory, 0, options, dq, dp);
+}
+
 /* Returns 1 if a force that is nearly constant along a step is another one at its end. Estimates see forces only at the
  * points of a step: after a free flight steps grow, and a wall, or a force that sets in, may lie between the last point
  * of one step and the first of the next. Momenta of three parts give mean forces: of both halves, and of a short step
