@@ -11,6 +11,7 @@ import scvi_codegen as sc
 
 EPS = float(np.finfo(np.float32).eps)
 COUNTS = (1, 2, 7, 33)
+GM = 1.32712440018e20  # m^3/s^2, of the Sun
 CASES = {
     "kepler": ("stoermer-verlet", [1.0, 0.0], [0.0, 1.1]),
     "planar-pendulum": ("composition:6", [1.0], [0.2]),
@@ -61,6 +62,11 @@ def test_sums_are_compensated_and_continue_in_double_precision_beyond_the_range(
     runs = free.integrate_ensemble([[3e38], [1.0]], [[1e37], [1.0]], h=1.0, steps=10, precision="single")
     assert runs.ok.all()
     assert runs.q[-1, :, 0] == pytest.approx([4e38, 11.0], rel=1e-6)
+    for r in (2e-12, 1.5e11):  # r^4 underflows, and overflows
+        start = [[r, 0.0]], [[0.0, (GM / r) ** 0.5]]
+        span = {"h": (r / GM) ** 0.5 * r / 64, "steps": 100, "parameters": {"mu": GM}}
+        runs = [stepper_of("kepler").integrate_ensemble(*start, **span, precision=x) for x in ("single", "double")]
+        assert np.abs(runs[0].q - runs[1].q).max() < 10 * EPS * r
 
 
 @pytest.mark.parametrize(
@@ -69,6 +75,7 @@ def test_sums_are_compensated_and_continue_in_double_precision_beyond_the_range(
         ({"h": None, "steps": None, "t_end": 1.0}, r"adaptive .* not available with precision='single': give h"),
         ({"observe": "energy"}, r"observe=.* not available with precision='single'"),
         ({"action": True}, "action is not available with precision='single'"),
+        ({"h": 1e-40}, "size 1e-40 is outside the range of single precision"),
         ({"parameters": {"mu": 1e39}}, "size 1e.39 is outside the range of single precision"),
         ({"precision": "half"}, "precision is 'half': ensembles have 'double' and 'single'"),
     ],

@@ -172,14 +172,18 @@ class EnsembleSettings:
 
     def check_range(self, parameters: Array, *states: Array) -> None:
         """Raise :class:`StateError` for parameters or states outside the range of the precision."""
-        if self.precision == "single":
-            for values in (parameters, *states):
-                worst = np.abs(values).max(initial=0.0)
-                if worst > RANGE.max or (values is parameters and (np.abs(values[values != 0.0]) < RANGE.tiny).any()):
-                    raise StateError(
-                        f"a parameter or state of size {worst:.3g} is outside the range of single precision, "
-                        f"{RANGE.tiny:.1e} to {RANGE.max:.1e}: choose other units, or precision='double'"
-                    )
+        if self.precision != "single":
+            return
+        smallest, tiny = RANGE.tiny / RANGE.eps, RANGE.tiny  # the low words of states are normal numbers, too
+        sizes = [np.abs(values[values != 0.0]) for values in (np.append(parameters, self.h), *states)]
+        limits = [(of.max(initial=0.0), tiny if of is sizes[0] else smallest) for of in sizes]
+        limits.append((sizes[0].min(initial=1.0), tiny))
+        for size, least in limits:
+            if size > RANGE.max or 0.0 < size < least:
+                raise StateError(
+                    f"a parameter, step size or state of size {size:.3g} is outside the range of single precision, "
+                    f"{least:.1e} to {RANGE.max:.1e}: choose other units, or precision='double'"
+                )
 
     def records_events(self, stepper: Any) -> bool:
         """Return whether trajectories record the events of the stepper, which may be counted instead."""

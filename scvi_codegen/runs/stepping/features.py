@@ -212,8 +212,8 @@ FEATURES = {
         (
             "without trajectories in SIMD lanes",
             "device observe_ensemble single",
-            "it requires explicit steps or a fixed-point iteration, as of SVI and Gauss methods without constraints; "
-            "omit it",
+            "it requires explicit steps or a fixed-point iteration, as of SVI and Gauss methods without constraints, "
+            "without the moving frame of a symmetric top; omit it",
         ),
         ("without derivatives", f"{_DERIVATIVES} {_ACTIONS}", "it was loaded without their source; compile the system"),
         (

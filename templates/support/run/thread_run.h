@@ -95,7 +95,7 @@ KERNEL NAME(thread_advance)(long long count, long long begin, long long steps, l
       active = 1.0;
       fixed_point(&step, &data, past, &guess, dq, dp, &options, &report);
     } while (!(active > 0.0) && !repeated++ && starts_again(&own, &guess, n));
-    drop_infinite(&own.now, dq, dp, &active);
+    drop_infinite(&own.now, dq, dp, 0, &active);
     if (!(active > 0.0))
       break;
     add_increments(own.now.q, own.now.carry_q, dq, &active);
