@@ -53,6 +53,26 @@ static void note_opening(const event_step *step, const contact_terms *of, const 
   }
 }
 
+#ifdef CONTACTS_IN_SPACE
+/* Slips of a body on several feet end together (Z. Farkas et al., Phys. Rev. Lett. 90, 248302, 2003): where one stops,
+ * so do slow ones that brake. The projection that removes its rate would turn them, with friction along them. */
+static int stop_together(const event_step *step, event_sample *at, contact_terms *of, contact_change *now)
+{
+  contact_mode mode[EVENT_CONTACTS];
+  real force[CONTACT_ROWS], second[CONTACT_ROWS];
+  int any = 0, status = OK;
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    any |= CONTACTS[k].slips == 2 && now->stops[k] && now->rests[k];
+  if (!any || !slips_at(step, at, of, mode, force, second, &status))
+    return status;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const real *const d = mode[k].direction, *const w = second + CONTACTS[k].tangential;
+    now->rests[k] |= CONTACTS[k].slips == 2 && d[0] * w[0] + d[1] * w[1] < 0.0 && stops_at(step, of, k);
+  }
+  return settle(step, at, of, now);
+}
+#endif
+
 /* Impacts and new modes at a state, which is projected onto their constraints. That may turn slow slips, and modes are
  * chosen again if it makes their forces impossible; none that remain so are kept. */
 static int change_modes(const event_step *step, event_sample *at, contact_change *now)
@@ -76,6 +96,10 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
     forces_at(at->t, at->q, at->p, step->own, present, force, step->workspace);
   if (status == OK && approach)
     status = collide(step, at, &of, closed, now);
+#ifdef CONTACTS_IN_SPACE
+  else if (status == OK)
+    status = stop_together(step, at, &of, now);
+#endif
   for (int pass = 0; status == OK && first >= 0 && pass <= EVENT_CONTACTS; pass++) {
     status = choose_modes(step, &of, now, force);
     if (status == OK)
