@@ -19,7 +19,8 @@ FUNCTION = re.compile(r"[\w\s*]*?(\w+)\s*\(")
 DECLARED = re.compile(r"(\w+)\s*(?:\[[^=]*\])?\s*;?\s*$")
 EXPORTED = re.compile(r"\b(NAME|STATUS)\((\w+)\)")
 PREFIXING = re.compile(r"^#define (NAME|STATUS)\(word\) (\w+)##word.*\n", re.MULTILINE)
-TOKEN = re.compile(r'/\*(?:[^*]|\*(?!/))*\*/|"(?:\\.|[^"\\])*"|#include .*|\bFMI\(\w+\)|\b[A-Za-z_]\w*')
+TOKEN = re.compile(r'/\*(?:[^*]|\*(?!/))*\*/|"(?:\\.|[^"\\])*"|#include .*|##\w+|\bFMI\(\w+\)|\b[A-Za-z_]\w*')
+"""Comments, strings, words, and words pasted to the end of others, which are no names by themselves."""
 HEAD = re.compile(r'^(?P<head>[A-Za-z_][^;{}#/"]*\))(?=\n\{)', re.MULTILINE)
 """Head of the definition of a function."""
 CONTINUED = re.compile(r"^#define .*\\\n(?:.*\\\n)*.*$", re.MULTILINE)
