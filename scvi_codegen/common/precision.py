@@ -8,6 +8,7 @@ thread-local: functions of mpmath that raise it meanwhile do not affect tables c
 import copyreg
 import threading
 from collections.abc import Iterator
+from fractions import Fraction
 from typing import Any, TypeAlias
 
 from mpmath import MPContext
@@ -48,6 +49,12 @@ for constant in (mp.pi, mp.e, mp.ln2, mp.ln10):  # cached by mpmath, but extende
 
 ZERO = mp.mpf(10) ** -40
 """Bound below which table entries on a step of length 1 are set to 0: round-off in the 60th digit of their terms."""
+
+VANISHING = Fraction(1, 2**120 + 1)
+"""Added to bases of roots that may be 0, so that these and their derivatives are finite; 2^-60 in single precision.
+
+No number of a model is equal to it.
+"""
 
 Number: TypeAlias = Any
 """An ``mp.mpf`` of this context (mpmath has no type annotations)."""

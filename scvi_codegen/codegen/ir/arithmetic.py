@@ -24,6 +24,7 @@ import sympy
 
 from scvi_codegen.codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation, exact_number
 from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.common.precision import VANISHING
 from scvi_codegen.systems.formulas.intermediates import Intermediate, intermediates
 from scvi_codegen.systems.formulas.kinks import rint, switching_function, unit_step
 
@@ -46,8 +47,8 @@ OPERATIONS = {
 PLAIN = sympy.Symbol, sympy.Mul, sympy.Function, Intermediate
 """Factors of numbers that make a product of SymPy as they are."""
 LARGEST_UNROLLED_POWER = 64
-VANISHING = sympy.Rational(1, 2**120)
-"""Added to bases of roots that vanish on a side of a kink, so that the rounding error of a root of 0 is 0, not 0/0."""
+LARGEST_COEFFICIENT = 2**100
+"""Largest coefficient in a sum without its common factor: terms with a larger one exceed single precision."""
 
 
 DEEPEST_EXPRESSION = 24
@@ -133,12 +134,13 @@ class _Graph:
         """Return the node of ``sum_i c_i x_i = c sum_i (c_i / c) x_i``, c the content of the c_i with the first sign.
 
         Multiples of a sum, its negative among them, share the node of the last sum. With ``paired`` c is only the sign
-        if a term has a sum as a factor.
+        if a term has a sum as a factor; so it is if a c_i / c is too large.
         """
         content, primitive = _primitive(expression)
         terms = [term.as_coeff_Mul() for term in primitive]
         terms.sort(key=lambda term: self._rank(term[1]))
-        if self.paired and any(isinstance(factor, sympy.Add) for _, rest in terms for factor in rest.args):
+        in_sums = self.paired and any(isinstance(factor, sympy.Add) for _, rest in terms for factor in rest.args)
+        if in_sums or max(abs(coefficient) for coefficient, _ in terms) > LARGEST_COEFFICIENT:
             content, terms = sympy.S.One, [(content * coefficient, rest) for coefficient, rest in terms]
         if terms[0][0] < 0:
             content, terms = -content, [(-coefficient, rest) for coefficient, rest in terms]
@@ -269,7 +271,7 @@ class _Graph:
         for slot, operand in zip(slots, operands, strict=True):
             error, rate = errors[operand], value.diff(slot)
             if operation in ("sqrt", "pow") and any("copysign" in str(self.nodes[k]) for k in _order(self, [operand])):
-                rate = rate.subs(slot, slot + VANISHING)
+                rate = rate.subs(slot, slot + sympy.Rational(VANISHING))
             if error is not None and rate != 0:
                 yield error if abs(rate) == 1 else self.node(("*", (self._absolute(self.read(rate)), error)))
 

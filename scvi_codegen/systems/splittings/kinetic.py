@@ -21,7 +21,7 @@ from typing import Any
 
 from sympy import Add, Expr, Float, Matrix, Quaternion, S, atan2, cos, expand, eye, sin, sqrt, zeros
 
-from scvi_codegen.common.precision import DIGITS, mp
+from scvi_codegen.common.precision import DIGITS, VANISHING, mp
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.formulas.expressions import jacobian
 from scvi_codegen.systems.formulas.intermediates import intermediate
@@ -30,7 +30,7 @@ from scvi_codegen.systems.formulas.symbols import symbol
 from scvi_codegen.systems.legendre.transform import equivalent_lagrangian
 from scvi_codegen.systems.system import MechanicalSystem
 
-SMALLEST = S(10) ** -40
+SMALLEST = S(VANISHING)
 """Added to the square of an angle, so that sin(x)/x and its derivatives have values at 0."""
 DOUBLINGS = 20
 """Doublings of the argument of elliptic functions: series of 4 terms at 2^-20 are correct to 45 digits."""

@@ -23,7 +23,7 @@ from scvi_codegen.codegen.ir.kernel import (
 )
 from scvi_codegen.codegen.rendering.text import TOLERANCE
 from scvi_codegen.common.errors import MethodError
-from scvi_codegen.common.precision import mp, nearest_float, settled
+from scvi_codegen.common.precision import VANISHING, mp, nearest_float, settled
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,6 +38,7 @@ class Target:
         tolerance: see :data:`scvi_codegen.codegen.rendering.text.TOLERANCE`.
         halvings: from 1 to the round-off unit.
         smallest, largest: numbers with full precision.
+        vanishing: in place of VANISHING, whose power -3/2, in the Jacobian of a turn, is beyond single precision.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Target:
     halvings: int
     smallest: float
     largest: float
+    vanishing: float = 2.0**-120
 
     @property
     def bytes(self) -> int:
@@ -56,7 +58,7 @@ class Target:
 
     def rounded(self, value: Number) -> float:
         """Return the number of the target nearest to ``value``; 0 below its smallest, as for low words of tables."""
-        nearest = nearest_float(value, self.halvings + 1)
+        nearest = self.vanishing if value == VANISHING else nearest_float(value, self.halvings + 1)
         return 0.0 if abs(nearest) <= self.smallest and abs(mp.convert(value)) < self.smallest else nearest
 
     def rest(self, value: Number) -> Number:
@@ -101,6 +103,7 @@ SINGLE = Target(
     halvings=23,
     smallest=2.0**-126,
     largest=(2.0 - 2.0**-23) * 2.0**127,
+    vanishing=2.0**-60,
 )
 
 
