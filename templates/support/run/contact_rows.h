@@ -159,7 +159,7 @@ static int terms_at(const event_step *step, const event_sample *at, contact_term
         fabs(of->second[r]) * duration;
     of->drift[r] = fabs(of->rate[r] - by_velocity);
     of->rounding[r] = DBL_EPSILON * (fmax(by_position, of->terms[r]) + fabs(at->t) * of->drift[r]);
-    of->size[r] = by_position + of->speed[r] * duration;
+    of->size[r] = fmax(by_position, of->terms[r]) + of->speed[r] * duration;
   }
   memset(of->absent, 0, sizeof of->absent);
   for (int i = 0; status == OK && i < TRANSITIONS; i++) {
