@@ -115,6 +115,19 @@ def test_independent_contacts_have_their_own_scales() -> None:
     assert run.contact_modes[-1] == (pytest.approx(1 / 0.3), ("stick", "stick"))
 
 
+@pytest.mark.second
+@pytest.mark.parametrize("height", [0.0, 0.2])
+def test_a_straight_leg_lands_at_the_limit_of_its_joint(height: float) -> None:
+    """Forces on the corners of the foot, whose gaps are 0 but for the rounding of b - c - 2 l, cancel at the joint."""
+    text = "m*((x_dot - l*a_dot*cos(a))**2 + (y_dot + l*a_dot*sin(a))**2 + r**2*a_dot**2 - 2*g*(y - l*cos(a)))/2"
+    numbers = {"M": 2.0, "m": 0.7, "l": 0.05, "r": 0.1, "g": 9.81, "b": 0.3, "c": 0.2}
+    system = lagrange("leg", "x y a", f"{text} + M*(x_dot**2 + y_dot**2 - 2*g*y)/2", **numbers)
+    foot = [sc.contact(f"y + b - c - 2*l*cos(a) {s} r*sin(a)", slip="x_dot", friction=0.7) for s in "+-"]
+    stepper = sc.compile_stepper(system, "svi:3", contacts=[sc.contact("a"), *foot])
+    run = stepper.integrate([0.3, height, 0.0], velocity=[0.0] * 3, h=0.01, t_end=0.5)
+    assert run.contact_modes[-1][1][1:] == ("stick", "stick")
+
+
 @pytest.mark.parametrize(
     ("friction", "jumps"),
     [("where(x_dot > w, 1, 2)", True), ("2 - sign(w - x_dot)", True), ("1 + abs(x_dot - w)", False), ("2 + x", False)],
