@@ -224,9 +224,7 @@ def test_models_with_numbers_beyond_single_precision_are_rejected(number):
 @pytest.mark.rotated
 def test_a_top_falls_from_rest_in_single_precision(tmp_path):
     """The Jacobian of its turn has abs(v)^-3 of v = 0, half of the angle."""
-    system = (
-        '[system]\nname = "top"\ncoordinates = []\nlagrangian = "(omega_1**2 + omega_2**2 + omega_3**2/2)/2 - R_33"'
-    )
+    system = '[system]\nname = "top"\ncoordinates = []\nlagrangian = "(omega_1**2+omega_2**2+omega_3**2/2)/2-R_33"'
     start = 'rotations = {R = "omega"}\n[initial.q]\nR = { euler = "xyz", angles = [0.5, 0.2, 0] }\n[initial.q_dot]'
     (tmp_path / "top.toml").write_text(f"{system}\n{start}\nomega = [0.0, 0.0, 0.0]\n[run]\nstep = 0.01\nspan = 1.0\n")
     for precision in EMBEDDED:

@@ -175,7 +175,7 @@ class EnsembleSettings:
         if self.precision != "single":
             return
         smallest, tiny = RANGE.tiny / RANGE.eps, RANGE.tiny  # the low words of states are normal numbers, too
-        sizes = [np.abs(values[values != 0.0]) for values in (np.append(parameters, self.h), *states)]
+        sizes = [np.abs(values[values != 0.0]) for values in (np.append(parameters, cast(float, self.h)), *states)]
         limits = [(of.max(initial=0.0), tiny if of is sizes[0] else smallest) for of in sizes]
         limits.append((sizes[0].min(initial=1.0), tiny))
         for size, least in limits:

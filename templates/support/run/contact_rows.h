@@ -154,7 +154,7 @@ static int terms_at(const event_step *step, const event_sample *at, contact_term
     real by_velocity = 0.0;
     for (int i = 0; i < M; i++)
       by_velocity += of->G[r * M + i] * v[i];
-    /* |G v| <= sqrt(G M^-1 G^T) sqrt(v^T M v), and the changes of the rate in a step, by forces that stop others, too */
+    /* |G v| <= sqrt(G M^-1 G^T) sqrt(v^T M v), and changes of the rate in a step, by forces that stop others, too */
     of->speed[r] = sqrt(fabs(of->W[r * (CONTACT_ROWS + 1)] * power)) + fabs(of->rate[r] - by_velocity) +
         fabs(of->second[r]) * duration;
     for (int j = 0; j < CONTACT_ROWS; j++) { /* W_rj / W_jj: rate of r by a force that changes that of j by 1 */
