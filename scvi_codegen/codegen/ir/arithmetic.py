@@ -306,10 +306,8 @@ def _primitive(total: sympy.Add) -> tuple[sympy.Rational, Sequence[sympy.Expr]]:
         content, primitive = total.primitive()
         return content, primitive.args
     scaled = [(sympy.Integer(c.p // divisor * (multiple // c.q)), rest) for c, rest in pairs]
-    terms = [
-        c if rest is sympy.S.One else rest if c == 1 else sympy.Mul._from_args((c, *sympy.Mul.make_args(rest)))
-        for c, rest in scaled
-    ]
+    factors = [(c, *(() if rest is sympy.S.One else sympy.Mul.make_args(rest))) for c, rest in scaled]
+    terms = [rest if c == 1 else sympy.Mul._from_args(of) for (c, rest), of in zip(scaled, factors, strict=True)]
     return sympy.Rational(divisor, multiple), sorted(terms, key=cmp_to_key(sympy.Basic.compare))
 
 

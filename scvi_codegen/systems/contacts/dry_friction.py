@@ -6,8 +6,8 @@ Let the forces f(q, v, t, s) contain the step s of a slip w = T(q, t) v + b(q, t
 
 motions may slide on w = 0 with the forces (f(1) + f(0))/2 + T^T tau, abs(tau) <= F (A. F. Filippov, *Differential
 Equations with Discontinuous Righthand Sides*, 1988). That is friction of the limit F without a gap, as are in space
-forces -F T^T w/sqrt(w_1^2 + w_2^2) of two slips. Jumps along other directions, and forces that may
-supply energy, stay as they are.
+forces -F T^T w/sqrt(w_1^2 + w_2^2) of two slips. Jumps along other directions, and forces
+that may supply energy, stay as they are.
 """
 
 from __future__ import annotations
