@@ -102,11 +102,8 @@ static int perform_steps(run_memory *run, const problem *arrays, const work_arra
 {
   for (long long k = 0; k < most; k++) {
     const long long before = report->iterations;
-    int status;
     report->t = run->t;
-    status = perform_step(run, arrays, work, options, report);
-    if (status != OK)
-      return status;
+    TRY(perform_step(run, arrays, work, options, report));
     count_step(run, report, report->iterations - before);
   }
   return OK;
@@ -126,9 +123,7 @@ static int take_steps(run_memory *run, const job *way, solver_report *report)
   while (report->steps < way->steps) {
     const long long left = way->steps - report->steps;
     const long long next = way->every ? way->every - run->step % way->every : left;
-    const int status = PERFORM(run, way->arrays, &work, way->options, report, next < left ? next : left);
-    if (status != OK)
-      return status;
+    TRY(PERFORM(run, way->arrays, &work, way->options, report, next < left ? next : left));
     store_state(run, way, report, work.n, 0);
   }
   return OK;
@@ -140,13 +135,10 @@ static int perform(run_memory *run, job way, const double *parameters, const sol
 {
   const solver_options standard = NAME(default_options)();
   solver_report unread;
-  int status;
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
   report->t = run->t;
-  status = use_parameters(run, parameters);
-  if (status != OK)
-    return status;
+  TRY(use_parameters(run, parameters));
 #ifdef HEAT_BATH
   if (!prepare_bath(run))
     return NOT_FINITE;

@@ -20,9 +20,7 @@ static int legendre_transform(double t, const double *q, const double *x, const 
     int inverse, double *workspace)
 {
   run_memory *run = run_in(workspace);
-  const int status = use_parameters(run, parameters);
-  if (status != OK)
-    return status;
+  TRY(use_parameters(run, parameters));
 #ifdef SITE_TRANSFORM
   (inverse ? find_momenta : find_velocities)(&run->data, joined(run, q, x), t, y);
   return OK;
@@ -53,10 +51,8 @@ static int energies_of(long long count, const double *t, const double *q, const 
 {
   run_memory *run = run_in(workspace);
   const long long n = coordinates_of(&run->data);
-  const int status = use_parameters(run, parameters);
+  TRY(use_parameters(run, parameters));
   problem arrays = run->data;
-  if (status != OK)
-    return status;
 #ifdef LISTS
   neighbours list[LISTS] = {{0}}; /* those of a run determine the order of its sums */
   for (int k = 0; k < LISTS; k++)

@@ -6,7 +6,7 @@
 
 static step_data step_of(const run_memory *run, const problem *arrays, const work_arrays *work)
 {
-  const step_data step = {.t = run->t,
+  return (step_data){.t = run->t,
       .h = run->h,
       .q0 = run->q,
       .p0 = run->p,
@@ -16,7 +16,6 @@ static step_data step_of(const run_memory *run, const problem *arrays, const wor
       .arrays = arrays,
       .work = work,
       .n = work->n};
-  return step;
 }
 
 /* Advances the state to the end of a solved step. */
@@ -37,12 +36,10 @@ static int perform_step(run_memory *run, const problem *arrays, const work_array
   step_data step = step_of(run, arrays, work);
   array_motion motion = {{0.0}, {0.0}};
   solver_data data;
-  int status;
+  int status = OK;
   step.motion = &motion;
   prepare(&step, &data);
-  status = solve(&step, &data, history_in(&step), &run->guess, work->dq, work->dp, options, report, NULL);
-  if (status != OK)
-    return status;
+  TRY(solve(&step, &data, history_in(&step), &run->guess, work->dq, work->dp, options, report, NULL));
   if (run->error < INFINITY) /* else a partial step, of a search for events */
     status = observe_error(run, &step, &data, work->dq, work->dp, options, NULL);
   if (status == OK)

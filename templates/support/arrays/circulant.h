@@ -53,8 +53,7 @@ typedef struct {
 static transforms transforms_in(const run_memory *run, double *memory, long long count)
 {
   lanes *spare = (lanes *)(((uintptr_t)(memory + PLAN * PLANS * count) + 63) / 64 * 64);
-  const transforms of = {run, count, memory, spare, spare + 4 * GROUPS * count};
-  return of;
+  return (transforms){run, count, memory, spare, spare + 4 * GROUPS * count};
 }
 
 static transforms transforms_of(const run_memory *run, const problem *arrays)
@@ -70,8 +69,7 @@ static plan plan_at(double *memory, long long size)
   double *re = memory + 1 + size, *im = re + half + 1, *next = im + half + 1;
   double *first = size % 8 == 0 ? next + 2 * half + 2 * size : NULL; /* then the radix is 4 or 8 */
   const roots of_half = {next, next + half, first}, of_size = {next + 2 * half, next + 2 * half + size, NULL};
-  const plan of = {memory, memory + 1, re, im, of_half, of_size};
-  return of;
+  return (plan){memory, memory + 1, re, im, of_half, of_size};
 }
 
 /* Computes the transform of real coefficients in every number of x. */

@@ -28,8 +28,7 @@ static lanes *sums_at(const transforms *in, int vector, int group)
 
 static images images_at(const transforms *in, int group)
 {
-  const images of = {sums_at(in, 0, group), sums_at(in, 2, group), sums_at(in, 1, group), STATES * in->count};
-  return of;
+  return (images){sums_at(in, 0, group), sums_at(in, 2, group), sums_at(in, 1, group), STATES * in->count};
 }
 
 static void multiply_by_circulant(const transforms *in, const circulant *by, double turn, const lanes *X,

@@ -22,8 +22,7 @@ typedef struct {
 static work_arrays bind_work_arrays(const run_memory *run, long long n)
 {
   double *work = run->work;
-  const work_arrays of = {n, work, work + n, work + 2 * n, work + 3 * n, work + 4 * n, work + 5 * n, work + 6 * n};
-  return of;
+  return (work_arrays){n, work, work + n, work + 2 * n, work + 3 * n, work + 4 * n, work + 5 * n, work + 6 * n};
 }
 
 /* Data shared by the substeps. */
@@ -40,8 +39,7 @@ typedef struct {
 static inline constrained_run constrained_run_of(run_memory *run, const problem *arrays, const work_arrays *work,
     const solver_options *options, solver_report *report)
 {
-  const constrained_run of = {run, arrays, work, constraint_arrays(run, work->n), work->n, options, report};
-  return of;
+  return (constrained_run){run, arrays, work, constraint_arrays(run, work->n), work->n, options, report};
 }
 
 /* x = G^T lambda. */
@@ -114,9 +112,7 @@ static int end_of_iteration(const progress *now, const constraint_system *held, 
 {
   const double left = product_of(held->right, held->right, held->count);
   const double rounding = product_of(held->rounding, held->rounding, held->count);
-  const int status = outcome(now, report);
-  if (status != OK)
-    return status;
+  TRY(outcome(now, report));
   return left <= ROUNDING_MULTIPLE * ROUNDING_MULTIPLE * rounding ? OK : SINGULAR;
 }
 
@@ -129,7 +125,6 @@ static int solve_positions(const constrained_run *of, double h, double t, double
   progress now = before_iterations();
   compute_constraint_forces(held, held->lambda, work->R, of->n);
   for (int iteration = 0;; iteration++) {
-    int status;
     double moved;
     *size = trial_increments(of, h);
     evaluate_constraints(of->arrays, work->Y, t, held->g, held->rate, held->next);
@@ -139,9 +134,7 @@ static int solve_positions(const constrained_run *of, double h, double t, double
       compute_rounding(held, held->next, work->X, 2.0 / (h * h));
     if (now.status)
       return end_of_iteration(&now, held, of->report);
-    status = solve_constraint_system(held, NEAR_ENOUGH, of->report);
-    if (status != OK)
-      return status;
+    TRY(solve_constraint_system(held, NEAR_ENOUGH, of->report));
     add_to(held->lambda, held->change, 1.0, held->count);
     compute_constraint_forces(held, held->change, work->F, of->n);
     moved = h * h / 2 * (h * h / 2) * push(work->R, work->F, 1.0, of->run->inverse_mass, of->n);
@@ -182,7 +175,6 @@ static int project_momenta(const constrained_run *of, double by, double unit, do
   const run_memory *run = of->run;
   progress now = before_iterations();
   for (int k = 0;; k++) {
-    int status;
     double moved = t && VELOCITY_FORCES ? update_forces(of, by, *t) : 0.0;
     for (long long i = 0; i < of->n; i++)
       of->work->D[i] = run->inverse_mass[i] * (run->p[i] + of->work->dp[i]);
@@ -191,9 +183,7 @@ static int project_momenta(const constrained_run *of, double by, double unit, do
       compute_rounding(held, held->derivative, of->work->X, 1.0 / by);
     if (now.status)
       return outcome(&now, of->report);
-    status = solve_constraint_system(held, NEAR_ENOUGH, of->report);
-    if (status != OK)
-      return status;
+    TRY(solve_constraint_system(held, NEAR_ENOUGH, of->report));
     compute_constraint_forces(held, held->change, of->work->R, of->n);
     moved += push(of->work->dp, of->work->R, by, run->inverse_mass, of->n);
     if (t && held->is_exact && !VELOCITY_FORCES) /* a linear system */
@@ -210,11 +200,8 @@ static int constrained_substep(const constrained_run *of, double h, double t)
   const constraint_system *held = &of->held;
   const run_memory *run = of->run;
   double size;
-  int status;
   add_to(work->dp, work->F, h / 2, of->n);
-  status = solve_positions(of, h, t, &size);
-  if (status != OK)
-    return status;
+  TRY(solve_positions(of, h, t, &size));
   add_to(work->dp, work->R, h / 2, of->n);
   memcpy(work->dq, work->D, sizeof(double) * (size_t)of->n);
   memcpy(held->derivative, held->next, sizeof(double) * (size_t)held->entries);
@@ -237,19 +224,17 @@ static int perform_step(run_memory *run, const problem *arrays, const work_array
 {
   const constrained_run of = constrained_run_of(run, arrays, work, options, report);
   const long long n = work->n;
-  int status = OK;
+  const int has_begun = run->guess != 0;
   run->error = NAN;
-  if (!run->guess) {
-    memset(of.held.lambda, 0, sizeof(double) * (size_t)of.held.count);
-    status = begin(&of);
-  }
   run->guess = 0;
+  if (!has_begun) {
+    memset(of.held.lambda, 0, sizeof(double) * (size_t)of.held.count);
+    TRY(begin(&of));
+  }
   memcpy(of.work->dq, run->carry_q, sizeof(double) * (size_t)n);
   memcpy(of.work->dp, run->carry_p, sizeof(double) * (size_t)n);
-  for (int k = 0; status == OK && k < PARTS; k++)
-    status = constrained_substep(&of, run->h * PART[k], run->t + run->h * PART_END[k]);
-  if (status != OK)
-    return status;
+  for (int k = 0; k < PARTS; k++)
+    TRY(constrained_substep(&of, run->h * PART[k], run->t + run->h * PART_END[k]));
   for (long long i = 0; i < n; i++) {
     run->carry_q[i] = of.work->dq[i], run->carry_p[i] = of.work->dp[i];
     add_increment(&run->q[i], &run->carry_q[i]);

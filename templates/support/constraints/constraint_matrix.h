@@ -141,7 +141,7 @@ static inline constraint_system constraint_arrays(const run_memory *run, long lo
 {
   const long long count = run->constraints, entries = run->entries;
   double *const numbers = run->held, *const further = numbers + 11 * count;
-  const constraint_system found = {
+  return (constraint_system){
       .of = pattern_of(run, n),
       .count = count,
       .entries = entries,
@@ -161,7 +161,6 @@ static inline constraint_system constraint_arrays(const run_memory *run, long lo
       .next = further + entries,
       .entry = further + 2 * entries,
       .factor = further + 2 * entries + run->pairs};
-  return found;
 }
 
 /* Computes the row of a constraint: products of derivatives with respect to the same coordinates. */

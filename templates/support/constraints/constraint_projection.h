@@ -16,7 +16,6 @@ static int project_positions(const constrained_run *of)
   memcpy(work->Y, run->q, sizeof(double) * (size_t)of->n);
   for (int k = 0;; k++) {
     double moved = 0.0, size = 0.0;
-    int status;
     evaluate_constraints(of->arrays, work->Y, run->t, held->g, held->rate, held->derivative);
     if (!assemble(held, run->inverse_mass))
       return SINGULAR;
@@ -29,9 +28,7 @@ static int project_positions(const constrained_run *of)
     compute_rounding(held, held->derivative, work->X, 1.0);
     if (now.status)
       return end_of_iteration(&now, held, of->report);
-    status = solve_constraint_system(held, NEAR_ENOUGH, of->report);
-    if (status != OK)
-      return status;
+    TRY(solve_constraint_system(held, NEAR_ENOUGH, of->report));
     add_to(held->lambda, held->change, 1.0, held->count);
     compute_constraint_forces(held, held->lambda, work->R, of->n);
     for (long long i = 0; i < of->n; i++) {
@@ -51,19 +48,14 @@ static int project_run(run_memory *run, solver_report *report, int positions)
   const work_arrays work = bind_work_arrays(run, coordinates_of(&run->data));
   const constrained_run of = constrained_run_of(run, &run->data, &work, &standard, report);
   double size = 0.0;
-  int status;
   run->guess = 0;
-  status = project_positions(&of);
-  if (status != OK)
-    return status;
+  TRY(project_positions(&of));
   memset(of.work->dp, 0, sizeof(double) * (size_t)of.n);
   for (long long i = 0; i < of.n; i++) {
     of.work->X[i] = fabs(run->inverse_mass[i] * run->p[i]);
     size += of.work->X[i] * of.work->X[i];
   }
-  status = project_momenta(&of, 1.0, 1.0, size, NULL);
-  if (status != OK)
-    return status;
+  TRY(project_momenta(&of, 1.0, 1.0, size, NULL));
   if (positions)
     memcpy(run->q, of.work->Y, sizeof(double) * (size_t)of.n);
   add_to(run->p, of.work->dp, 1.0, of.n);

@@ -78,15 +78,14 @@ static int multipliers_of_run(run_memory *run, double *lambda)
   const constrained_run of = constrained_run_of(run, arrays, &work, NULL, &report);
   const constraint_system *held = &of.held;
   double *F = of.work->D, *pulled = of.work->Y;
-  int status = run->guess ? OK : begin(&of);
-  if (status != OK)
-    return status;
+  if (!run->guess)
+    TRY(begin(&of));
   find_forces(&of, run->q, NULL, run->t, F);
   for (long long i = 0; i < of.n; i++)
     pulled[i] = run->inverse_mass[i] * run->p[i];
   compute_second_derivatives(arrays, run->q, pulled, run->t, held->g);
   memset(lambda, 0, sizeof(double) * (size_t)held->count);
-  for (int round = 0; status == OK && round < REFINEMENTS; round++) {
+  for (int round = 0; round < REFINEMENTS; round++) {
     compute_constraint_forces(held, lambda, of.work->R, of.n);
     for (long long i = 0; i < of.n; i++)
       pulled[i] = run->inverse_mass[i] * (F[i] + of.work->R[i]);
@@ -94,10 +93,10 @@ static int multipliers_of_run(run_memory *run, double *lambda)
     for (long long i = 0; i < of.n; i++)
       pulled[i] = run->inverse_mass[i] * (fabs(F[i]) + fabs(of.work->R[i]));
     compute_rounding(held, held->derivative, pulled, 1.0);
-    status = solve_constraint_system(held, REFINED, &report);
+    TRY(solve_constraint_system(held, REFINED, &report));
     add_to(lambda, held->change, 1.0, held->count);
   }
-  return status;
+  return OK;
 }
 
 int NAME(constraint_values)(long long count, const double *t, const double *q, const double *p,
@@ -106,9 +105,7 @@ int NAME(constraint_values)(long long count, const double *t, const double *q, c
   run_memory *run = run_in(workspace);
   const long long n = coordinates_of(&run->data), m = run->constraints;
   for (long long k = 0; k < count; k++) {
-    const int status = start_at(run, t[k], q + k * n, p + k * n, parameters);
-    if (status != OK)
-      return status;
+    TRY(start_at(run, t[k], q + k * n, p + k * n, parameters));
     values_of_run(run, g + k * m, rate + k * m);
   }
   return OK;
@@ -120,11 +117,8 @@ int NAME(multipliers)(long long count, const double *t, const double *q, const d
   run_memory *run = run_in(workspace);
   const long long n = coordinates_of(&run->data), m = run->constraints;
   for (long long k = 0; k < count; k++) {
-    int status = start_at(run, t[k], q + k * n, p + k * n, parameters);
-    if (status == OK)
-      status = multipliers_of_run(run, multiplier + k * m);
-    if (status != OK)
-      return status;
+    TRY(start_at(run, t[k], q + k * n, p + k * n, parameters));
+    TRY(multipliers_of_run(run, multiplier + k * m));
   }
   return OK;
 }

@@ -114,9 +114,7 @@ static int constrained(real t, const real *q, const real *p, const real *paramet
     real *workspace)
 {
   real value[M + 2 * CONSTRAINTS], derivative[CONSTRAINT_ENTRIES];
-  const int status = find_velocity(t, q, p, parameters, u + M, workspace);
-  if (status != OK)
-    return status;
+  TRY(find_velocity(t, q, p, parameters, u + M, workspace));
   memcpy(u, q, sizeof(real) * M);
   constraints(u, t, parameters, g, derivative);
   constrained_motion(u, t, parameters, value);
@@ -128,12 +126,9 @@ int NAME(constraint_values)(long long count, const real *t, const real *q, const
     real *g, real *rate, real *workspace)
 {
   real u[2 * M];
-  for (long long k = 0; k < count; k++) {
-    const int status = constrained(t[k], q + k * M, p + k * M, parameters, u, g + k * CONSTRAINTS,
-        rate + k * CONSTRAINTS, workspace);
-    if (status != OK)
-      return status;
-  }
+  for (long long k = 0; k < count; k++)
+    TRY(constrained(t[k], q + k * M, p + k * M, parameters, u, g + k * CONSTRAINTS,
+        rate + k * CONSTRAINTS, workspace));
   return OK;
 }
 #endif
@@ -264,11 +259,9 @@ static int project_position(real t, real *u, const real *parameters, saddle *at)
   real g[CONSTRAINTS], right[CONSTRAINTS], y[CONSTRAINTS], update[M], nearest[M], size[CONSTRAINTS],
       derivative[CONSTRAINT_ENTRIES], last = 0;
   for (int k = 0; k < MAX_PROJECTIONS; k++) {
-    const int status = factorise_saddle(t, u, parameters, at, g);
     int halvings = 0, is_rounding;
     real left, now, square = 0;
-    if (status != OK)
-      return status;
+    TRY(factorise_saddle(t, u, parameters, at, g));
     constraint_rounding(u, t, parameters, size);
     if (is_below(g, REAL_EPSILON / 2, size))
       return OK;
@@ -325,11 +318,8 @@ static int project_momentum(real t, const real *q, real *p, const real *paramete
   real u[2 * M], g[CONSTRAINTS], rate[CONSTRAINTS], y[CONSTRAINTS], update[M], derivative[CONSTRAINT_ENTRIES];
   real fastest = 0; /* the projection may be at rest */
   for (int k = 0; k < MOST_MOMENTUM_PROJECTIONS; k++) {
-    int status = constrained(t, q, p, parameters, u, g, rate, workspace);
-    if (status == OK)
-      status = factorise_saddle(t, u, parameters, at, g);
-    if (status != OK)
-      return status;
+    TRY(constrained(t, q, p, parameters, u, g, rate, workspace));
+    TRY(factorise_saddle(t, u, parameters, at, g));
     for (int j = 0; j < CONSTRAINTS; j++)
       rate[j] = -rate[j];
     solve_saddle(at, NULL, rate, update, y);
@@ -348,15 +338,11 @@ int NAME(project)(real t, const real *q0, const real *p0, const real *parameters
 {
   saddle *at = saddle_in(workspace);
   real u[2 * M], p[M];
-  int status = find_velocity(t, q0, p0, parameters, u + M, workspace);
+  TRY(find_velocity(t, q0, p0, parameters, u + M, workspace));
   memcpy(u, q0, sizeof(real) * M);
   memcpy(p, p0, sizeof p);
-  if (status == OK)
-    status = project_position(t, u, parameters, at);
-  if (status == OK)
-    status = project_momentum(t, u, p, parameters, at, workspace);
-  if (status != OK)
-    return status;
+  TRY(project_position(t, u, parameters, at));
+  TRY(project_momentum(t, u, p, parameters, at, workspace));
   memcpy(q1, u, sizeof(real) * M);
   memcpy(p1, p, sizeof p);
   return OK;
@@ -382,16 +368,12 @@ int NAME(apart)(real t, const real *q0, const real *p0, const real *q1, const re
 {
   const real still[M] = {0};
   real u[2 * M], velocity[M], x[2][M], y[2][M], p[M], mass[MASS_ENTRIES];
-  int status = find_velocity(t, q1, p0, parameters, y[0], workspace);
-  if (status == OK)
-    status = find_velocity(t, q1, p1, parameters, y[1], workspace);
+  TRY(find_velocity(t, q1, p0, parameters, y[0], workspace));
+  TRY(find_velocity(t, q1, p1, parameters, y[1], workspace));
+  TRY(find_velocity(t, q1, still, parameters, p, workspace));
   memcpy(u, q1, sizeof(real) * M);
   memcpy(velocity, y[0], sizeof velocity);
   memcpy(u + M, y[1], sizeof y[1]);
-  if (status == OK)
-    status = find_velocity(t, q1, still, parameters, p, workspace);
-  if (status != OK)
-    return status;
   for (int i = 0; i < M; i++) {
     y[0][i] -= p[i];
     y[1][i] -= p[i];
@@ -420,12 +402,9 @@ int NAME(multipliers)(long long count, const real *t, const real *q, const real 
   saddle *at = saddle_in(workspace);
   for (long long k = 0; k < count; k++) {
     real u[2 * M], value[M + 2 * CONSTRAINTS], g[CONSTRAINTS], a[M], *y = multiplier + k * CONSTRAINTS;
-    int status = find_velocity(t[k], q + k * M, p + k * M, parameters, u + M, workspace);
+    TRY(find_velocity(t[k], q + k * M, p + k * M, parameters, u + M, workspace));
     memcpy(u, q + k * M, sizeof(real) * M);
-    if (status == OK)
-      status = factorise_saddle_of(ACTUAL_FORCES, t[k], u, parameters, at, g);
-    if (status != OK)
-      return status;
+    TRY(factorise_saddle_of(ACTUAL_FORCES, t[k], u, parameters, at, g));
     constrained_motion(u, t[k], parameters, value);
     for (int j = 0; j < CONSTRAINTS; j++)
       value[M + CONSTRAINTS + j] = -value[M + CONSTRAINTS + j];
@@ -452,12 +431,9 @@ int NAME(contact_terms)(real t, const real *q, const real *p, const real *idle, 
   real *G = W + MASKED * MASKED;
   real u[2 * M], g[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES], value[M + 2 * CONSTRAINTS], right[CONSTRAINTS] = {0};
   real x[M], y[CONSTRAINTS];
-  int status = find_velocity(t, q, p, idle, u + M, workspace);
+  TRY(find_velocity(t, q, p, idle, u + M, workspace));
   memcpy(u, q, sizeof(real) * M);
-  if (status == OK)
-    status = factorise_saddle(t, u, idle, at, g);
-  if (status != OK)
-    return status;
+  TRY(factorise_saddle(t, u, idle, at, g));
   constraints(u, t, imposed, g, derivative);
   constrained_motion(u, t, imposed, value);
   memcpy(terms, g + FIRST, sizeof(real) * MASKED);

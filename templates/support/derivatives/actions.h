@@ -57,10 +57,9 @@ int NAME(actions)(long long steps, const real *t, const real *h, const real *q, 
     const real *own = parameters + k * stride;
     const step_data step = step_from(t[k], h[k], q + k * M, p + k * M, carry, carry, own, workspace);
     real dq[M], dp[2 * M] = {0}, totals[SUMS];
-    int keep = 0, status = newton_from_line(&step, data, dp, &keep, options ? options : &standard, report);
+    int keep = 0;
     report->t = t[k];
-    if (status != OK)
-      return status;
+    TRY(newton_from_line(&step, data, dp, &keep, options ? options : &standard, report));
     gather(END_POSITION, 1, step.h, data->z, M, dq, 0, 1);
     for (int i = 0; i < M; i++) {
       q1[k * M + i] = step.q0[i] + dq[i];

@@ -64,17 +64,15 @@ static void end_time(const linearised_step *at, int back)
 int NAME(energy_gradient)(const real *q, const real *p, const real *parameters, real *partials, real *workspace)
 {
   real u[2 * M];
-  int status = OK;
   memcpy(u, q, sizeof(real) * M);
 #ifdef FROM_MOMENTA
   memcpy(u + M, p, sizeof(real) * M);
   (void)workspace;
 #else
-  status = NAME(velocity)(0, q, p, parameters, u + M, workspace);
+  TRY(NAME(velocity)(0, q, p, parameters, u + M, workspace));
 #endif
-  if (status == OK)
-    energy_derivatives(u, 0, parameters, partials);
-  return status == OK && !all_finite(partials, STEP_INPUTS - 2) ? NOT_FINITE : status;
+  energy_derivatives(u, 0, parameters, partials);
+  return all_finite(partials, STEP_INPUTS - 2) ? OK : NOT_FINITE;
 }
 #else
 /* Linearised time without time transformation: t + h. */
@@ -132,9 +130,8 @@ static int linearise_step(linearised_step *at, const solver_options *options, re
 #endif
   const long long before = report->iterations;
   real dq[M], dp[2 * M] = {0}, size_p[SITES], size_q[M], *partials = at->partials;
-  int keep = 0, status = newton_from_line(step, at->data, dp, &keep, options, report);
-  if (status != OK)
-    return status;
+  int keep = 0;
+  TRY(newton_from_line(step, at->data, dp, &keep, options, report));
   gather(END_POSITION, 1, step->h, at->data->z, M, dq, 0, 1);
   if (is_spurious(step, at->data->z, dq, report->iterations - before))
     return STATUS(SPURIOUS_SOLUTION);
@@ -144,21 +141,20 @@ static int linearise_step(linearised_step *at, const solver_options *options, re
   for (int f = 0; f < COUNT_OF_GROUPS; f++)
     partials = derivatives_of_group(STAGE_GROUPS + f, step, at->data->z, partials);
 #ifdef FIRST_ORDER_SYSTEM
-  status = variables_of_momenta(step, at->data->z, dq, dp);
+  TRY(variables_of_momenta(step, at->data->z, dq, dp));
 #endif
   for (int i = 0; i < M; i++) {
     dq[i] = step->q0[i] + dq[i];
     at->p1[i] = step->p0[i] + (dp[i] + dp[M + i]);
   }
 #ifdef FIRST_ORDER_SYSTEM
-  if (status == OK)
-    status = linearise_momenta(step, dq, at->p1, &at->momenta);
+  TRY(linearise_momenta(step, dq, at->p1, &at->momenta));
 #endif
   for (int i = 0; q1 && i < M; i++) {
     q1[i] = dq[i];
     p1[i] = at->p1[i];
   }
-  return status;
+  return OK;
 }
 
 /* From v (back: to it) to all rows, or from dz to the last one, that of p1, through all points. */

@@ -42,15 +42,12 @@ static int vectors_by_newton(propagation *over, long long k, int first)
   const real nothing[M] = {0};
   const step_data step = step_of(over, k, nothing);
   linearised_step at = linearised_in(&step, over->workspace);
-  int status;
   over->report->t = step.t;
-  status = linearise_step(&at, over->options, over->q1 ? over->q1 + k * M : NULL, over->q1 ? over->p1 + k * M : NULL,
-      over->report);
   over->guess = 0;
-  if (status == OK)
-    status = propagate_vectors(&at, over->back, over->count - first, vectors_from(over, k) + first * STEP_INPUTS,
-        vectors_to(over, k) + first * STEP_INPUTS);
-  return status;
+  TRY(linearise_step(&at, over->options, over->q1 ? over->q1 + k * M : NULL, over->q1 ? over->p1 + k * M : NULL,
+      over->report));
+  return propagate_vectors(&at, over->back, over->count - first, vectors_from(over, k) + first * STEP_INPUTS,
+      vectors_to(over, k) + first * STEP_INPUTS);
 }
 
 #ifdef VECTORS_BY_ITERATION

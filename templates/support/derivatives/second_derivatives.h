@@ -206,14 +206,10 @@ int NAME(second_order)(long long steps, const real *t, const real *h, const real
   for (long long k = steps - 1; k >= 0; k--) {
     const step_data step = step_from(t[k], h[k], q + k * M, p + k * M, carry, carry, parameters, workspace);
     linearised_step at = linearised_in(&step, workspace);
-    int status;
     report->t = t[k];
-    status = linearise_step(&at, options ? options : &standard, NULL, NULL, report);
-    if (status == OK)
-      status = hessian_of_vectors(&at, count, changes + k * across, vectors + (k + 1) * 2 * across,
-          vectors + k * 2 * across);
-    if (status != OK)
-      return status;
+    TRY(linearise_step(&at, options ? options : &standard, NULL, NULL, report));
+    TRY(hessian_of_vectors(
+        &at, count, changes + k * across, vectors + (k + 1) * 2 * across, vectors + k * 2 * across));
     report->steps++;
   }
   return OK;

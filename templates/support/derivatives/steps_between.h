@@ -86,10 +86,8 @@ int NAME(steps_between)(long long steps, const real *t, const real *h, const rea
     real start_p[M], increment[M], totals[SUMS];
     const step_data step = step_from(t[k], h[k], q0 + k * M, start_p, carry, carry, parameters + k * stride, workspace);
     linearised_step at = linearised_in(&step, workspace);
-    int status = newton_between(&step, at.data, q1 + k * M, start_p, increment, options ? options : &standard, report);
     report->t = t[k];
-    if (status != OK)
-      return status;
+    TRY(newton_between(&step, at.data, q1 + k * M, start_p, increment, options ? options : &standard, report));
     for (int i = 0; i < M; i++) {
       p0[k * M + i] = start_p[i];
       p1[k * M + i] = at.p1[i] = start_p[i] + increment[i];

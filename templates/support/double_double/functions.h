@@ -5,8 +5,7 @@
  * OF(is_small)(x), 1 if |x| < 1/4, else 0; OF(sign)(x); and log, atan2 and asinh of libm as OF(log_of) etc. */
 static inline PAIR OF(constant)(const double *words)
 {
-  const PAIR result = {BROADCAST(words[0]), BROADCAST(words[1])};
-  return result;
+  return (PAIR){BROADCAST(words[0]), BROADCAST(words[1])};
 }
 
 /* x - k unit for a unit of three words; k is the nearest whole number to x / unit, so that the first difference is

@@ -42,12 +42,12 @@ static inline int variable_pairs(const step_data *step, const pair_equations *at
     u[M + i] = dd_word(step->p0[i] + (step->carry_p[i] + dp[i]));
     theta[i] = dd_add(at->p0[i], at->rows[i * (B + 1) + B]);
   }
-  const int status = correct_transform(dd_add(at->t, at->h), u, theta, at->parameters, step->scratch);
+  TRY(correct_transform(dd_add(at->t, at->h), u, theta, at->parameters, step->scratch));
   for (int i = 0; i < M; i++) {
     const dd change = dd_subtract(u[M + i], dd_of(step->p0[i], step->carry_p[i]));
     dp[i] = change.high, dp[M + i] = change.low;
   }
-  return status;
+  return OK;
 }
 #endif
 
@@ -132,9 +132,7 @@ static int refine_unknowns(const step_data *step, double *memory, double t_low, 
 #endif
   }
 #ifdef FIRST_ORDER_SYSTEM
-  const int status = variable_pairs(step, &at, dq, dp);
-  if (status != OK)
-    return status;
+  TRY(variable_pairs(step, &at, dq, dp));
 #endif
   return all_finite(dq, 2 * M) && all_finite(dp, 2 * M) ? OK : NOT_FINITE;
 }

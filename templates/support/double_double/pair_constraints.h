@@ -28,9 +28,7 @@ static int constrained_pairs(dd t, const dd *q, const dd *p, const double *param
     double *workspace)
 {
   dd value[M + 2 * CONSTRAINTS];
-  const int status = velocities_of(t, q, p, parameters, u + M, workspace);
-  if (status != OK)
-    return status;
+  TRY(velocities_of(t, q, p, parameters, u + M, workspace));
   memcpy(u, q, sizeof(dd) * M);
   constraints_pairs(u, t, parameters, g);
   constrained_motion_pairs(u, t, parameters, value);
@@ -45,10 +43,8 @@ int NAME(constraint_values)(long long count, const double *t, const double *q, c
     dd positions[M], momenta[M], u[2 * M], values[CONSTRAINTS + CONSTRAINT_ENTRIES], rates[CONSTRAINTS];
     load_pairs(q + k * 2 * M, positions);
     load_pairs(p + k * 2 * M, momenta);
-    const int status = constrained_pairs(dd_of(t[2 * k], t[2 * k + 1]), positions, momenta, parameters, u, values,
-        rates, workspace);
-    if (status != OK)
-      return status;
+    TRY(constrained_pairs(dd_of(t[2 * k], t[2 * k + 1]), positions, momenta, parameters, u, values,
+        rates, workspace));
     high_words(values, CONSTRAINTS, g + k * CONSTRAINTS);
     high_words(rates, CONSTRAINTS, rate + k * CONSTRAINTS);
     if (!all_finite(g + k * CONSTRAINTS, CONSTRAINTS) || !all_finite(rate + k * CONSTRAINTS, CONSTRAINTS))
@@ -79,61 +75,45 @@ int NAME(project)(const double *time, const double *q0, const double *p0, const 
   const double t = now.high;
   double high[2 * M], g[CONSTRAINTS], right[CONSTRAINTS], y[CONSTRAINTS], update[M], size = INFINITY;
   dd q[M], p[M], moved[M], u[2 * M], values[CONSTRAINTS + CONSTRAINT_ENTRIES], rate[CONSTRAINTS], sum[CONSTRAINTS];
-  int status = find_velocity(t, q0, p0, parameters, high + M, workspace);
+  TRY(find_velocity(t, q0, p0, parameters, high + M, workspace));
   load_pairs(q0, q);
   memcpy(high, q0, sizeof(double) * M);
-  if (status == OK)
-    status = project_position(t, high, parameters, at);
+  TRY(project_position(t, high, parameters, at));
   for (int i = 0; i < M; i++)
     moved[i] = dd_add(q[i], dd_two_sum(high[i], -q0[i]));
-  if (status == OK && misfit_of_pairs(now, moved, parameters) < misfit_of_pairs(now, q, parameters))
+  if (misfit_of_pairs(now, moved, parameters) < misfit_of_pairs(now, q, parameters))
     memcpy(q, moved, sizeof q);
-  for (int k = 0; status == OK && k < MOST_PAIR_CORRECTIONS && size > SETTLED_PAIRS * largest_high(q); k++) {
+  for (int k = 0; k < MOST_PAIR_CORRECTIONS && size > SETTLED_PAIRS * largest_high(q); k++) {
     high_words(q, M, high);
-    status = factorise_saddle(t, high, parameters, at, g);
+    TRY(factorise_saddle(t, high, parameters, at, g));
     constraints_pairs(q, now, parameters, values);
     for (int j = 0; j < CONSTRAINTS; j++)
       right[j] = -values[j].high;
-    if (status == OK)
-      solve_saddle(at, NULL, right, update, y);
-    for (int i = 0; status == OK && i < M; i++)
+    solve_saddle(at, NULL, right, update, y);
+    for (int i = 0; i < M; i++)
       q[i] = dd_add(q[i], dd_word(update[i]));
     size = largest_of(update);
   }
   memset(sum, 0, sizeof sum);
   size = INFINITY;
-  for (int k = 0; status == OK && k < MOST_PAIR_CORRECTIONS && (k < 2 || size > SETTLED_PAIRS * largest_of(high + M));
-      k++) {
+  for (int k = 0; k < MOST_PAIR_CORRECTIONS && (k < 2 || size > SETTLED_PAIRS * largest_of(high + M)); k++) {
     load_pairs(p0, p);
     constraints_pairs(q, now, parameters, values);
     for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
       p[CONSTRAINT_ENTRY[e][1]] = dd_subtract(p[CONSTRAINT_ENTRY[e][1]],
           dd_multiply(values[CONSTRAINTS + e], sum[CONSTRAINT_ENTRY[e][0]]));
-    status = constrained_pairs(now, q, p, parameters, u, values, rate, workspace);
+    TRY(constrained_pairs(now, q, p, parameters, u, values, rate, workspace));
     high_words(u, 2 * M, high);
-    if (status == OK)
-      status = factorise_saddle(t, high, parameters, at, g);
+    TRY(factorise_saddle(t, high, parameters, at, g));
     for (int j = 0; j < CONSTRAINTS; j++)
       right[j] = -rate[j].high;
-    if (status == OK)
-      solve_saddle(at, NULL, right, update, y);
-    for (int j = 0; status == OK && j < CONSTRAINTS; j++)
+    solve_saddle(at, NULL, right, update, y);
+    for (int j = 0; j < CONSTRAINTS; j++)
       sum[j] = dd_add(sum[j], dd_word(y[j]));
     size = largest_of(update);
   }
-  if (status != OK)
-    return status;
-  status = store_pairs(q, q1);
-  return status == OK ? store_pairs(p, p1) : status;
-}
-
-/* Relative size of a difference d with the dual e, of vectors whose larger squared norm is `size`. */
-static double relative_size(const double *d, const double *e, double size)
-{
-  double sum = 0.0;
-  for (int i = 0; i < M; i++)
-    sum += d[i] * e[i];
-  return size > 0.0 ? sqrt(fabs(sum) / size) : 0.0;
+  TRY(store_pairs(q, q1));
+  return store_pairs(p, p1);
 }
 
 static double product_of_vectors(const double *x, const double *y)
@@ -142,6 +122,12 @@ static double product_of_vectors(const double *x, const double *y)
   for (int i = 0; i < M; i++)
     sum += x[i] * y[i];
   return fabs(sum);
+}
+
+/* Relative size of a difference d with the dual e, of vectors whose larger squared norm is `size`. */
+static double relative_size(const double *d, const double *e, double size)
+{
+  return size > 0.0 ? sqrt(product_of_vectors(d, e) / size) : 0.0;
 }
 
 /* Relative distances of two states: positions in the metric of the mass matrix, momenta in that of its inverse. */
@@ -153,16 +139,12 @@ int NAME(apart)(const double *time, const double *q0, const double *p0, const do
   const double still[M] = {0};
   double u[2 * M], p[M], v[M], other[M], d[M], e[M], mass[MASS_ENTRIES];
   dd q[M], x[2][M], velocity[2][M];
-  int status = OK;
   load_pairs(q1, q);
-  for (int k = 0; status == OK && k < 2; k++) {
+  for (int k = 0; k < 2; k++) {
     load_pairs(k ? p1 : p0, x[k]);
-    status = velocities_of(now, q, x[k], parameters, velocity[k], workspace);
+    TRY(velocities_of(now, q, x[k], parameters, velocity[k], workspace));
   }
-  if (status == OK)
-    status = find_velocity(t, q1, still, parameters, p, workspace);
-  if (status != OK)
-    return status;
+  TRY(find_velocity(t, q1, still, parameters, p, workspace));
   for (int i = 0; i < M; i++) {
     d[i] = dd_subtract(x[1][i], x[0][i]).high;
     e[i] = dd_subtract(velocity[1][i], velocity[0][i]).high;
@@ -195,12 +177,9 @@ int NAME(multipliers)(long long count, const double *t, const double *q, const d
     double high[2 * M], none[CONSTRAINTS], *to = multiplier + k * 2 * CONSTRAINTS;
     load_pairs(q + k * 2 * M, positions);
     load_pairs(p + k * 2 * M, momenta);
-    int status = constrained_pairs(then, positions, momenta, parameters, u, g, rate, workspace);
+    TRY(constrained_pairs(then, positions, momenta, parameters, u, g, rate, workspace));
     high_words(u, 2 * M, high);
-    if (status == OK)
-      status = factorise_saddle(t[2 * k], high, parameters, at, none);
-    if (status != OK)
-      return status;
+    TRY(factorise_saddle(t[2 * k], high, parameters, at, none));
     memset(a, 0, sizeof a);
     memset(y, 0, sizeof y);
     legendre_pairs(u, then, parameters, mass);

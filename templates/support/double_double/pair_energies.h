@@ -8,8 +8,8 @@ int NAME(momentum)(const double *t, const double *q, const double *v, const doub
   dd positions[M], velocity[M], result[M];
   load_pairs(q, positions);
   load_pairs(v, velocity);
-  const int status = momenta_of(dd_of(t[0], t[1]), positions, velocity, parameters, result, workspace);
-  return status == OK ? store_pairs(result, p) : status;
+  TRY(momenta_of(dd_of(t[0], t[1]), positions, velocity, parameters, result, workspace));
+  return store_pairs(result, p);
 }
 
 int NAME(velocity)(const double *t, const double *q, const double *p, const double *parameters, double *v,
@@ -18,8 +18,8 @@ int NAME(velocity)(const double *t, const double *q, const double *p, const doub
   dd positions[M], momentum[M], result[M];
   load_pairs(q, positions);
   load_pairs(p, momentum);
-  const int status = velocities_of(dd_of(t[0], t[1]), positions, momentum, parameters, result, workspace);
-  return status == OK ? store_pairs(result, v) : status;
+  TRY(velocities_of(dd_of(t[0], t[1]), positions, momentum, parameters, result, workspace));
+  return store_pairs(result, v);
 }
 
 static int energy_of(dd t, const double *q, const double *p, const double *parameters, double *energy,
@@ -34,9 +34,7 @@ static int energy_of(dd t, const double *q, const double *p, const double *param
 #else
   dd momentum[M], value;
   load_pairs(p, momentum);
-  const int status = velocities_of(t, u, momentum, parameters, u + M, workspace);
-  if (status != OK)
-    return status;
+  TRY(velocities_of(t, u, momentum, parameters, u + M, workspace));
   lagrangian_pairs(u, t, parameters, &value);
   sum = dd_negative(value);
   for (int i = 0; i < M; i++)
@@ -56,12 +54,9 @@ int NAME(energy)(double t, const double *q, const double *p, const double *param
 int NAME(energies)(long long count, const double *t, const double *q, const double *p, const double *parameters,
     double *energy, double *workspace)
 {
-  for (long long k = 0; k < count; k++) {
-    const int status = energy_of(dd_of(t[2 * k], t[2 * k + 1]), q + k * 2 * M, p + k * 2 * M, parameters,
-        energy + 2 * k, workspace);
-    if (status != OK)
-      return status;
-  }
+  for (long long k = 0; k < count; k++)
+    TRY(energy_of(dd_of(t[2 * k], t[2 * k + 1]), q + k * 2 * M, p + k * 2 * M, parameters,
+        energy + 2 * k, workspace));
   return OK;
 }
 

@@ -25,9 +25,7 @@ static int refine_increments(const step_data *step, double *memory, double t_low
   int status, keep;
   if (((solved_step *)step->points)->by_iteration && refine_velocities(step, t_low, h_low, dq, dp, passed) == OK)
     return OK;
-  status = newton_from_line(step, newton_in(workspace), dp, &keep, &options, &report);
-  if (status != OK)
-    return status;
+  TRY(newton_from_line(step, newton_in(workspace), dp, &keep, &options, &report));
   memory = unknowns;
   memcpy(memory, newton_in(workspace)->z, sizeof(double) * N);
 #endif

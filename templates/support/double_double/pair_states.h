@@ -66,9 +66,7 @@ static inline int invert_pairs(dd t, dd *u, const dd *y, const double *parameter
   double q[M], high[M], value[M];
   for (int i = 0; i < M; i++)
     q[i] = u[i].high, high[i] = y[i].high;
-  const int status = inverse_transform(t.high, q, high, parameters, value, workspace);
-  if (status != OK)
-    return status;
+  TRY(inverse_transform(t.high, q, high, parameters, value, workspace));
   for (int i = 0; i < M; i++)
     u[M + i] = dd_word(value[i]);
   return correct_transform(t, u, y, parameters, workspace);
@@ -85,12 +83,11 @@ static inline int state_transform(int inverse, dd t, const dd *q, const dd *x, c
     double *workspace)
 {
   dd u[2 * M];
-  int status = OK;
   memcpy(u, q, sizeof(dd) * M);
   if (inverse) {
-    status = MASS_ENTRIES || !MOMENTA_INVERTED ? invert_pairs(t, u, x, parameters, workspace) : SINGULAR;
+    TRY(MASS_ENTRIES || !MOMENTA_INVERTED ? invert_pairs(t, u, x, parameters, workspace) : SINGULAR);
     memcpy(y, u + M, sizeof(dd) * M);
-    return status;
+    return OK;
   }
   memcpy(u + M, x, sizeof(dd) * M);
   return transform_of_pairs(t, u, parameters, y, workspace);

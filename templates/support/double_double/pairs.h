@@ -7,30 +7,26 @@ typedef struct {
 
 INLINE PAIR OF(word)(NUMBER x)
 {
-  const PAIR result = {x, BROADCAST(0.0)};
-  return result;
+  return (PAIR){x, BROADCAST(0.0)};
 }
 
 INLINE PAIR OF(two_sum)(NUMBER a, NUMBER b)
 {
   const NUMBER sum = a + b, part = sum - a;
-  const PAIR result = {sum, (a - (sum - part)) + (b - part)};
-  return result;
+  return (PAIR){sum, (a - (sum - part)) + (b - part)};
 }
 
 /* The same for |a| >= |b| or a = 0. */
 INLINE PAIR OF(fast_two_sum)(NUMBER a, NUMBER b)
 {
   const NUMBER sum = a + b;
-  const PAIR result = {sum, b - (sum - a)};
-  return result;
+  return (PAIR){sum, b - (sum - a)};
 }
 
 INLINE PAIR OF(two_product)(NUMBER a, NUMBER b)
 {
   const NUMBER product = a * b;
-  const PAIR result = {product, FMA(a, b, -product)};
-  return result;
+  return (PAIR){product, FMA(a, b, -product)};
 }
 
 /* Relative error 3 u^2 (u = 2^-53), also if the high words cancel. */
@@ -63,8 +59,7 @@ INLINE PAIR OF(plus)(PAIR a, PAIR b)
 
 INLINE PAIR OF(negative)(PAIR a)
 {
-  const PAIR result = {-a.high, -a.low};
-  return result;
+  return (PAIR){-a.high, -a.low};
 }
 
 INLINE PAIR OF(difference)(PAIR a, PAIR b)
@@ -96,8 +91,7 @@ INLINE PAIR OF(multiple)(PAIR a, NUMBER b)
 /* With a power of two, exactly. */
 INLINE PAIR OF(times_power)(PAIR a, NUMBER b)
 {
-  const PAIR result = {a.high * b, a.low * b};
-  return result;
+  return (PAIR){a.high * b, a.low * b};
 }
 
 /* With the square of the low word: terms of one sign must be added to a product before that is rounded, here and below,

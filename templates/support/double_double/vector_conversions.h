@@ -1,14 +1,12 @@
 /* Vectors of pairs from words, from numbers, and from the array of parameters. */
 static inline ddl ddl_of(dd x)
 {
-  const ddl result = {lanes_of(x.high), lanes_of(x.low)};
-  return result;
+  return (ddl){lanes_of(x.high), lanes_of(x.low)};
 }
 
 static inline ddl ddl_of_words(lanes high, lanes low)
 {
-  const ddl result = {high, low};
-  return result;
+  return (ddl){high, low};
 }
 
 #define PARAMETER_OF_LANES(i) ddl_of_words(parameters[i], parameters[PARAMETERS + (i)])

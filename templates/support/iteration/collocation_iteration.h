@@ -91,9 +91,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   lanes u[2 * M], force[M], mass[MASS];
   double inverse_size[M] = {0.0};
   progress now = before_iterations();
-  int status = first_curve(step, past, *steps, &curve);
-  if (status != OK)
-    return status;
+  TRY(first_curve(step, past, *steps, &curve));
   for (int k = 0; needs_iteration(&now); k++) {
     lanes change = lanes_of(0.0);
     double total;
@@ -120,9 +118,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
     if (is_stagnant(&now, options, k))
       measure_by_largest(stagnant(&now), inverse_size);
   }
-  status = outcome(&now, report);
-  if (status != OK)
-    return status;
+  TRY(outcome(&now, report));
   end_increment(step, &curve, dq);
   momentum_increment(step, data, &curve, dq, dp);
   if (!accept(step, dq, dp, report))

@@ -61,13 +61,10 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   secants before;
   before.begun = number_of(0.0);
 #endif
-  int status = OK;
   if (*steps > 0)
     continue_curve(step, past, *steps, z);
   else
-    status = start_velocities(step, z);
-  if (status != OK)
-    return status;
+    TRY(start_velocities(step, z));
   for (int k = 0; needs_iteration(&now); k++) {
     point_sums change = {lanes_of(0.0)};
     scale(data->position_weight, z, scaled);
@@ -168,9 +165,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
 #ifndef POINTS
   restore_early(&now, stored[0][0], z[0]);
 #endif
-  status = outcome(&now, report);
-  if (status != OK)
-    return status;
+  TRY(outcome(&now, report));
   converged_forces(step, data, value, z, r, impulse);
 #if defined(FOLLOWED) && !defined(POINTS)
   restore_early(&now, stored[1][0], impulse[0]);

@@ -139,16 +139,13 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
   coordinates stored[2][S];
 #endif
   progress now = before_iterations();
-  int status = OK;
   if (*steps > 0) {
     continue_curve(step, past, *steps, z);
     continue_curve(step, second_curve(past), *steps, force);
   } else {
-    status = start_velocities(step, z);
+    TRY(start_velocities(step, z));
     memset(force, 0, sizeof(coordinates) * GROUPS);
   }
-  if (status != OK)
-    return status;
   push(step, data, force, u);
   for (int k = 0; needs_iteration(&now); k++) {
     lanes before[GROUPS][M];
@@ -202,9 +199,7 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
       keep_early(step, data, z, u, force, joint, &now, stored);
 #endif
   }
-  status = outcome(&now, report);
-  if (status != OK)
-    return status;
+  TRY(outcome(&now, report));
   converged_forces(step, data, z, u, force, joint);
 #ifndef POINTS
   restore_early(&now, stored[0][0], z[0]);

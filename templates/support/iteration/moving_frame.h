@@ -270,7 +270,6 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   frame_state state;
   const step_data moving = into_frame(step, &state);
   progress now = before_iterations();
-  int status;
   memset(z, 0, sizeof z);
   memset(force, 0, sizeof force);
   for (int k = 0; needs_iteration(&now); k++) {
@@ -293,9 +292,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
     }
     take_change(&now, total_change(change) / POINTS, options, k, report);
   }
-  status = outcome(&now, report);
-  if (status != OK)
-    return status;
+  TRY(outcome(&now, report));
   scale(data->position_weight, z, scaled);
   for (int i = 0; i < M; i++)
     dq[i] = weigh(POINT_END_POSITION, scaled, i);

@@ -67,9 +67,8 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   const double h = step->h;
   double inverse_size[M] = {0.0};
   progress now = before_iterations();
-  int settled = 0, status = first_curve(step, past, *steps, &curve);
-  if (status != OK)
-    return status;
+  int settled = 0;
+  TRY(first_curve(step, past, *steps, &curve));
   for (int i = 0; i < M; i++)
     m[i] = lanes_of(0.0);
   if (*steps > 0)
@@ -122,9 +121,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
       now.status = 0;
     }
   }
-  status = outcome(&now, report);
-  if (status != OK)
-    return status;
+  TRY(outcome(&now, report));
   evaluate_nodes(step, &curve, m, node, mass);
   evaluate_points(step, &curve, action);
   end_increment(step, &curve, dq);

@@ -20,9 +20,7 @@ int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q1, cons
   }
   for (int n = 0; n < 2; n++) {
     const real then = t + KICK_ABSCISSA[n] * h;
-    const int status = NAME(energy)(then, ends[n], p, parameters, &energy, workspace);
-    if (status != OK)
-      return status;
+    TRY(NAME(energy)(then, ends[n], p, parameters, &energy, workspace));
     force(ends[n], then, parameters, F[n]);
     sum += KICK[n] * (product - energy);
   }
@@ -49,12 +47,9 @@ SELDOM int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q
   newton_data *data = newton_in(workspace + SCRATCH);
   real start_p[M], increment[M];
   const step_data step = step_from(t, h, q0, start_p, carry_q, carry_q, parameters, workspace);
-  int status;
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
-  status = newton_between(&step, data, q1, start_p, increment, options ? options : &standard, report);
-  if (status != OK)
-    return status;
+  TRY(newton_between(&step, data, q1, start_p, increment, options ? options : &standard, report));
   for (int i = 0; i < M; i++) {
     p0[i] = start_p[i];
     p1[i] = start_p[i] + increment[i];
@@ -75,13 +70,11 @@ SELDOM int NAME(work_and_impulses)(real t, real h, const real *q0, const real *p
   const step_data step = step_from(t, h, q0, p0, carry, carry, parameters, workspace);
   solver_report unread;
   real dq[M], dp[2 * M] = {0};
-  int keep = 0, status;
+  int keep = 0;
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
   report->t = t;
-  status = newton_from_line(&step, data, dp, &keep, options ? options : &standard, report);
-  if (status != OK)
-    return status;
+  TRY(newton_from_line(&step, data, dp, &keep, options ? options : &standard, report));
   sums_along(&step, data->z, given);
   gather(END_POSITION, 1, h, data->z, M, dq, 0, 1);
   if (!all_finite(given, SUMS) || !reaches(&step, dq, dp))

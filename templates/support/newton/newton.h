@@ -20,8 +20,7 @@ typedef struct {
 
 static movement no_movement(void)
 {
-  const movement none = {0};
-  return none;
+  return (movement){0};
 }
 
 static void measure(movement *moved, const real *change, const real *size)

@@ -8,12 +8,10 @@ static int newton_between(const step_data *step, newton_data *data, const real *
     const solver_options *options, solver_report *report)
 {
   real v[M];
-  int keep = 0, status;
+  int keep = 0;
   for (int i = 0; i < M; i++)
     v[i] = (q1[i] - step->q0[i]) / step->h;
-  status = find_momentum(step->t, step->q0, v, step->parameters, p0, step->scratch);
-  if (status != OK)
-    return status;
+  TRY(find_momentum(step->t, step->q0, v, step->parameters, p0, step->scratch));
   start_on_line(v, p0, data->z);
   return newton(step, data, q1, p0, increment, &keep, options, report);
 }

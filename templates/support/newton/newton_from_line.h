@@ -6,10 +6,9 @@
 static int line_from(const step_data *step, newton_data *data)
 {
   real v[M];
-  const int status = find_velocity(step->t, step->q0, step->p0, step->parameters, v, step->scratch);
-  if (status == OK)
-    start_on_line(v, step->p0, data->z);
-  return status;
+  TRY(find_velocity(step->t, step->q0, step->p0, step->parameters, v, step->scratch));
+  start_on_line(v, step->p0, data->z);
+  return OK;
 }
 
 /* Stages that solve the equations with a step size near 0 belong to a branch, on which those of the step lie. Newton's
@@ -54,14 +53,11 @@ static int newton_from_line(const step_data *step, newton_data *data, real *dp, 
     const solver_options *options, solver_report *report)
 {
   const long long before = report->iterations;
-  int status = line_from(step, data);
-  if (status != OK)
-    return status;
+  TRY(line_from(step, data));
   *keep = 0;
-  status = newton(step, data, NULL, NULL, dp, keep, options, report);
-  if (status == OK && report->iterations - before > NEARBY_ITERATIONS)
-    return follow_branch(step, data, dp, keep, options, report);
-  return status;
+  TRY(newton(step, data, NULL, NULL, dp, keep, options, report));
+  const int is_near = report->iterations - before <= NEARBY_ITERATIONS;
+  return is_near ? OK : follow_branch(step, data, dp, keep, options, report);
 }
 
 #ifdef SPURIOUS_TESTED

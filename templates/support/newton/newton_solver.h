@@ -52,16 +52,15 @@ static void guess_from(const real *memory, newton_data *data)
 static int variables_of_momenta(const step_data *step, const real *z, const real *dq, real *increment)
 {
   real u[2 * M], theta[M];
-  int status;
   for (int i = 0; i < M; i++) {
     u[i] = step->q0[i] + (step->carry_q[i] + dq[i]);
     u[M + i] = z[i * B + B - 1];
     theta[i] = step->theta0[i] + increment[i];
   }
-  status = invert_from(step->t + step->h, u, theta, step->parameters, step->scratch);
+  TRY(invert_from(step->t + step->h, u, theta, step->parameters, step->scratch));
   for (int i = 0; i < M; i++)
     increment[i] = (u[M + i] - step->p0[i]) - step->carry_p[i];
-  return status;
+  return OK;
 }
 #endif
 
@@ -104,14 +103,10 @@ static int solve(const step_data *step, const solver_data *way, real *memory, lo
     status = newton(step, data, NULL, NULL, dp, &keep, options, report);
   }
   if (status != OK)
-    status = newton_from_line(step, data, dp, &keep, options, report);
-  if (status != OK)
-    return status;
+    TRY(newton_from_line(step, data, dp, &keep, options, report));
   gather(END_POSITION, 1, step->h, data->z, M, dq, 0, 1);
 #ifdef FIRST_ORDER_SYSTEM
-  status = variables_of_momenta(step, data->z, dq, dp);
-  if (status != OK)
-    return status;
+  TRY(variables_of_momenta(step, data->z, dq, dp));
 #endif
   if (!reaches(step, dq, dp))
     return NOT_FINITE;
@@ -120,5 +115,5 @@ static int solve(const step_data *step, const solver_data *way, real *memory, lo
   memcpy(memory + N, data->point, sizeof(real) * POINT);
   *guess = falls_back ? after_fallback(*guess) : POINT > 0 && keep ? 2
                                                                    : 1;
-  return status;
+  return OK;
 }

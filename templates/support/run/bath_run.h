@@ -121,9 +121,7 @@ static int step_of_bath(const bath_call *call, run_memory *run, double temperatu
       run->reversed = !run->reversed;
     }
   } else {
-    status = step_in_halves(call, &before, h, q, p);
-    if (status != OK)
-      return status;
+    TRY(step_in_halves(call, &before, h, q, p));
     memcpy(run->q, q, sizeof q);
     memcpy(run->p, p, sizeof p);
     memset(run->carry_q, 0, sizeof run->carry_q);

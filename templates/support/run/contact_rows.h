@@ -144,9 +144,8 @@ static int terms_at(const event_step *step, const event_sample *at, contact_term
 {
   real *const v = step->memory + 3 * M, power = 0.0;
   const real duration = fabs(step->whole);
-  int status = rows_at(at->t, at->q, at->p, step->own, of, step->workspace);
-  if (status == OK)
-    status = NAME(velocity)(at->t, at->q, at->p, step->own, v, step->workspace);
+  TRY(rows_at(at->t, at->q, at->p, step->own, of, step->workspace));
+  TRY(NAME(velocity)(at->t, at->q, at->p, step->own, v, step->workspace));
   for (int i = 0; i < M; i++)
     power += at->p[i] * v[i];
   for (int r = 0; r < CONTACT_ROWS; r++) {
@@ -166,13 +165,13 @@ static int terms_at(const event_step *step, const event_sample *at, contact_term
     of->size[r] = fmax(by_position, of->terms[r]) + of->speed[r] * duration;
   }
   memset(of->absent, 0, sizeof of->absent);
-  for (int i = 0; status == OK && i < TRANSITIONS; i++) {
+  for (int i = 0; i < TRANSITIONS; i++) {
     const int event = FIRST_TRANSITION + i, k = TRANSITION[i][0], row = CONTACTS[k].normal;
     int exists;
     if (TRANSITION[i][1] != CONTACT_CLOSES || !IS_CONDITIONAL[event])
       continue;
-    status = conditions(EVENT_FIRST[event], at->t, at->q, at->p, step->parameters, &exists, step->workspace);
+    TRY(conditions(EVENT_FIRST[event], at->t, at->q, at->p, step->parameters, &exists, step->workspace));
     of->absent[k] = !exists || of->value[row] < -CONTACT_PENETRATION * of->size[row];
   }
-  return status;
+  return OK;
 }

@@ -47,19 +47,20 @@ static int keeps_direction(const real *start, const real *w)
   return length_of(start, 2) > length_of(w, 2) * length_of(w, 2);
 }
 
-/* Present modes, the forces and second rates in them; returns 0 without slips in space, or without forces. */
+/* Present modes, the forces and second rates in them, if there are slips in space (*any), and forces. */
 static int slips_at(const event_step *step, const event_sample *at, contact_terms *of, contact_mode *mode, real *force,
-    real *second, int *status)
+    real *second, int *any)
 {
   const real *const modes = step->watch->mode;
-  int slips = 0;
+  *any = 0;
   for (int k = 0; k < EVENT_CONTACTS; k++)
-    slips |= CONTACTS[k].slips == 2 && modes[CONTACTS[k].direction] != 0.0 && !mode_of(modes, k).held;
-  *status = slips ? terms_at(step, at, of) : OK;
-  if (!slips || *status != OK)
-    return 0;
+    *any |= CONTACTS[k].slips == 2 && modes[CONTACTS[k].direction] != 0.0 && !mode_of(modes, k).held;
+  if (!*any)
+    return OK;
+  TRY(terms_at(step, at, of));
   modes_at(of, modes, mode);
-  return solve_contacts(of, mode, of->second, force, second, NULL) <= CONTACT_ROUNDING;
+  *any = solve_contacts(of, mode, of->second, force, second, NULL) <= CONTACT_ROUNDING;
+  return OK;
 }
 
 /* Directions in a part of a step of slips that begin, by the midpoint rule: friction is opposite to w + (part/2) w', w'
@@ -73,12 +74,9 @@ static int turn_slips(const event_step *step, const event_sample *at, const cont
   contact_problem in = {.of = &there};
   real right[CONTACT_ROWS];
   solver_report own;
-  int status = NAME(step)(at->t, 0.5 * part, at->q, at->p, step->own, step->options, middle.q, middle.p, &own,
-      step->workspace);
-  if (status == OK)
-    status = terms_at(step, &middle, &there);
-  if (status != OK)
-    return status;
+  TRY(NAME(step)(at->t, 0.5 * part, at->q, at->p, step->own, step->options, middle.q, middle.p, &own,
+      step->workspace));
+  TRY(terms_at(step, &middle, &there));
   memcpy(right, there.second, sizeof right);
   in.right = right;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
@@ -97,7 +95,7 @@ static int turn_slips(const event_step *step, const event_sample *at, const cont
     for (int i = 0; begins[k] && size > 0.0 && i < 2; i++) /* without a force any direction is right */
       mode[k].direction[i] = -tau[i] / size;
   }
-  return status;
+  return OK;
 }
 
 /* Slips in space at the beginning of a part of a step, of at most *longest. Where they stop and where they begin
@@ -109,10 +107,11 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
   contact_terms of;
   contact_mode mode[EVENT_CONTACTS];
   real force[CONTACT_ROWS], second[CONTACT_ROWS], direction[EVENT_CONTACTS][2], most = *longest;
-  int keeps[EVENT_CONTACTS], begins[EVENT_CONTACTS], changes = 0, turns = 0, status;
+  int keeps[EVENT_CONTACTS], begins[EVENT_CONTACTS], changes = 0, turns = 0, any;
   *longest = INFINITY;
-  if (!slips_at(step, at, &of, mode, force, second, &status))
-    return status;
+  TRY(slips_at(step, at, &of, mode, force, second, &any));
+  if (!any)
+    return OK;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int slip = CONTACTS[k].tangential;
     const real *const start = step->watch->mode + CONTACTS[k].direction + 1, *const ahead = start + 2;
@@ -141,10 +140,10 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
       direction[k][i] = size > 0.0 && !(keeps[k] && kept) ? w[i] / size : ahead[i];
   }
   if (turns)
-    status = turn_slips(step, at, &of, begins, mode, force, fmin(*longest, most));
-  if (status == OK && changes)
-    status = add_change(step, FIRST_TRANSITION, at);
-  for (int k = 0; status == OK && changes && k < EVENT_CONTACTS; k++) {
+    TRY(turn_slips(step, at, &of, begins, mode, force, fmin(*longest, most)));
+  if (changes)
+    TRY(add_change(step, FIRST_TRANSITION, at));
+  for (int k = 0; changes && k < EVENT_CONTACTS; k++) {
     real *const start = step->watch->mode + CONTACTS[k].direction + 1;
     for (int i = 0; keeps[k] >= 0 && i < 2; i++) {
       start[2 + i] = begins[k] ? mode[k].direction[i] : direction[k][i];
@@ -152,6 +151,6 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
     }
   }
   put_modes(step->watch->mode, step->own);
-  return status;
+  return OK;
 }
 #endif

@@ -60,11 +60,13 @@ static int stop_together(const event_step *step, event_sample *at, contact_terms
 {
   contact_mode mode[EVENT_CONTACTS];
   real force[CONTACT_ROWS], second[CONTACT_ROWS];
-  int any = 0, status = OK;
+  int any = 0;
   for (int k = 0; k < EVENT_CONTACTS; k++)
     any |= CONTACTS[k].slips == 2 && now->stops[k] && now->rests[k];
-  if (!any || !slips_at(step, at, of, mode, force, second, &status))
-    return status;
+  if (any)
+    TRY(slips_at(step, at, of, mode, force, second, &any));
+  if (!any)
+    return OK;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const real *const d = mode[k].direction, *const w = second + CONTACTS[k].tangential;
     now->rests[k] |= CONTACTS[k].slips == 2 && d[0] * w[0] + d[1] * w[1] < 0.0 && stops_at(step, of, k);
@@ -80,44 +82,40 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
   contact_terms of;
   contact_mode present[EVENT_CONTACTS];
   real force[CONTACT_ROWS];
-  int closed[EVENT_CONTACTS], outside[EVENT_CONTACTS], approach = 0, first = 0, status = terms_at(step, at, &of);
+  int closed[EVENT_CONTACTS], outside[EVENT_CONTACTS], approach = 0, first = 0;
+  TRY(terms_at(step, at, &of));
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const contact_mode mode = mode_of(step->watch->mode, k);
-    if (status == OK && CONTACTS[k].slips > 0)
+    if (CONTACTS[k].slips > 0)
       step->watch->fastest[k] = fmax(step->watch->fastest[k], of.speed[CONTACTS[k].tangential]);
     closed[k] = CONTACTS[k].normal >= 0 && mode.closed && !now->leaves[k];
     now->touches[k] |= closed[k];
     now->rests[k] = mode.sticks || (mode.closed && mode.held) || (now->stops[k] && stops_at(step, &of, k));
     now->rests[k] &= !now->begins[k];
-    approach |= status == OK && is_met(&of, now, closed, k) && /* also one that just does not close yet */
+    approach |= is_met(&of, now, closed, k) && /* also one that just does not close yet */
         of.rate[CONTACTS[k].normal] < (now->closes[k] ? 0.0 : -CONTACT_ROUNDING * of.speed[CONTACTS[k].normal]);
   }
-  if (status == OK)
-    forces_at(at->t, at->q, at->p, step->own, present, force, step->workspace);
-  if (status == OK && approach)
-    status = collide(step, at, &of, closed, now);
+  forces_at(at->t, at->q, at->p, step->own, present, force, step->workspace);
+  if (approach)
+    TRY(collide(step, at, &of, closed, now));
 #ifdef CONTACTS_IN_SPACE
-  else if (status == OK)
-    status = stop_together(step, at, &of, now);
+  else
+    TRY(stop_together(step, at, &of, now));
 #endif
-  for (int pass = 0; status == OK && first >= 0 && pass <= EVENT_CONTACTS; pass++) {
-    status = choose_modes(step, &of, now, force);
-    if (status == OK)
-      status = satisfy_constraints(step, at->t, at->q, at->p, 1);
-    if (status == OK)
-      status = terms_at(step, at, &of);
-    if (status == OK)
-      first = find_outside(step, &of, CONTACT_ROUNDING, outside);
+  for (int pass = 0; first >= 0 && pass <= EVENT_CONTACTS; pass++) {
+    TRY(choose_modes(step, &of, now, force));
+    TRY(satisfy_constraints(step, at->t, at->q, at->p, 1));
+    TRY(terms_at(step, at, &of));
+    first = find_outside(step, &of, CONTACT_ROUNDING, outside);
   }
-  if (status == OK && first >= 0)
+  if (first >= 0)
     first = find_outside(step, &of, CONTACT_OUTSIDE, outside);
-  if (status == OK && first == EVENT_CONTACTS)
-    status = refuse(step, CONTACT_WITHOUT_MODE, -1, 0.0);
-  else if (status == OK && first >= 0)
-    status = refuse(step, CONTACT_LEAVES_CONE, first, 0.0);
-  if (status == OK)
-    note_opening(step, &of, closed);
-  return status;
+  if (first == EVENT_CONTACTS)
+    return refuse(step, CONTACT_WITHOUT_MODE, -1, 0.0);
+  else if (first >= 0)
+    return refuse(step, CONTACT_LEAVES_CONE, first, 0.0);
+  note_opening(step, &of, closed);
+  return OK;
 }
 
 #ifdef CONTACTS_IN_SPACE
@@ -129,17 +127,18 @@ static int renew_slips(const event_step *step, event_sample *at, real *longest)
   const real most = *longest;
   contact_change now;
   contact_terms of;
-  int outside[EVENT_CONTACTS], status = follow_slips(step, at, longest);
-  if (status == OK && *step->filled > before)
-    status = terms_at(step, at, &of);
-  const int first =
-      status == OK && *step->filled > before ? find_outside(step, &of, CONTACT_ROUNDING, outside) : -1;
+  int outside[EVENT_CONTACTS], first = -1;
+  TRY(follow_slips(step, at, longest));
+  if (*step->filled > before) {
+    TRY(terms_at(step, at, &of));
+    first = find_outside(step, &of, CONTACT_ROUNDING, outside);
+  }
   if (first < 0 || first == EVENT_CONTACTS)
-    return status;
+    return OK;
   memset(&now, 0, sizeof now);
-  status = change_modes(step, at, &now);
+  TRY(change_modes(step, at, &now));
   *longest = most;
-  return status == OK ? follow_slips(step, at, longest) : status;
+  return follow_slips(step, at, longest);
 }
 #endif
 
@@ -183,23 +182,20 @@ static int begin_contacts(const event_step *step, event_sample *at)
   contact_terms of;
   contact_change now;
   real impossible = 0.0;
-  int status;
   memset(&now, 0, sizeof now);
   for (int k = 0; k < EVENT_CONTACTS; k++)
     put_mode(CONTACTS + k, CONTACT_IS_OPEN, AT_REST, 0.0, step->watch->mode);
   put_modes(step->watch->mode, step->own);
-  status = terms_at(step, at, &of);
-  for (int k = 0; status == OK && k < EVENT_CONTACTS; k++) {
+  TRY(terms_at(step, at, &of));
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int row = CONTACTS[k].normal;
     if (row >= 0 && !of.absent[k] && of.value[row] < -CONTACT_PENETRATION * of.size[row])
-      status = refuse(step, CONTACT_PENETRATES, k, of.value[row]);
-    if (status == OK && is_impossible(&of, k, &impossible))
-      status = refuse(step, CONTACT_IMPOSSIBLE, k, impossible);
+      return refuse(step, CONTACT_PENETRATES, k, of.value[row]);
+    if (is_impossible(&of, k, &impossible))
+      return refuse(step, CONTACT_IMPOSSIBLE, k, impossible);
     now.closes[k] = row >= 0 && !of.absent[k] && fabs(of.value[row]) <= CONTACT_ROUNDING * of.size[row];
   }
-  if (status == OK)
-    status = change_modes(step, at, &now);
-  return status;
+  return change_modes(step, at, &now);
 }
 
 /* Whether the function of a transition is not negative after a step without it; gaps of limited contacts may be. */
@@ -221,30 +217,30 @@ static int is_of_forces(int transition)
 static int end_modes_at_start(const event_step *step, const event_sample *right)
 {
   contact_terms of;
-  int outside[EVENT_CONTACTS], has_terms = 0, status = OK;
-  for (int i = 0; status == OK && i < TRANSITIONS; i++) {
+  int outside[EVENT_CONTACTS], has_terms = 0;
+  for (int i = 0; i < TRANSITIONS; i++) {
     const int e = EVENT_FIRST[FIRST_TRANSITION + i];
     const real before = values_at(step, 0)[e], after = values_at(step, EVENT_DEGREE)[e];
     event_crossing *crossing = step->found + *step->filled;
     event_sample start;
     if (!(is_of_forces(i) && before < 0.0 && after < before))
       continue;
-    status = has_terms ? OK : terms_at(step, right, &of);
-    if (status == OK && !has_terms)
+    if (!has_terms) {
+      TRY(terms_at(step, right, &of));
       find_outside(step, &of, CONTACT_OUTSIDE, outside);
+    }
     has_terms = 1;
-    if (status != OK || !outside[TRANSITION[i][0]])
+    if (!outside[TRANSITION[i][0]])
       continue;
-    status = take_sample(step, e, CONTACT_START, &start);
-    if (status == OK &&
-        (*step->filled == step->room || !place_crossing(step->watch, crossing, step->room)))
+    TRY(take_sample(step, e, CONTACT_START, &start));
+    if (*step->filled == step->room || !place_crossing(step->watch, crossing, step->room))
       return EVENT_NO_ROOM;
     *crossing = (event_crossing){.t = start.t, .fraction = CONTACT_START, .direction = -1};
     crossing->function = FIRST_TRANSITION + i;
     copy_state(crossing->q, crossing->p, start.q, start.p);
     ++*step->filled;
   }
-  return status;
+  return OK;
 }
 
 /* Fails if a gap is negative at the end of a step without a transition, or forces are outside of their cone. */
@@ -252,18 +248,17 @@ static int check_gaps(const event_step *step, const event_sample *right)
 {
   contact_terms of;
   real value[EVENTS];
-  int outside[EVENT_CONTACTS], doubtful = 0, status = evaluate_functions(step, right, value);
+  int outside[EVENT_CONTACTS], doubtful = 0;
+  TRY(evaluate_functions(step, right, value));
   for (int i = 0; i < TRANSITIONS; i++)
     doubtful |= value[EVENT_FIRST[FIRST_TRANSITION + i]] < 0.0;
-  if (status != OK || !doubtful)
-    return status;
+  if (!doubtful)
+    return OK;
   memcpy(values_at(step, 0), value, BYTES(EVENTS));
-  status = rounding_of(step, right);
-  if (status == OK)
-    status = terms_at(step, right, &of);
-  if (status == OK)
-    find_outside(step, &of, CONTACT_OUTSIDE, outside);
-  for (int i = 0; status == OK && i < TRANSITIONS; i++) {
+  TRY(rounding_of(step, right));
+  TRY(terms_at(step, right, &of));
+  find_outside(step, &of, CONTACT_OUTSIDE, outside);
+  for (int i = 0; i < TRANSITIONS; i++) {
     const int e = EVENT_FIRST[FIRST_TRANSITION + i], row = CONTACTS[TRANSITION[i][0]].normal;
     const real rounding = CONTACT_MISSED * values_at(step, EVENT_DEGREE + 2)[e] + step->watch->history[e].slack +
         (row < 0 ? 0.0 : CONTACT_ROUNDING * of.size[row]);
@@ -272,5 +267,5 @@ static int check_gaps(const event_step *step, const event_sample *right)
       return NOT_CONVERGED;
     }
   }
-  return status;
+  return OK;
 }

@@ -87,12 +87,11 @@ static int rate_along(const event_step *step, int e, const event_sample *at, rea
   const real part = 0x1p-20 * step->h;
   event_sample next = {.t = at->t + part, .q = step->memory, .p = step->memory + M};
   solver_report own;
-  int status = NAME(step)(at->t, part, at->q, at->p, step->parameters, step->options, next.q, next.p, &own,
-      step->workspace);
-  if (status == OK)
-    status = evaluate_function(step, e, &next);
+  TRY(NAME(step)(at->t, part, at->q, at->p, step->parameters, step->options, next.q, next.p, &own,
+      step->workspace));
+  TRY(evaluate_function(step, e, &next));
   *rate = (next.g - at->g) / fabs(part);
-  return status;
+  return OK;
 }
 
 /* State of the crossings from `first` on. That of an impact is moved back along the flow by g / (dg/dt), at most the
@@ -105,7 +104,6 @@ static int refine_crossing(const event_step *step, long long first, const event_
   event_entries wall;
   solver_report own;
   real back = 0.0, least, *const q = step->memory, *const p = q + M;
-  int status;
   (void)right;
   at->t = crossing->t;
   copy_state(at->q, at->p, crossing->q, crossing->p);
@@ -117,20 +115,19 @@ static int refine_crossing(const event_step *step, long long first, const event_
     copy_state(step->found[i].q, step->found[i].p, at->q, at->p);
   return evaluate_function(step, FUNCTION_OF(crossing), at);
 #endif
-  status = evaluate_function(step, FUNCTION_OF(crossing), at);
-  if (status != OK || !(IS_IMPACT[crossing->function] || is_kink(crossing->function)))
-    return status;
-  if (is_kink(crossing->function)) {
-    status = rate_along(step, FUNCTION_OF(crossing), at, &wall.rate);
-  } else {
-    status = changes_at(step, FUNCTION_OF(crossing), at, &wall);
-  }
+  TRY(evaluate_function(step, FUNCTION_OF(crossing), at));
+  if (!(IS_IMPACT[crossing->function] || is_kink(crossing->function)))
+    return OK;
+  if (is_kink(crossing->function))
+    TRY(rate_along(step, FUNCTION_OF(crossing), at, &wall.rate));
+  else
+    TRY(changes_at(step, FUNCTION_OF(crossing), at, &wall));
   back = at->g / wall.rate; /* in the direction of the run */
   least = is_kink(crossing->function) ? -CHANGE_SAFETY * DBL_EPSILON * fabs(step->h) : 0.0;
-  if (status != OK || !(back > least && back <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->h)))
-    return status;
+  if (!(back > least && back <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->h)))
+    return OK;
   back = step->h < 0.0 ? -back : back;
-  status = NAME(step)(at->t, -back, at->q, at->p, step->parameters, step->options, q, p, &own, step->workspace);
+  TRY(NAME(step)(at->t, -back, at->q, at->p, step->parameters, step->options, q, p, &own, step->workspace));
   at->t -= back;
   *part -= back;
   copy_state(at->q, at->p, q, p);
@@ -138,7 +135,7 @@ static int refine_crossing(const event_step *step, long long first, const event_
     step->found[i].t = at->t;
     copy_state(step->found[i].q, step->found[i].p, at->q, at->p);
   }
-  return status;
+  return OK;
 }
 
 /* Whether function e may be within rounding of zero at the state of a change, by bounds 2^20 times as large: of the
@@ -158,9 +155,9 @@ static int may_be_touched(const event_step *step, int e)
 static int note_rounding(const event_step *step, int e, event_sample *at)
 {
   const real change = fmax(fabs(values_at(step, 0)[e]), fabs(values_at(step, EVENT_DEGREE)[e]));
-  const int status = evaluate_function(step, e, at);
+  TRY(evaluate_function(step, e, at));
   step->watch->history[e].slack = fmax(fabs(at->g), EVENT_AT_ZERO * change);
-  return status;
+  return OK;
 }
 
 /* Whether the zeros of an event end a mode, and do not change the state themselves. */
@@ -173,47 +170,44 @@ static int ends_mode(int event)
  * rounding and approaches, in their order, until there is none; walls that are met there are crossings, too. */
 static int change_at_crossings(const event_step *step, long long first, event_sample *at)
 {
-  int met = 1, status = OK;
+  int met = 1;
   const long long last = *step->filled;
   const real *const value = values_at(step, EVENT_DEGREE + 1);
   real rate, *const v = step->memory + 3 * M;
-  for (long long i = first; status == OK && i < last; i++)
+  for (long long i = first; i < last; i++)
     if (step->watch->acts[step->found[i].function]) {
 #ifdef EVENT_MODES
       memcpy(step->found[i].mode, step->watch->mode, BYTES(EVENT_MODES));
 #endif
-      if (ends_mode(step->found[i].function))
-        status = note_rounding(step, FUNCTION_OF(step->found + i), at);
-      else
-        status = change_state(step, FUNCTION_OF(step->found + i), at);
+      const int event = step->found[i].function, e = FUNCTION_OF(step->found + i);
+      const int status = ends_mode(event) ? note_rounding(step, e, at) : change_state(step, e, at);
       note_hit(step, step->found + i, at->t);
-      if (status == OK)
-        status = check_pace(step, step->found[i].function);
+      TRY(status);
+      TRY(check_pace(step, event));
     }
-  for (int round = 0; status == OK && met; round++) {
+  for (int round = 0; met; round++) {
     met = 0;
-    status = evaluate_functions(step, at, values_at(step, EVENT_DEGREE + 1));
-    if (status == OK && ANY_IMPACTS)
-      status = approach(step, at, NULL, 0.0, v, &rate);
-    for (int e = 0; status == OK && e < EVENTS; e++) {
+    TRY(evaluate_functions(step, at, values_at(step, EVENT_DEGREE + 1)));
+    if (ANY_IMPACTS)
+      TRY(approach(step, at, NULL, 0.0, v, &rate));
+    for (int e = 0; e < EVENTS; e++) {
       const int event = EVENT_OF(e);
       event_entries wall;
       int open = 0, known = 0;
       if (!IS_IMPACT[event] || !step->watch->acts[event] || !may_be_touched(step, e))
         continue;
-      status = evaluate_changes(step, e, at, v, &wall);
-      if (status == OK && fabs(value[e]) <= wall.slack && wall.rate < -CHANGE_SAFETY * DBL_EPSILON * wall.size)
-        status = conditions(e, at->t, at->q, at->p, step->parameters, &open, step->workspace);
-      if (status != OK || !open)
+      TRY(evaluate_changes(step, e, at, v, &wall));
+      if (fabs(value[e]) <= wall.slack && wall.rate < -CHANGE_SAFETY * DBL_EPSILON * wall.size)
+        TRY(conditions(e, at->t, at->q, at->p, step->parameters, &open, step->workspace));
+      if (!open)
         continue;
       met = 1;
       if (round == CHANGE_ROUNDS) {
         step->watch->jammed = event + 1;
         return NOT_CONVERGED;
       }
-      status = change_state(step, e, at);
-      if (status == OK)
-        status = approach(step, at, NULL, 0.0, v, &rate);
+      TRY(change_state(step, e, at));
+      TRY(approach(step, at, NULL, 0.0, v, &rate));
       for (long long i = first; i < *step->filled; i++)
         known |= FUNCTION_OF(step->found + i) == e;
       if (known)
@@ -229,7 +223,7 @@ static int change_at_crossings(const event_step *step, long long first, event_sa
       ++*step->filled;
     }
   }
-  return status;
+  return OK;
 }
 
 /* Fails if a step that began before a wall ends behind it without a crossing: contact that persists. Without `left`,
@@ -238,28 +232,27 @@ static int check_walls(const event_step *step, const event_sample *left, const e
 {
   const real *const before = values_at(step, 0), *const after = values_at(step, left ? EVENT_DEGREE : 0);
   real rate, *const v = step->memory + 3 * M;
-  int known = 0, status = OK;
-  for (int e = 0; status == OK && e < EVENTS; e++) {
+  int known = 0;
+  for (int e = 0; e < EVENTS; e++) {
     const int event = EVENT_OF(e);
     event_entries wall;
     int open = left || !IS_CONDITIONAL[event];
     if (after[e] >= 0.0 || !IS_IMPACT[event] || !step->watch->acts[event])
       continue;
     if (!known)
-      status = approach(step, left ? left : right, NULL, 0.0, v, &rate);
+      TRY(approach(step, left ? left : right, NULL, 0.0, v, &rate));
     known = 1;
-    if (status == OK)
-      status = evaluate_changes(step, e, left ? left : right, v, &wall);
-    if (status == OK && left)
-      status = conditions(e, right->t, right->q, right->p, step->parameters, &open, step->workspace);
+    TRY(evaluate_changes(step, e, left ? left : right, v, &wall));
+    if (left)
+      TRY(conditions(e, right->t, right->q, right->p, step->parameters, &open, step->workspace));
     wall.slack = fmax(wall.slack, step->watch->history[e].slack); /* the velocity after an impact may be 0 */
-    if (status == OK && open && (!left || before[e] >= -wall.slack) && after[e] < -wall.slack) {
+    if (open && (!left || before[e] >= -wall.slack) && after[e] < -wall.slack) {
       step->watch->through = event + 1;
       step->watch->behind = left ? 0.0 : after[e];
-      status = NOT_CONVERGED;
+      return NOT_CONVERGED;
     }
   }
-  return status;
+  return OK;
 }
 
 /* Arrays for the states of a call. */
@@ -308,16 +301,15 @@ static int renew_sides(const event_step *step, long long first, const event_samp
 {
   const real part = ldexp(step->whole, -KINK_LAST_PROBE);
   event_sample next = {.t = at->t + part, .q = step->memory, .p = step->memory + M};
-  int changed = 0, status = OK;
+  int changed = 0;
   for (long long i = first; i < *step->filled; i++)
     changed |= step->watch->acts[step->found[i].function] && !is_kink(step->found[i].function);
-  if (changed)
-    status = values_of_kinks(step, at, values_at(step, 0));
-  if (changed && status == OK)
-    status = step_from_left(step, at, part, &next);
-  if (changed && status == OK)
-    status = values_of_kinks(step, &next, values_at(step, 1));
-  for (int k = 0; changed && status == OK && k < EVENT_KINKS; k++) {
+  if (!changed)
+    return OK;
+  TRY(values_of_kinks(step, at, values_at(step, 0)));
+  TRY(step_from_left(step, at, part, &next));
+  TRY(values_of_kinks(step, &next, values_at(step, 1)));
+  for (int k = 0; k < EVENT_KINKS; k++) {
     const int e = EVENT_FIRST[FIRST_KINK + k];
     const real g = values_at(step, 0)[e], change = values_at(step, 1)[e] - g;
     const int is_zero = fabs(g) <= KINK_ZERO * fabs(change);
@@ -327,7 +319,7 @@ static int renew_sides(const event_step *step, long long first, const event_samp
     if (is_zero)
       step->watch->history[e] = (NAME(event_history)){.last = step->watch->time, .slack = fabs(g), .hits = 1};
   }
-  return status;
+  return OK;
 }
 #endif
 
@@ -338,21 +330,21 @@ static int shorten_part(const event_step *step, event_sample *left, event_sample
     real longest, real *part)
 {
   const real whole = *part;
-  int is_taken = changes == 0, status;
+  int is_taken = changes == 0;
   longest = fmin(longest, fabs(whole));
   for (int k = 0; k < EVENT_MODES; k++)
     is_taken &= step->own[MODE_PLACE[k]] == step->watch->mode[k];
   put_modes(step->watch->mode, step->own);
   real by_slips = longest;
-  status = renew_slips(step, left, &by_slips);
+  TRY(renew_slips(step, left, &by_slips));
   longest = fmin(longest, by_slips);
   if (longest < fabs(whole))
     *part = copysign(longest, whole);
-  if (status == OK && !(*part == whole && is_taken)) {
-    status = step_from_left(step, left, *part, right);
+  if (!(*part == whole && is_taken)) {
+    TRY(step_from_left(step, left, *part, right));
     right->t = *part == whole ? end : left->t + *part;
   }
-  return status;
+  return OK;
 }
 #endif
 
@@ -364,7 +356,6 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
   real *const states = step->memory + 9 * M;
   event_sample left = {.t = before->t, .q = states, .p = states + M};
   event_sample right = {.fraction = 1.0, .t = run->t, .q = states + 2 * M, .p = states + 3 * M};
-  int status;
 #ifdef CONTACTS_IN_SPACE
   real longest = INFINITY;
   int halvings = 0;
@@ -375,13 +366,13 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
 #endif
   copy_state(left.q, left.p, before->q, before->p);
   copy_state(right.q, right.p, run->q, run->p);
-  status = evaluate_functions(step, &left, values_at(step, 0));
-  if (status == OK && before->step == 0)
-    status = check_walls(step, NULL, &left);
-  for (int changes = 0; status == OK; changes++) {
+  TRY(evaluate_functions(step, &left, values_at(step, 0)));
+  if (before->step == 0)
+    TRY(check_walls(step, NULL, &left));
+  for (int changes = 0;; changes++) {
     event_sample at = {.q = states + 4 * M, .p = states + 5 * M};
     real part = length;
-    int acts = 0, far = 0, ends, cut = 0;
+    int acts = 0, far = 0, ends, cut = 0, status = OK;
 #ifdef CONTACTS_IN_SPACE
     if (!adaptive)
       status = shorten_part(step, &left, &right, run->t, changes, longest, &part);
@@ -430,15 +421,14 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       set_run(run, left.t, &left);
       return OK;
     }
-    if (status != OK)
-      return status;
+    TRY(status);
     for (long long i = first; i < *step->filled; i++)
       acts |= step->watch->acts[step->found[i].function];
     if (acts || step->watch->ended) {
       while (step->found[group].fraction != step->found[*step->filled - 1].fraction)
         group++;
       part *= step->found[group].fraction;
-      status = refine_crossing(step, group, &right, &at, &part);
+      TRY(refine_crossing(step, group, &right, &at, &part));
     }
     step->watch->time += part;
     cut &= !acts && !step->watch->ended;
@@ -449,46 +439,40 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       step->watch->started = 1;
       if (changes > 0)
         set_run(run, run->t, &right);
-      if (status == OK)
-        status = check_walls(step, &left, &right);
+      TRY(check_walls(step, &left, &right));
 #ifdef EVENT_KINKS
-      if (status == OK)
-        status = check_sides(step, &right);
+      TRY(check_sides(step, &right));
 #endif
 #ifdef EVENT_CONTACTS
-      if (status == OK)
-        status = check_gaps(step, &right);
+      TRY(check_gaps(step, &right));
 #endif
-      return status == OK ? store_state(to, &right, length, iterations, run->step, step->report) : status;
+      return store_state(to, &right, length, iterations, run->step, step->report);
     }
-    if (status == OK && EVENTS > EVENT_FEW && !step->rounding_known) {
-      status = rounding_of(step, &left);
+    if (EVENTS > EVENT_FEW && !step->rounding_known) {
+      TRY(rounding_of(step, &left));
       step->rounding_known = 1;
     }
-    if (status == OK && !cut)
-      status = change_at_crossings(step, group, &at);
-    length -= part;
+    if (!cut) {
+      TRY(change_at_crossings(step, group, &at));
 #ifdef EVENT_KINKS
-    if (status == OK && !cut)
-      status = change_sides(step, group, &at);
+      TRY(change_sides(step, group, &at));
 #endif
 #ifdef EVENT_CONTACTS
-    if (status == OK && !cut)
-      status = change_contacts(step, group, &at);
+      TRY(change_contacts(step, group, &at));
 #endif
 #ifdef EVENT_KINKS
-    if (status == OK && !cut)
-      status = renew_sides(step, group, &at);
+      TRY(renew_sides(step, group, &at));
 #endif
+    }
+    length -= part;
     ends = fabs(length) <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->whole);
-    if (status == OK)
-      status = store_state(to, &at, part, ends ? iterations : 0, ends ? run->step : within, step->report);
-    if (status == OK && !ends && changes == CHANGES_IN_STEP) {
+    TRY(store_state(to, &at, part, ends ? iterations : 0, ends ? run->step : within, step->report));
+    if (!ends && changes == CHANGES_IN_STEP) {
       step->watch->jammed = step->found[group].function + 1;
-      status = NOT_CONVERGED;
+      return NOT_CONVERGED;
     }
     step->watch->started = cut;
-    if (status == OK && (ends || adaptive || step->watch->ended)) {
+    if (ends || adaptive || step->watch->ended) {
       if (!ends) {
         copy_run(run, before);
         run->step += adaptive;
@@ -505,14 +489,11 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     }
     left.t = at.t;
     copy_state(left.q, left.p, at.q, at.p);
-    if (status == OK)
-      status = evaluate_functions(step, &left, values_at(step, 0));
+    TRY(evaluate_functions(step, &left, values_at(step, 0)));
 #ifndef CONTACTS_IN_SPACE /* which shorten the next part first */
-    if (status == OK)
-      status = step_from_left(step, &left, length, &right);
+    TRY(step_from_left(step, &left, length, &right));
 #endif
   }
-  return status;
 }
 
 #ifdef EVENT_CONTACTS
@@ -522,15 +503,14 @@ static int begin_at(event_step *step, event_sample *at, real duration)
 {
   contact_terms of;
   real least = INFINITY;
-  int status;
   step->whole = 0.0;
-  status = terms_at(step, at, &of);
-  for (int r = 0; status == OK && r < CONTACT_ROWS; r++) {
+  TRY(terms_at(step, at, &of));
+  for (int r = 0; r < CONTACT_ROWS; r++) {
     const real second = fabs(of.second[r]), time = sqrt(of.size[r] / second) + of.speed[r] / second;
     least = time > 0.0 ? fmin(least, time) : least;
   }
   step->whole = step->h = isinf(least) ? duration : copysign(least, duration);
-  return status == OK ? begin_contacts(step, at) : status;
+  return begin_contacts(step, at);
 }
 #endif
 

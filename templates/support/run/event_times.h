@@ -21,15 +21,12 @@ static int add_time(const event_step *step, int e, event_sample from, const even
 {
   const long long before = *step->filled;
   event_sample high = *to;
-  int status = OK;
   for (;;) {
     const real middle = from.t + 0.5 * (high.t - from.t);
     real g;
     if (middle == from.t || middle == high.t)
       break;
-    status = time_value(e, middle, step->parameters, &g, step->workspace);
-    if (status != OK)
-      return status;
+    TRY(time_value(e, middle, step->parameters, &g, step->workspace));
     if (changes_sign(from.g, g))
       high.t = middle, high.g = g;
     else
@@ -43,13 +40,13 @@ static int add_time(const event_step *step, int e, event_sample from, const even
                                                                              : left->q;
   high.p = high.t == right->t ? right->p : high.fraction > 2.0 * DBL_EPSILON ? step->memory + M
                                                                              : left->p;
-  status = add_crossing(step, e, &from, &high, NAN);
-  if (status == OK && *step->filled > before) {
+  TRY(add_crossing(step, e, &from, &high, NAN));
+  if (*step->filled > before) {
     step->found[before].t = high.t;
     if (step->watch->acts[EVENT_OF(e)])
       step->horizon->t = high.t;
   }
-  return status;
+  return OK;
 }
 
 /* Adds a crossing if the sign changes between the last state with a sign and a later one. */
@@ -68,27 +65,23 @@ static int search_until(const event_step *step, int e, real t, const event_sampl
   const real half = 0.5 * (to->t - t);
   event_sample middle = {.t = t + half};
   real reach[3];
-  int status;
   if ((t - step->t) / step->h >= step->horizon->fraction)
     return OK;
-  status = time_value(e, middle.t, step->parameters, &middle.g, step->workspace);
-  if (status == OK)
-    status = time_reach(e, middle.t, fabs(half), step->parameters, reach, step->workspace);
+  TRY(time_value(e, middle.t, step->parameters, &middle.g, step->workspace));
+  TRY(time_reach(e, middle.t, fabs(half), step->parameters, reach, step->workspace));
   const real noise = EVENT_TIME_NOISE * reach[2];
-  if (status == OK && fabs(middle.g) > reach[0])
+  if (fabs(middle.g) > reach[0])
     return fabs(middle.g) > noise ? note_sign(step, e, last, &middle, left, right) : OK;
   if (reach[1] > 0.0 || 2.0 * fabs(half) <= EVENT_SAME_TIME * fmax(fabs(middle.t), DBL_EPSILON * fabs(step->h)))
-    return status == OK && (to->t == right->t || fabs(to->g) > noise) ? note_sign(step, e, last, to, left, right)
-                                                                      : status;
+    return to->t == right->t || fabs(to->g) > noise ? note_sign(step, e, last, to, left, right) : OK;
   if (fabs(middle.g) + reach[0] <= noise)
-    return status;
+    return OK;
   if (--*intervals < 0) {
     step->watch->inseparable = EVENT_OF(e) + 1;
     return NOT_CONVERGED;
   }
-  if (status == OK)
-    status = search_until(step, e, t, &middle, last, left, right, intervals);
-  return status == OK ? search_until(step, e, middle.t, to, last, left, right, intervals) : status;
+  TRY(search_until(step, e, t, &middle, last, left, right, intervals));
+  return search_until(step, e, middle.t, to, last, left, right, intervals);
 }
 
 /* Finds the crossings of a function of time alone on a step. */
@@ -96,10 +89,10 @@ static int search_times(const event_step *step, int e, const event_sample *left,
 {
   const real span = right->t - left->t;
   event_sample from = *left, to = *right;
-  int intervals = EVENT_INTERVALS, status = end_value(step, e, left->t, span, &from.g);
+  int intervals = EVENT_INTERVALS;
+  TRY(end_value(step, e, left->t, span, &from.g));
   if (JUST_CHANGED(step->watch, e) && side_at_start(step->watch, e) != 0.0) /* whose sign may be that of rounding */
     from.g = copysign(fmax(fabs(from.g), DBL_MIN), side_at_start(step->watch, e));
-  if (status == OK)
-    status = end_value(step, e, right->t, span, &to.g);
-  return status == OK ? search_until(step, e, left->t, &to, &from, left, right, &intervals) : status;
+  TRY(end_value(step, e, right->t, span, &to.g));
+  return search_until(step, e, left->t, &to, &from, left, right, &intervals);
 }

@@ -102,24 +102,24 @@ static real *values_at(const event_step *step, int row)
  * finite. */
 static int evaluate_functions(const event_step *step, const event_sample *at, real *value)
 {
-  const int status = all_values(at->t, at->q, at->p, step->parameters, value, step->workspace);
-  for (int e = 0; status == OK && e < EVENTS; e++)
+  TRY(all_values(at->t, at->q, at->p, step->parameters, value, step->workspace));
+  for (int e = 0; e < EVENTS; e++)
     if (!is_finite(value[e])) {
       step->watch->undefined = EVENT_OF(e) + 1;
       return NOT_FINITE;
     }
-  return status;
+  return OK;
 }
 
 /* Evaluates function e at the state of a sample. */
 static int evaluate_function(const event_step *step, int e, event_sample *at)
 {
-  int status = one_value(e, at->t, at->q, at->p, step->parameters, &at->g, step->workspace);
-  if (status == OK && !is_finite(at->g)) {
+  TRY(one_value(e, at->t, at->q, at->p, step->parameters, &at->g, step->workspace));
+  if (!is_finite(at->g)) {
     step->watch->undefined = EVENT_OF(e) + 1;
-    status = NOT_FINITE;
+    return NOT_FINITE;
   }
-  return status;
+  return OK;
 }
 
 /* Computes the state at a fraction of the step by one step of that size. */
@@ -141,8 +141,8 @@ static int state_at(const event_step *step, real fraction, event_sample *sample)
 /* Computes the sample of function e at a fraction of the step. */
 static int take_sample(const event_step *step, int e, real fraction, event_sample *sample)
 {
-  const int status = state_at(step, fraction, sample);
-  return status == OK ? evaluate_function(step, e, sample) : status;
+  TRY(state_at(step, fraction, sample));
+  return evaluate_function(step, e, sample);
 }
 
 /* Narrows a sign change to neighbouring fractions; high is the later end, `guess` its approximation or NAN. Secant
@@ -158,7 +158,6 @@ static int enclose_crossing(const event_step *step, int e, event_sample low, eve
     const event_sample near = fabs(high->g) < fabs(low.g) ? *high : low;
     real fraction = guess;
     event_sample now;
-    int status;
     if (k > 0 || !(guess > low.fraction && guess < high->fraction)) {
       const real move = -near.g / (quotient * mean > 0.0 ? quotient : mean);
       fraction = near.fraction + move + copysign(fmax(1.5 * least, EVENT_OVERSHOOT * fabs(move)), move);
@@ -168,9 +167,7 @@ static int enclose_crossing(const event_step *step, int e, event_sample low, eve
     wider = wide;
     wide = width;
     fraction = fmin(fmax(fraction, low.fraction + least), high->fraction - least);
-    status = take_sample(step, e, fraction, &now);
-    if (status != OK)
-      return status;
+    TRY(take_sample(step, e, fraction, &now));
     *sampled = fraction;
     quotient = (now.g - near.g) / (fraction - near.fraction);
     if (changes_sign(low.g, now.g))
@@ -189,24 +186,23 @@ static int add_crossing(const event_step *step, int e, const event_sample *from,
   event_sample at = *to, *const horizon = step->horizon;
   event_crossing *crossing = step->found + *step->filled;
   real sampled = NAN;
-  int open, status = OK;
+  int open;
   if (step->watch->direction[event] == -direction || from->fraction >= horizon->fraction)
     return OK;
   if (to->fraction > horizon->fraction) {
     at = *horizon;
-    status = evaluate_function(step, e, &at);
-    if (status != OK || !changes_sign(from->g, at.g))
-      return status;
+    TRY(evaluate_function(step, e, &at));
+    if (!changes_sign(from->g, at.g))
+      return OK;
   }
   if (*step->filled == step->room)
     return EVENT_NO_ROOM;
-  status = enclose_crossing(step, e, *from, &at, guess, &sampled);
-  if (status == OK && at.q == step->memory && at.fraction != sampled)
-    status = take_sample(step, e, at.fraction, &at);
-  if (status == OK)
-    status = conditions(e, at.t, at.q, at.p, step->parameters, &open, step->workspace);
-  if (status != OK || !open)
-    return status;
+  TRY(enclose_crossing(step, e, *from, &at, guess, &sampled));
+  if (at.q == step->memory && at.fraction != sampled)
+    TRY(take_sample(step, e, at.fraction, &at));
+  TRY(conditions(e, at.t, at.q, at.p, step->parameters, &open, step->workspace));
+  if (!open)
+    return OK;
   if (!place_crossing(step->watch, crossing, step->room))
     return EVENT_NO_ROOM;
   crossing->t = at.t;
@@ -231,24 +227,21 @@ static int add_crossings(const event_step *step, int e, const event_sample *left
 {
   event_sample from = *left, to;
   for (int i = 0; i <= count; i++) {
-    int status = OK;
     if (i < count && extrema[i] < step->horizon->fraction) {
-      status = take_sample(step, e, extrema[i], &to);
+      TRY(take_sample(step, e, extrema[i], &to));
     } else if (i < count) { /* later crossings are not required */
       i = count;
       to = *step->horizon;
-      status = evaluate_function(step, e, &to);
+      TRY(evaluate_function(step, e, &to));
     } else {
       to = *right;
     }
-    if (status == OK && changes_sign(from.g, to.g)) {
+    if (changes_sign(from.g, to.g)) {
       real guess = NAN;
       for (int k = 0; k < zero_count; k++)
         guess = zeros[k] > from.fraction && zeros[k] < to.fraction ? zeros[k] : guess;
-      status = add_crossing(step, e, &from, &to, guess);
+      TRY(add_crossing(step, e, &from, &to, guess));
     }
-    if (status != OK)
-      return status;
     from = to;
   }
   return OK;
@@ -263,24 +256,21 @@ static int search_part(const event_step *step, int e, const event_sample *left, 
   const real half = 0.5 * (right->fraction - left->fraction), middle = left->fraction + half;
   real g[EVENT_DEGREE + 1], c[EVENT_DEGREE + 1], extrema[EVENT_DEGREE], zeros[EVENT_DEGREE];
   real doubt, range, split, before = left->g;
-  int count, zero_count, follows, crossed = 0, status = OK;
+  int count, zero_count, follows, crossed = 0;
   event_sample sample;
   if (left->fraction >= step->horizon->fraction)
     return OK;
   g[0] = left->g;
   g[EVENT_DEGREE] = right->g;
   for (int j = 1; j < EVENT_DEGREE; j++) {
-    if (!known) {
-      status = take_sample(step, e, left->fraction + EVENT_NODES[j] * 2.0 * half, &sample);
-      if (status != OK)
-        return status;
-    }
+    if (!known)
+      TRY(take_sample(step, e, left->fraction + EVENT_NODES[j] * 2.0 * half, &sample));
     g[j] = known ? known[j - 1] : sample.g;
   }
   interpolate(g, c, &doubt, &range);
   follows = doubt <= EVENT_SMALL_PART * range;
   if (fabs(c[0]) > range + (follows ? doubt : range))
-    return status; /* far from zero */
+    return OK; /* far from zero */
   split = uncertain_abscissa(c, doubt, extrema, &count, zeros, &zero_count);
   if (split < 1.0 || !follows)
     split = split > 1.0 ? 0.0 : fmin(fmax(split, -0.5), 0.5);
@@ -294,11 +284,10 @@ static int search_part(const event_step *step, int e, const event_sample *left, 
   for (int i = 0; i < zero_count; i++)
     zeros[i] = middle + half * zeros[i];
   if (split > 1.0 || splits == 0)
-    return crossed || split < 1.0 ? add_crossings(step, e, left, right, extrema, count, zeros, zero_count) : status;
-  status = take_sample(step, e, middle + half * split, &sample);
-  if (status == OK)
-    status = search_part(step, e, left, &sample, NULL, splits - 1);
-  return status == OK ? search_part(step, e, &sample, right, NULL, splits - 1) : status;
+    return crossed || split < 1.0 ? add_crossings(step, e, left, right, extrema, count, zeros, zero_count) : OK;
+  TRY(take_sample(step, e, middle + half * split, &sample));
+  TRY(search_part(step, e, left, &sample, NULL, splits - 1));
+  return search_part(step, e, &sample, right, NULL, splits - 1);
 }
 
 /* Changes of the functions if each coordinate and its momentum change by one ulp: the effect of rounding of the state.
@@ -309,29 +298,28 @@ static int rounding_of(const event_step *step, const event_sample *at)
   const real *const before = values_at(step, 0);
   const int each = M <= EVENT_SINGLE;
   event_sample next = *at;
-  int status = OK;
   next.q = step->memory + 2 * M;
   next.p = next.q + M;
   memset(noise, 0, BYTES(EVENTS));
-  for (int k = 0; status == OK && k < (each ? M : 3); k++) {
+  for (int k = 0; k < (each ? M : 3); k++) {
     for (int i = 0; i < M; i++) {
       const int sign = (i * k / 2) % 2 ? -1 : 1, ulps = each ? i == k : sign;
       next.q[i] = at->q[i] * (1.0 + ulps * DBL_EPSILON);
       next.p[i] = at->p[i] * (1.0 + ulps * DBL_EPSILON);
     }
-    status = evaluate_functions(step, &next, now);
-    for (int e = 0; status == OK && e < EVENTS; e++)
+    TRY(evaluate_functions(step, &next, now));
+    for (int e = 0; e < EVENTS; e++)
       noise[e] = each ? noise[e] + fabs(now[e] - before[e]) : fmax(noise[e], fabs(now[e] - before[e]));
   }
 #ifdef EVENTS_OF_TIME
-  for (int e = 0; status == OK && e < EVENTS; e++)
+  for (int e = 0; e < EVENTS; e++)
     if (IS_TIMED[EVENT_OF(e)]) {
       real reach[3];
-      status = time_reach(e, at->t, 0.0, step->parameters, reach, step->workspace);
+      TRY(time_reach(e, at->t, 0.0, step->parameters, reach, step->workspace));
       noise[e] = DBL_EPSILON * reach[2];
     }
 #endif
-  return status;
+  return OK;
 }
 
 /* Central difference of a function along (q, p, t), divided by the size of the change; dq or dp NULL: zeros. */
@@ -341,7 +329,6 @@ static int difference(const event_step *step, int e, const event_sample *at, con
   event_sample ends[2] = {*at, *at};
   for (int side = 0; side < 2; side++) {
     const real part = side ? size : -size;
-    int status;
     ends[side].q = step->memory;
     ends[side].p = step->memory + M;
     for (int i = 0; i < M; i++) {
@@ -349,9 +336,7 @@ static int difference(const event_step *step, int e, const event_sample *at, con
       ends[side].p[i] = at->p[i] + (dp ? part * dp[i] : 0.0);
     }
     ends[side].t += part * dt;
-    status = evaluate_function(step, e, ends + side);
-    if (status != OK)
-      return status;
+    TRY(evaluate_function(step, e, ends + side));
   }
   *found = (ends[1].g - ends[0].g) / (2.0 * size);
   return OK;
@@ -365,11 +350,8 @@ static int first_change(const event_step *step, int e, const event_sample *at, r
   real *const v = step->memory + 2 * M, *const dq = v + M, *const dp = dq + M;
   real fast = 0.0, large = 0.0, size, by_q = 0.0, by_rest = 0.0;
   event_sample next;
-  int status = event_velocity(at->t, at->q, at->p, step->parameters, v, step->workspace);
-  if (status == OK)
-    status = state_at(step, little, &next);
-  if (status != OK)
-    return status;
+  TRY(event_velocity(at->t, at->q, at->p, step->parameters, v, step->workspace));
+  TRY(state_at(step, little, &next));
   for (int i = 0; i < M; i++) {
     dq[i] = v[i] * (next.t - at->t) / little;
     dp[i] = (next.p[i] - at->p[i]) / little;
@@ -377,12 +359,11 @@ static int first_change(const event_step *step, int e, const event_sample *at, r
     large = fmax(large, fabs(at->q[i]));
   }
   size = fast > 0.0 && 0x1p-17 * large / fast > little ? 0x1p-17 * large / fast : little;
-  status = difference(step, e, at, dq, NULL, 0.0, size, &by_q);
-  if (status == OK)
-    status = difference(step, e, at, NULL, dp, (next.t - at->t) / little, little, &by_rest);
+  TRY(difference(step, e, at, dq, NULL, 0.0, size, &by_q));
+  TRY(difference(step, e, at, NULL, dp, (next.t - at->t) / little, little, &by_rest));
   *change = by_q + by_rest;
   *doubt = noise / size + (by_rest != 0.0 ? noise / little : 0.0);
-  return status;
+  return OK;
 }
 
 /* Start of the search in a first step. A run that ended at a zero and restarts there, e.g. after a rebound, may be on
@@ -394,11 +375,10 @@ static int leave_zero(const event_step *step, int e, const event_sample *left, r
 {
   event_sample next;
   real noise = values_at(step, EVENT_DEGREE + 2)[e], change, doubt;
-  int sign, place = EVENT_FIRST_PROBE, away = 0, event = EVENT_OF(e), status;
+  int sign, place = EVENT_FIRST_PROBE, away = 0, event = EVENT_OF(e);
   if (fabs(left->g) > EVENT_AT_ZERO * range * fabs(step->whole / step->h) + 8.0 * noise + RESIDUAL(step->watch, e))
     return OK;
-  status = first_change(step, e, left, noise, &change, &doubt);
-  if (status != OK) {
+  if (first_change(step, e, left, noise, &change, &doubt) != OK) {
     step->watch->undefined = 0; /* the rate is not defined at this state */
     return OK;
   }
@@ -406,17 +386,15 @@ static int leave_zero(const event_step *step, int e, const event_sample *left, r
   if (fabs(change) <= EVENT_UNCHANGED * range + 4.0 * doubt || sign * left->g > 0.0)
     return OK;
   /* g = x dg + x^2 c with g >= x dg / 2 at the last of these states does not return before 2 x */
-  status = take_sample(step, e, ldexp(1.0, -EVENT_LAST_PROBE), &next);
-  if (status == OK && sign * next.g >= ldexp(0.5 * fabs(change), -EVENT_LAST_PROBE) && sign * next.g > 8.0 * noise) {
+  TRY(take_sample(step, e, ldexp(1.0, -EVENT_LAST_PROBE), &next));
+  if (sign * next.g >= ldexp(0.5 * fabs(change), -EVENT_LAST_PROBE) && sign * next.g > 8.0 * noise) {
     if (changes_sign(from->g, next.g) && !JUST_CHANGED(step->watch, e))
-      status = add_crossing(step, e, from, &next, NAN);
+      TRY(add_crossing(step, e, from, &next, NAN));
     from->g = sign * fabs(from->g);
-    return status;
+    return OK;
   }
-  for (; status == OK && place >= EVENT_LAST_PROBE; place -= 2) {
-    status = take_sample(step, e, ldexp(1.0, -place), &next);
-    if (status != OK)
-      return status;
+  for (; place >= EVENT_LAST_PROBE; place -= 2) {
+    TRY(take_sample(step, e, ldexp(1.0, -place), &next));
     if (!away && fabs(next.g) <= 8.0 * noise + 4.0 * fabs(left->g))
       continue;
     if (!away && sign * next.g < 0.0 && (step->watch->remaining[event] > 0 || step->watch->acts[event]) &&
@@ -426,9 +404,7 @@ static int leave_zero(const event_step *step, int e, const event_sample *left, r
     }
     away = 1;
     if (changes_sign(from->g, next.g) && !(from->fraction == 0.0 && JUST_CHANGED(step->watch, e)))
-      status = add_crossing(step, e, from, &next, NAN);
-    if (status != OK)
-      return status;
+      TRY(add_crossing(step, e, from, &next, NAN));
     *from = next;
   }
   return OK;
@@ -443,7 +419,7 @@ static int leave_to_side(const event_step *step, int e, const event_sample *left
   const real noise = 8.0 * values_at(step, EVENT_DEGREE + 2)[e] + RESIDUAL(step->watch, e);
   const real tiny = copysign(DBL_MIN, side);
   event_sample next = *left;
-  int status = OK, away = 0, remains = EVENT_DEGREE;
+  int away = 0, remains = EVENT_DEGREE;
   while (remains >= 0 && !is_transition(EVENT_OF(e)) && fabs(values_at(step, remains)[e]) <= noise)
     remains--;
   if (remains < 0)
@@ -451,20 +427,20 @@ static int leave_to_side(const event_step *step, int e, const event_sample *left
   if (remains < 0 || fabs(left->g) > noise)
     return OK;
   from->g = tiny;
-  for (int k = 3; k >= 0 && status == OK && !away; k--) {
-    status = take_sample(step, e, ldexp(1.0, -PLACES[0][k]), &next);
+  for (int k = 3; k >= 0 && !away; k--) {
+    TRY(take_sample(step, e, ldexp(1.0, -PLACES[0][k]), &next));
     away = fabs(next.g) > noise;
     *from = next;
     from->g = away ? next.g : tiny;
   }
-  for (int k = 0; k < 4 && status == OK && changes_sign(tiny, from->g); k++) {
-    status = take_sample(step, e, ldexp(1.0, -PLACES[1][k]), &next);
+  for (int k = 0; k < 4 && changes_sign(tiny, from->g); k++) {
+    TRY(take_sample(step, e, ldexp(1.0, -PLACES[1][k]), &next));
     *from = next;
     from->g = fabs(next.g) > noise ? next.g : tiny;
   }
   if (changes_sign(tiny, from->g))
     from->g = tiny;
-  return status;
+  return OK;
 }
 
 /* Search in a part that begins at a kink or a start, from twice as long to twice as long intervals, so that the first
@@ -472,19 +448,17 @@ static int leave_to_side(const event_step *step, int e, const event_sample *left
 static int search_octaves(const event_step *step, int e, const event_sample *from, const event_sample *right)
 {
   event_sample low = *from, high;
-  int status = OK;
-  for (int k = EVENT_OCTAVES; k >= 0 && status == OK && low.fraction < step->horizon->fraction; k--) {
+  for (int k = EVENT_OCTAVES; k >= 0 && low.fraction < step->horizon->fraction; k--) {
     const real fraction = ldexp(1.0, -k);
     if (fraction <= low.fraction)
       continue;
     high = *right;
     if (k > 0)
-      status = take_sample(step, e, fraction, &high);
-    if (status == OK)
-      status = search_part(step, e, &low, &high, NULL, EVENT_SPLITS);
+      TRY(take_sample(step, e, fraction, &high));
+    TRY(search_part(step, e, &low, &high, NULL, EVENT_SPLITS));
     low = high;
   }
-  return status;
+  return OK;
 }
 
 /* Marks the functions that are far from zero along a step, as search_part would find, in a loop over all of them. */
@@ -531,7 +505,6 @@ static int search_function(const event_step *step, int e, const event_sample *le
 {
   event_sample start = *left, from, to = *right;
   real inner[EVENT_DEGREE - 1], middle = values_at(step, EVENT_DEGREE / 2)[e], range = 0.0, largest = 0.0;
-  int status = OK;
   start.g = values_at(step, 0)[e];
   to.g = values_at(step, EVENT_DEGREE)[e];
   for (int j = 1; j < EVENT_DEGREE; j++)
@@ -545,16 +518,16 @@ static int search_function(const event_step *step, int e, const event_sample *le
     return OK; /* far from zero, or at zero, as the gap of bodies that rest side by side */
   from = start;
   if (!step->watch->started && side_at_start(step->watch, e) != 0.0) {
-    status = leave_to_side(step, e, &start, &from);
+    TRY(leave_to_side(step, e, &start, &from));
   } else if (!step->watch->started) {
     range = fabs(to.g - from.g);
     for (int j = 1; j < EVENT_DEGREE; j++)
       range = fmax(range, fabs(inner[j - 1] - from.g));
-    status = leave_zero(step, e, &start, range, &from);
+    TRY(leave_zero(step, e, &start, range, &from));
   }
-  if (status == OK && !step->watch->started && !is_transition(EVENT_OF(e)) && side_at_start(step->watch, e) != 0.0)
+  if (!step->watch->started && !is_transition(EVENT_OF(e)) && side_at_start(step->watch, e) != 0.0)
     return search_octaves(step, e, &from, &to);
-  return status == OK ? search_part(step, e, &from, &to, from.fraction > 0.0 ? NULL : inner, EVENT_SPLITS) : status;
+  return search_part(step, e, &from, &to, from.fraction > 0.0 ? NULL : inner, EVENT_SPLITS);
 }
 
 #ifdef EVENTS_OF_TIME
@@ -566,25 +539,22 @@ static int search_function(const event_step *step, int e, const event_sample *le
 static int search_step(const event_step *step, const event_sample *left, const event_sample *right)
 {
   real *const far = values_at(step, EVENT_DEGREE + 1);
-  int status = OK, first;
+  int first;
   event_sample sample;
   step->horizon->fraction = INFINITY;
 #ifdef EVENTS_OF_TIME
-  for (int e = 0; e < EVENTS && status == OK; e++)
+  for (int e = 0; e < EVENTS; e++)
     if (IS_TIMED[EVENT_OF(e)])
-      status = search_times(step, e, left, right);
+      TRY(search_times(step, e, left, right));
   if (EVENTS_OF_TIME_ALONE)
-    return status;
+    return OK;
 #endif
-  for (int j = 1; j < EVENT_DEGREE && status == OK; j++) {
-    status = state_at(step, EVENT_NODES[j], &sample);
-    if (status == OK)
-      status = evaluate_functions(step, &sample, values_at(step, j));
+  for (int j = 1; j < EVENT_DEGREE; j++) {
+    TRY(state_at(step, EVENT_NODES[j], &sample));
+    TRY(evaluate_functions(step, &sample, values_at(step, j)));
   }
-  if (status == OK && !step->watch->started && !step->rounding_known)
-    status = rounding_of(step, left);
-  if (status != OK)
-    return status;
+  if (!step->watch->started && !step->rounding_known)
+    TRY(rounding_of(step, left));
   mark_far(step, far);
 #ifdef EVENTS_OF_TIME
   for (int e = 0; e < EVENTS; e++)
@@ -592,11 +562,11 @@ static int search_step(const event_step *step, const event_sample *left, const e
 #endif
   first = first_to_change(step, far);
   if (first >= 0)
-    status = search_function(step, first, left, right);
-  for (int e = 0; e < EVENTS && status == OK; e++)
+    TRY(search_function(step, first, left, right));
+  for (int e = 0; e < EVENTS; e++)
     if (e != first && far[e] == 0.0)
-      status = search_function(step, e, left, right);
-  return status;
+      TRY(search_function(step, e, left, right));
+  return OK;
 }
 
 /* Counts a crossing; returns 1 if it ends the search, or changes the state. */
@@ -624,13 +594,12 @@ static int keep_coincident(const event_step *step, long long last)
   const long long filled = *step->filled;
   event_crossing end = step->found[last];
   event_sample at = {.t = end.t, .q = end.q, .p = end.p};
-  int status = OK;
   *step->filled = last + 1;
-  for (long long i = last + 1; status == OK && i < filled; i++) {
+  for (long long i = last + 1; i < filled; i++) {
     event_crossing other = step->found[i];
     if (other.fraction - end.fraction <= EVENT_TIE)
-      status = value_at_end(step, FUNCTION_OF(&other), &at);
-    if (status != OK || other.fraction - end.fraction > EVENT_TIE || (real)other.direction * at.g < 0.0)
+      TRY(value_at_end(step, FUNCTION_OF(&other), &at));
+    if (other.fraction - end.fraction > EVENT_TIE || (real)other.direction * at.g < 0.0)
       continue;
     ends_search(step->watch, &other);
     other.t = end.t;
@@ -638,7 +607,7 @@ static int keep_coincident(const event_step *step, long long last)
     copy_state(other.q, other.p, end.q, end.p);
     step->found[(*step->filled)++] = other;
   }
-  return status;
+  return OK;
 }
 
 /* Sorts the crossings of one step by their fractions, as times may coincide, and drops those after the one that ends
@@ -686,9 +655,7 @@ int NAME(crossings)(event_watch *watch, long long count, const real *h, const re
       *filled = first;
       return status == EVENT_NO_ROOM ? OK : status;
     }
-    status = settle_crossings(&step, first);
-    if (status != OK)
-      return status;
+    TRY(settle_crossings(&step, first));
     watch->started |= k > 0;
     report->steps = k;
     left = right;

@@ -14,17 +14,16 @@ enum {
  * together are a multiple of the projected normal: P(p + lambda n). Positions are projected, too, if `moves`. */
 static int satisfy_constraints(const event_step *step, real t, real *q, real *p, int moves)
 {
-  int status = OK;
 #ifdef EVENT_CONSTRAINTS
   real *const q1 = step->memory, *const p1 = q1 + M;
-  status = NAME(project)(t, q, p, step->parameters, q1, p1, step->workspace);
+  TRY(NAME(project)(t, q, p, step->parameters, q1, p1, step->workspace));
   memcpy(p, p1, BYTES(M));
   if (moves)
     memcpy(q, q1, BYTES(M));
 #else
   (void)step, (void)t, (void)q, (void)p, (void)moves;
 #endif
-  return status;
+  return OK;
 }
 
 /* Momenta p + lambda n. */
@@ -41,16 +40,14 @@ static int approach(const event_step *step, const event_sample *at, const event_
 {
   const event_entries none = {.count = 0};
   real *const p = step->memory + 2 * M;
-  int status;
   wall = wall ? wall : &none;
   add_impulse(wall, lambda, at->p, p);
-  status = satisfy_constraints(step, at->t, at->q, p, 0);
-  if (status == OK)
-    status = NAME(velocity)(at->t, at->q, p, step->parameters, v, step->workspace);
+  TRY(satisfy_constraints(step, at->t, at->q, p, 0));
+  TRY(NAME(velocity)(at->t, at->q, p, step->parameters, v, step->workspace));
   *rate = wall->by_time;
   for (int i = 0; i < wall->count; i++)
     *rate += wall->value[i] * v[wall->place[i]];
-  return status;
+  return OK;
 }
 
 #ifdef EVENT_REFRACTS
@@ -62,10 +59,10 @@ static int approach(const event_step *step, const event_sample *at, const event_
 /* Changes by function e; if it is a wall, with its rate at velocities v. */
 static int evaluate_changes(const event_step *step, int e, const event_sample *at, const real *v, event_entries *wall)
 {
-  const int status = changes_by(e, at->t, at->q, at->p, step->parameters, step->values + EVENT_VALUES * EVENTS, wall,
-      step->workspace);
-  if (status != OK || !IS_WALL(EVENT_OF(e)))
-    return status;
+  TRY(changes_by(e, at->t, at->q, at->p, step->parameters, step->values + EVENT_VALUES * EVENTS, wall,
+      step->workspace));
+  if (!IS_WALL(EVENT_OF(e)))
+    return OK;
   wall->rate = wall->by_time;
   wall->size = fabs(wall->by_time);
   wall->slack = fabs(wall->by_time * at->t);
@@ -77,15 +74,16 @@ static int evaluate_changes(const event_step *step, int e, const event_sample *a
   }
   wall->slack *= CHANGE_SAFETY * DBL_EPSILON;
   wall->rate *= step->h < 0.0 ? -1.0 : 1.0;
-  return status;
+  return OK;
 }
 
 /* Changes by function e at the velocities of a state. */
 static int changes_at(const event_step *step, int e, const event_sample *at, event_entries *wall)
 {
   real rate, *const v = step->memory + 3 * M;
-  const int status = IS_WALL(EVENT_OF(e)) ? approach(step, at, NULL, 0.0, v, &rate) : OK;
-  return status == OK ? evaluate_changes(step, e, at, v, wall) : status;
+  if (IS_WALL(EVENT_OF(e)))
+    TRY(approach(step, at, NULL, 0.0, v, &rate));
+  return evaluate_changes(step, e, at, v, wall);
 }
 
 /* sum + low += a b with the rounding errors of product and sum (Dekker; Ogita, Rump & Oishi, SIAM J. Sci. Comput. 26
@@ -118,14 +116,13 @@ static int mean_rate(const event_step *step, const event_sample *at, const event
 {
   static const real NODE[3] = {0.11270166537925831, 0.5, 0.88729833462074169};
   static const real WEIGHT[3] = {5.0 / 18, 4.0 / 9, 5.0 / 18};
-  int status = OK;
   *mean = 0.0;
-  for (int k = 0; status == OK && k < 3; k++) {
+  for (int k = 0; k < 3; k++) {
     real rate = 0.0;
-    status = approach(step, at, wall, NODE[k] * lambda, v, &rate);
+    TRY(approach(step, at, wall, NODE[k] * lambda, v, &rate));
     *mean += WEIGHT[k] * rate;
   }
-  return status;
+  return OK;
 }
 
 /* H(p1) + lambda g_t - (p1 - u).v of p1 = P(u), u = p + lambda n, which an impulse conserves, of velocities v. The last
@@ -134,16 +131,14 @@ static int energy_after(const event_step *step, const event_sample *at, const ev
     const real *v, real *energy)
 {
   real *const moved = step->memory + 4 * M, *const free = moved + M;
-  int status;
   add_impulse(wall, lambda, at->p, free);
   memcpy(moved, free, BYTES(M));
-  status = satisfy_constraints(step, at->t, at->q, moved, 0);
-  if (status == OK)
-    status = NAME(energy)(at->t, at->q, moved, step->parameters, energy, step->workspace);
+  TRY(satisfy_constraints(step, at->t, at->q, moved, 0));
+  TRY(NAME(energy)(at->t, at->q, moved, step->parameters, energy, step->workspace));
   *energy += lambda * wall->by_time;
   for (int i = 0; i < M; i++)
     *energy -= (moved[i] - free[i]) * v[i];
-  return status;
+  return OK;
 }
 
 /* Newton's method for the impulse lambda by which the energy becomes `after` from `start` at lambda = 0. Its derivative
@@ -153,31 +148,30 @@ static int solve_impulse(const event_step *step, const event_sample *at, const e
 {
   real *const v = step->memory + 3 * M;
   real rate, mean = 0.0, now = after, size = fabs(after), last = INFINITY;
-  int status = approach(step, at, wall, *lambda, v, &rate);
+  TRY(approach(step, at, wall, *lambda, v, &rate));
   *passes = 1;
-  for (int k = 0; status == OK && k < CHANGE_ITERATIONS; k++) {
+  for (int k = 0; k < CHANGE_ITERATIONS; k++) {
     real correction, precise;
     if (!(toward * rate > 0.0)) {
       *passes = 0;
       return OK;
     }
-    status = energy_after(step, at, wall, *lambda, v, &now);
-    if (status == OK)
-      status = mean_rate(step, at, wall, *lambda, v, &mean);
+    TRY(energy_after(step, at, wall, *lambda, v, &now));
+    TRY(mean_rate(step, at, wall, *lambda, v, &mean));
     precise = start - after + *lambda * mean;
     correction = now - after;
     size = fabs(after) + fabs(now) + fabs(*lambda) * wall->size;
     if (fabs(correction - precise) <= 4.0 * DBL_EPSILON * size)
       correction = precise; /* the difference is rounding of the energy */
     correction /= rate;
-    if (status != OK || !(fabs(correction) < last))
+    if (!(fabs(correction) < last))
       break; /* the correction is rounding */
     last = fabs(correction);
     *lambda -= correction;
-    status = approach(step, at, wall, *lambda, v, &rate);
+    TRY(approach(step, at, wall, *lambda, v, &rate));
   }
   *passes = fabs(now - after) <= CHANGE_SAFETY * DBL_EPSILON * size;
-  return status;
+  return OK;
 }
 
 /* Impulse of an impact: p += (1 + e)/2 lambda_1 n. Where the kinetic energy is quadratic, i.e. W n, W = H_pp, is the
@@ -191,36 +185,32 @@ static int impact(const event_step *step, event_sample *at, const event_entries 
   real *const v = step->memory + 3 * M, *const rest = v + 2 * M, *const change = rest + M;
   real lambda, low = 0.0, at_rest = 0.0, after = 0.0, energy = 0.0, before = INFINITY;
   real inverse_mass, there = 0.0, size = wall->size;
-  int status, solved;
+  int solved;
   moved.p = step->memory + 4 * M;
   memset(moved.p, 0, BYTES(M));
-  status = approach(step, &moved, wall, 0.0, rest, &at_rest);
-  if (status == OK)
-    status = approach(step, &moved, wall, 1.0, change, &after);
+  TRY(approach(step, &moved, wall, 0.0, rest, &at_rest));
+  TRY(approach(step, &moved, wall, 1.0, change, &after));
   inverse_mass = after - at_rest;
-  if (status == OK)
-    status = approach(step, at, wall, 1.0, v, &there);
+  TRY(approach(step, at, wall, 1.0, v, &there));
   for (int i = 0; i < wall->count; i++)
     size += fabs(wall->value[i] * v[wall->place[i]]) + fabs(wall->value[i] * change[wall->place[i]]);
   lambda = -2.0 * rate / inverse_mass;
-  if (status == OK && !(fabs(there - rate - inverse_mass) <= CHANGE_SAFETY * DBL_EPSILON * size)) {
-    status = NAME(energy)(at->t, at->q, at->p, step->parameters, &energy, step->workspace);
-    if (status == OK)
-      status = approach(step, at, wall, lambda, v, &after);
+  if (!(fabs(there - rate - inverse_mass) <= CHANGE_SAFETY * DBL_EPSILON * size)) {
+    TRY(NAME(energy)(at->t, at->q, at->p, step->parameters, &energy, step->workspace));
+    TRY(approach(step, at, wall, lambda, v, &after));
   } else {
     before = 0.0; /* the kinetic energy is quadratic */
-    if (status == OK)
-      status = approach(step, at, wall, 0.0, v, &after);
+    TRY(approach(step, at, wall, 0.0, v, &after));
     for (int i = 0; i < M; i++)
       change[i] -= rest[i];
     low = correct_impulse(wall, v, change, lambda, rate);
   }
-  for (int k = 0; before > 0.0 && status == OK && k < CHANGE_ITERATIONS && !(after * rate < 0.0); k++) {
+  for (int k = 0; before > 0.0 && k < CHANGE_ITERATIONS && !(after * rate < 0.0); k++) {
     lambda *= 2.0; /* beyond the minimum of the convex energy: Newton's method does not return to lambda = 0 */
-    status = approach(step, at, wall, lambda, v, &after);
+    TRY(approach(step, at, wall, lambda, v, &after));
   }
-  if (status == OK && before > 0.0)
-    status = solve_impulse(step, at, wall, energy, energy, -rate, &lambda, &solved);
+  if (before > 0.0)
+    TRY(solve_impulse(step, at, wall, energy, energy, -rate, &lambda, &solved));
   lambda *= 0.5 * (1.0 + restitution);
   low *= 0.5 * (1.0 + restitution);
   for (int i = 0; i < wall->count; i++) {
@@ -228,18 +218,18 @@ static int impact(const event_step *step, event_sample *at, const event_entries 
     add_product(lambda, wall->value[i], p, &remainder);
     *p += remainder;
   }
-  return status == OK ? satisfy_constraints(step, at->t, at->q, at->p, 0) : status;
+  return satisfy_constraints(step, at->t, at->q, at->p, 0);
 }
 
 /* Sets the variables of a map to its values, modes too; velocities are set last, by their momenta. */
 static int apply_map(const event_step *step, event_sample *at, const event_entries *map)
 {
   real *const v = step->memory + 3 * M;
-  int by_velocity = 0, status = OK;
+  int by_velocity = 0;
   for (int i = 0; i < map->count; i++)
     by_velocity |= map->place[i] >= 2 * M && map->place[i] < 3 * M;
   if (by_velocity)
-    status = NAME(velocity)(at->t, at->q, at->p, step->parameters, v, step->workspace);
+    TRY(NAME(velocity)(at->t, at->q, at->p, step->parameters, v, step->workspace));
   for (int i = 0; i < map->count; i++)
     if (map->place[i] < M)
       at->q[map->place[i]] = map->value[i];
@@ -254,37 +244,35 @@ static int apply_map(const event_step *step, event_sample *at, const event_entri
 #ifdef EVENT_MODES
   put_modes(step->watch->mode, step->own);
 #endif
-  return by_velocity && status == OK
-      ? NAME(momentum)(at->t, at->q, v, step->parameters, at->p, step->workspace)
-      : status;
+  return by_velocity ? NAME(momentum)(at->t, at->q, v, step->parameters, at->p, step->workspace) : OK;
 }
 
 /* Changes the state by function e: by its map, or by an impact if the wall is approached. */
 static int change_state(const event_step *step, int e, event_sample *at)
 {
   event_entries wall;
-  const int is_impact = IS_IMPACT[EVENT_OF(e)];
-  int status = changes_at(step, e, at, &wall), is_defined = 1;
-  if (status == OK && is_impact && wall.rate < 0.0) {
+  int is_defined = 1;
+  TRY(changes_at(step, e, at, &wall));
+  if (IS_IMPACT[EVENT_OF(e)] && wall.rate < 0.0) {
     is_defined = wall.restitution >= 0.0;
     step->watch->history[e].slack = wall.slack;
     step->watch->history[e].rounding = wall.slack / -wall.rate;
-    status = impact(step, at, &wall);
+    const int status = is_defined ? impact(step, at, &wall) : OK;
     if (status == NOT_CONVERGED)
       step->watch->jammed = EVENT_OF(e) + 1; /* such as of prescribed motion, whose momenta no impulse changes */
-  } else if (status == OK && !is_impact) {
+    TRY(status);
+  } else if (!IS_IMPACT[EVENT_OF(e)]) {
     if (evaluate_function(step, e, at) == OK)
       step->watch->history[e].slack = fabs(at->g);
-    status = apply_map(step, at, &wall);
-    if (status == OK)
-      status = satisfy_constraints(step, at->t, at->q, at->p, 1);
+    TRY(apply_map(step, at, &wall));
+    TRY(satisfy_constraints(step, at->t, at->q, at->p, 1));
   }
 #ifdef EVENT_MODES
   is_defined &= all_finite(step->watch->mode, EVENT_MODES);
 #endif
-  if (!is_defined || (status == OK && !(all_finite(at->q, M) && all_finite(at->p, M)))) {
+  if (!is_defined || !all_finite(at->q, M) || !all_finite(at->p, M)) {
     step->watch->undefined = -(EVENT_OF(e) + 1);
-    status = NOT_FINITE;
+    return NOT_FINITE;
   }
-  return status;
+  return OK;
 }

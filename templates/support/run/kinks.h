@@ -53,15 +53,15 @@ static void set_side(const event_step *step, int kink, int side)
 /* Values of all functions at a state; those of time alone eight roundings later, as at the ends of steps. */
 static int values_of_kinks(const event_step *step, const event_sample *at, real *value)
 {
-  int status = evaluate_functions(step, at, value);
+  TRY(evaluate_functions(step, at, value));
 #ifdef EVENTS_OF_TIME
-  for (int k = 0; status == OK && k < EVENT_KINKS; k++)
+  for (int k = 0; k < EVENT_KINKS; k++)
     if (IS_OF_TIME(k)) {
       const int e = EVENT_FIRST[FIRST_KINK + k];
-      status = end_value(step, e, at->t, step->h, value + e);
+      TRY(end_value(step, e, at->t, step->h, value + e));
     }
 #endif
-  return status;
+  return OK;
 }
 
 /* Effect of rounding on the function of a kink. */
@@ -83,23 +83,24 @@ static int side_of(const event_step *step, int kink, const real *value)
 static int settle_sides(const event_step *step, const event_sample *at, int *unknown)
 {
   real *const value = values_at(step, 0);
-  int doubtful = 0, status = values_of_kinks(step, at, value);
+  int doubtful = 0;
+  TRY(values_of_kinks(step, at, value));
   *unknown = 0;
-  for (int k = 0; status == OK && k < EVENT_KINKS; k++) {
+  for (int k = 0; k < EVENT_KINKS; k++) {
     const real g = value[EVENT_FIRST[FIRST_KINK + k]], side = SIDE_OF(step->watch, k);
     step->watch->acts[FIRST_KINK + k] = 1;
     step->own[MODE_PLACE[FIRST_SIDE + k]] = side;
     doubtful |= !((g > 0.0 && side > 0.0) || (g < 0.0 && side < 0.0));
   }
-  if (status == OK && doubtful)
-    status = rounding_of(step, at);
-  for (int k = 0; status == OK && doubtful && k < EVENT_KINKS; k++) {
+  if (doubtful)
+    TRY(rounding_of(step, at));
+  for (int k = 0; doubtful && k < EVENT_KINKS; k++) {
     const int side = side_of(step, k, value);
     if (side)
       set_side(step, k, side);
     *unknown += SIDE_OF(step->watch, k) == 0.0;
   }
-  return status;
+  return OK;
 }
 
 /* Signs of the functions of all kinks after small parts of a step from a state, by the sides that are set: at the first
@@ -109,23 +110,22 @@ static int signs_after(const event_step *step, const event_sample *at, real leng
   event_step from = *step;
   event_sample next;
   real *const value = values_at(step, EVENT_DEGREE + 1);
-  int status = OK, unknown = EVENT_KINKS;
+  int unknown = EVENT_KINKS;
   from.t = at->t;
   from.h = length;
   from.q = at->q;
   from.p = at->p;
   memset(sign, 0, sizeof(int) * EVENT_KINKS);
-  for (int place = KINK_FIRST_PROBE; status == OK && unknown > 0 && place >= KINK_LAST_PROBE; place -= 5) {
-    status = state_at(&from, ldexp(1.0, -place), &next);
-    if (status == OK)
-      status = values_of_kinks(&from, &next, value);
+  for (int place = KINK_FIRST_PROBE; unknown > 0 && place >= KINK_LAST_PROBE; place -= 5) {
+    TRY(state_at(&from, ldexp(1.0, -place), &next));
+    TRY(values_of_kinks(&from, &next, value));
     unknown = 0;
-    for (int k = 0; status == OK && k < EVENT_KINKS; k++) {
+    for (int k = 0; k < EVENT_KINKS; k++) {
       sign[k] = sign[k] ? sign[k] : side_of(step, k, value);
       unknown += sign[k] == 0;
     }
   }
-  return status;
+  return OK;
 }
 
 /* Sides of the kinks at whose zeros a run starts: those after a small part of its first step by the formula. A function
@@ -133,36 +133,36 @@ static int signs_after(const event_step *step, const event_sample *at, real leng
 static int sides_after_start(const event_step *step, const event_sample *at, real length)
 {
   int sign[EVENT_KINKS];
-  const int status = signs_after(step, at, length, sign);
-  for (int k = 0; status == OK && k < EVENT_KINKS; k++)
+  TRY(signs_after(step, at, length, sign));
+  for (int k = 0; k < EVENT_KINKS; k++)
     if (SIDE_OF(step->watch, k) == 0.0) {
       const real value = values_at(step, 0)[EVENT_FIRST[FIRST_KINK + k]];
       set_side(step, k, sign[k] < 0 || (sign[k] == 0 && value < 0.0) ? -1 : 1);
     }
-  return status;
+  return OK;
 }
 
 /* The same where no step by the formula exists, as of forces that point to a surface: side 1, or -1 if the motion of
  * side 1 leaves to it. If that of side -1 returns, it slides. */
 static int sides_at_jump(const event_step *step, const event_sample *at, real length)
 {
-  int sign[EVENT_KINKS], starts[EVENT_KINKS], status = OK;
+  int sign[EVENT_KINKS], starts[EVENT_KINKS];
   for (int k = 0; k < EVENT_KINKS; k++) {
     starts[k] = SIDE_OF(step->watch, k) == 0.0;
     if (starts[k])
       set_side(step, k, 1);
   }
-  for (int pass = 0; status == OK && pass < 2; pass++) {
-    status = signs_after(step, at, length, sign);
-    for (int k = 0; status == OK && k < EVENT_KINKS; k++) {
+  for (int pass = 0; pass < 2; pass++) {
+    TRY(signs_after(step, at, length, sign));
+    for (int k = 0; k < EVENT_KINKS; k++) {
       if (!starts[k] || sign[k] * SIDE_OF(step->watch, k) >= 0.0)
         continue;
       set_side(step, k, -1);
       step->watch->sliding = pass ? FIRST_KINK + k + 1 : 0;
-      status = pass ? NOT_CONVERGED : OK;
+      TRY(pass ? NOT_CONVERGED : OK);
     }
   }
-  return status;
+  return OK;
 }
 
 #ifdef EVENT_REFRACTS
@@ -174,18 +174,16 @@ static int refract(const event_step *step, event_sample *at, const event_entries
 {
   real *const v = step->memory + 3 * M;
   real lambda = 0.0, rate, start = 0.0, mass = 0.0;
-  int status = approach(step, at, wall, 0.0, v, &rate);
-  if (status == OK)
-    status = energy_after(step, at, wall, 0.0, v, &start);
-  if (status == OK && !(toward * rate > 0.0)) { /* beyond the root of a quadratic energy */
-    status = approach(step, at, wall, 1.0, v, &mass);
+  TRY(approach(step, at, wall, 0.0, v, &rate));
+  TRY(energy_after(step, at, wall, 0.0, v, &start));
+  if (!(toward * rate > 0.0)) { /* beyond the root of a quadratic energy */
+    TRY(approach(step, at, wall, 1.0, v, &mass));
     mass = 1.0 / (mass - rate);
     lambda = toward * (2.0 * fabs(rate) * mass + sqrt(2.0 * fabs(mass * (start - before))));
   }
-  if (status == OK)
-    status = solve_impulse(step, at, wall, start, before, toward, &lambda, passes);
-  if (status != OK || !*passes)
-    return status;
+  TRY(solve_impulse(step, at, wall, start, before, toward, &lambda, passes));
+  if (!*passes)
+    return OK;
   for (int i = 0; i < wall->count; i++)
     at->p[wall->place[i]] += lambda * wall->value[i];
   return satisfy_constraints(step, at->t, at->q, at->p, 0);
@@ -198,23 +196,22 @@ static int pass_surface(const event_step *step, event_crossing *crossing, event_
   const int kink = crossing->function - FIRST_KINK, direction = crossing->direction, e = FUNCTION_OF(crossing);
   event_entries wall;
   real before = 0.0;
-  int sign[EVENT_KINKS], passes = 0, status = signs_after(step, at, step->whole, sign);
-  if (status != OK || sign[kink] != direction) {
+  int sign[EVENT_KINKS], passes = 0;
+  TRY(signs_after(step, at, step->whole, sign));
+  if (sign[kink] != direction) {
     crossing->direction = 0;
     step->watch->history[e].hits = 1;
-    return status;
+    return OK;
   }
-  status = changes_at(step, e, at, &wall);
-  if (status == OK)
-    status = energy_after(step, at, &wall, 0.0, step->memory + 3 * M, &before);
+  TRY(changes_at(step, e, at, &wall));
+  TRY(energy_after(step, at, &wall, 0.0, step->memory + 3 * M, &before));
   set_side(step, kink, direction);
-  if (status == OK)
-    status = refract(step, at, &wall, before, step->h < 0.0 ? -direction : direction, &passes);
-  if (status != OK || passes)
-    return status;
+  TRY(refract(step, at, &wall, before, step->h < 0.0 ? -direction : direction, &passes));
+  if (passes)
+    return OK;
   set_side(step, kink, -direction);
   crossing->direction = -direction;
-  status = impact(step, at, &wall);
+  const int status = impact(step, at, &wall);
   if (status == NOT_CONVERGED)
     step->watch->jammed = crossing->function + 1;
   return status;
@@ -226,7 +223,7 @@ static int pass_surface(const event_step *step, event_crossing *crossing, event_
  * Differential Equations with Discontinuous Righthand Sides, 1988). */
 static int change_sides(const event_step *step, long long first, event_sample *at)
 {
-  int sign[EVENT_KINKS], changed = 0, returns = 0, status = OK;
+  int sign[EVENT_KINKS], changed = 0, returns = 0;
   for (long long i = first; i < *step->filled; i++)
     if (is_kink(step->found[i].function)) {
       if (!IS_WALL(step->found[i].function))
@@ -235,17 +232,15 @@ static int change_sides(const event_step *step, long long first, event_sample *a
     }
   if (!changed)
     return OK;
-  status = evaluate_functions(step, at, values_at(step, 0));
-  if (status == OK)
-    status = rounding_of(step, at);
+  TRY(evaluate_functions(step, at, values_at(step, 0)));
+  TRY(rounding_of(step, at));
 #ifdef EVENT_REFRACTS
-  for (long long i = first; status == OK && i < *step->filled; i++)
+  for (long long i = first; i < *step->filled; i++)
     if (REFRACTS[step->found[i].function])
-      status = pass_surface(step, step->found + i, at);
+      TRY(pass_surface(step, step->found + i, at));
 #endif
-  if (status == OK)
-    status = signs_after(step, at, step->whole, sign);
-  for (long long i = first; status == OK && i < *step->filled; i++) {
+  TRY(signs_after(step, at, step->whole, sign));
+  for (long long i = first; i < *step->filled; i++) {
     event_crossing *crossing = step->found + i;
     const int kink = crossing->function - FIRST_KINK;
     if (kink >= 0 && !IS_OF_TIME(kink) && !IS_WALL(crossing->function) && sign[kink] == -crossing->direction) {
@@ -255,36 +250,37 @@ static int change_sides(const event_step *step, long long first, event_sample *a
       returns = 1;
     }
   }
-  if (status == OK && returns)
-    status = signs_after(step, at, step->whole, sign);
-  for (long long i = first; status == OK && returns && i < *step->filled; i++) {
+  if (returns)
+    TRY(signs_after(step, at, step->whole, sign));
+  for (long long i = first; returns && i < *step->filled; i++) {
     const int kink = step->found[i].function - FIRST_KINK;
     if (kink >= 0 && step->found[i].direction == 0 && sign[kink] * SIDE_OF(step->watch, kink) < 0.0) {
       step->watch->sliding = step->found[i].function + 1;
-      status = NOT_CONVERGED;
+      return NOT_CONVERGED;
     }
   }
-  return status;
+  return OK;
 }
 
 /* Fails if a function has the sign of the other side at the end of a step in which no crossing was found. */
 static int check_sides(const event_step *step, const event_sample *right)
 {
   real *const value = values_at(step, EVENT_DEGREE);
-  int doubtful = 0, status = values_of_kinks(step, right, value);
-  for (int k = 0; status == OK && k < EVENT_KINKS; k++)
+  int doubtful = 0;
+  TRY(values_of_kinks(step, right, value));
+  for (int k = 0; k < EVENT_KINKS; k++)
     doubtful |= value[EVENT_FIRST[FIRST_KINK + k]] * (SIDE_OF(step->watch, k) / KINK_SIDE) < 0.0;
   if (!doubtful)
     return OK;
   memcpy(values_at(step, 0), value, BYTES(EVENTS));
-  status = rounding_of(step, right);
-  for (int k = 0; status == OK && k < EVENT_KINKS; k++)
+  TRY(rounding_of(step, right));
+  for (int k = 0; k < EVENT_KINKS; k++)
     if (side_of(step, k, value) * SIDE_OF(step->watch, k) < 0.0 &&
         fabs(value[EVENT_FIRST[FIRST_KINK + k]]) > KINK_MISSED * rounding_at(step, k)) {
       step->watch->through = FIRST_KINK + k + 1;
       return NOT_CONVERGED;
     }
-  return status;
+  return OK;
 }
 
 #if defined(EVENT_POWERS) && EVENTS_CONTROLLED

@@ -13,9 +13,7 @@ static int density_arguments(const step_data *step, double *u)
   }
 #ifndef HAMILTONIAN_SYSTEM
   dd v[M];
-  const int status = velocities_of(dd_word(step->t), q, p, step->parameters, v, step->scratch);
-  if (status != OK)
-    return status;
+  TRY(velocities_of(dd_word(step->t), q, p, step->parameters, v, step->scratch));
   memcpy(p, v, sizeof p);
 #endif
   for (int i = 0; i < M; i++)
@@ -74,9 +72,7 @@ static int next_density(const run_memory *run, trial *now)
 {
   const real half = (real)run->direction * now->tau / 2, halves = now->turned ? 1 - run->part : 1 + run->part;
   real u[2 * M], value[2];
-  const int status = density_arguments(&now->step, u);
-  if (status != OK)
-    return status;
+  TRY(density_arguments(&now->step, u));
   step_density(u, now->at.t, now->step.parameters, value);
   now->growth = half * value[1];
   now->density = run->density > 0 ? run->density + halves * now->growth : value[0] + now->growth;
@@ -87,11 +83,8 @@ static int next_density(const run_memory *run, trial *now)
 static int find_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const real rest = (now->t_end - now->at.t) - now->at.t_low;
-  int status;
   report->t = now->step.t = now->at.t;
-  status = next_density(run, now);
-  if (status != OK)
-    return status;
+  TRY(next_density(run, now));
   now->step.h = MATH(copysign)(now->tau / now->density, rest);
   now->last = MATH(fabs)(now->step.h) * (1 + LAST_STEP) >= MATH(fabs)(rest);
   now->part = 1;
@@ -103,7 +96,7 @@ static int find_step(run_memory *run, trial *now, const solver_options *options,
   prepare(&now->step, &now->data);
   run->guess = 0; /* the predictor belongs to another step size */
   now->fallbacks = report->fallback_steps;
-  status = solve(&now->step, &now->data, run->memory, &run->guess, now->dq, now->dp, options, report,
+  const int status = solve(&now->step, &now->data, run->memory, &run->guess, now->dq, now->dp, options, report,
       now->step.scratch + SCRATCH);
   now->fallbacks = report->fallback_steps - now->fallbacks;
   return status;

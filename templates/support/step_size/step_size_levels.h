@@ -52,9 +52,8 @@ static error_limits limits_of(real tolerance)
   const real most = larger(MATH(pow)(tolerance, 1 / ERROR_POWER), LEAST_UNRESOLVED);
   const real power = (real)LEVELS_PER_BINADE * MATH(log2)(GROWTH);
   const real few = most * USED_PART / GROWTH, fewer = few / GROWTH;
-  const error_limits limits = {most, few, fewer, LITTLE * (tolerance > REAL_EPSILON ? fewer / GROWTH : fewer),
+  return (error_limits){most, few, fewer, LITTLE * (tolerance > REAL_EPSILON ? fewer / GROWTH : fewer),
       MATH(exp2)(MATH(log2)(most) / (power > FEW_POWERS ? power - 2 : power))};
-  return limits;
 }
 
 static real size_of_level(long long grid_level)
