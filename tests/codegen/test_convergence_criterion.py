@@ -85,6 +85,7 @@ typedef struct {{ double tolerance; long long max_iterations; int absolute; }} s
 #define REAL_MIN DBL_MIN
 typedef double real;
 static double larger(double a, double b) {{ return a > b ? a : b; }}
+static double smaller(double a, double b) {{ return a < b ? a : b; }}
 static double largest_number(const number *x) {{ return larger(x[0], larger(x[1], x[2])); }}
 static double number_of(double x) {{ return x; }}
 {header}

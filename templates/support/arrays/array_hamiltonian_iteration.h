@@ -45,8 +45,7 @@ static step_points points_in(const step_data *step, const iteration_data *data, 
       data->position_weight, 0.0, {0.0}};
   const half_state p = {step->p0, step->carry_p, X + n, past.now, MOMENTUM, POINT_END_MOMENTUM,
       data->momentum_weight, 0.0, {0.0}};
-  const step_points points = {step, data, X, past.now, n, {q, p}};
-  return points;
+  return (step_points){step, data, X, past.now, n, {q, p}};
 }
 
 static void forces(const step_points *w)
@@ -73,8 +72,7 @@ static double improve(const step_data *step, half_state *of, const solver_option
   double change;
   sums all;
   describe_coordinate_arrays(step->arrays, array);
-  begin_blocks(&all, step);
-  EACH_BLOCK (all) {
+  EACH_BLOCK (all, step) {
     lanes total = lanes_of(0.0), increment[GROUPS], scaled[GROUPS];
     double values[1 + COORDINATE_ARRAYS] = {0.0};
     for (int k = 0; k < COORDINATE_ARRAYS; k++) {
@@ -200,7 +198,6 @@ static int fixed_point(const step_data *step, const iteration_data *data, histor
   step_points w = points_in(step, data, past);
   progress now = before_iterations();
   double last = 0.0;
-  int status;
   first_rates(&w, past, *steps);
   for (int k = 0; needs_iteration(&now); k++) {
     const double of_q = improve(step, &w.half[0], options), both = of_q + improve(step, &w.half[1], options);
@@ -209,9 +206,7 @@ static int fixed_point(const step_data *step, const iteration_data *data, histor
       take_change(&now, last + both, options, k / 2 - 1, report);
     last = both;
   }
-  status = outcome(&now, report);
-  if (status != OK)
-    return status;
+  TRY(outcome(&now, report));
   find_increments(&w, own_part(step), dq, dp);
   if (!accept(step, dq, dp, report))
     return NOT_FINITE;

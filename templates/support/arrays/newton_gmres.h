@@ -133,8 +133,7 @@ static double size_of_state(const linear_system *of)
 {
   const step_points *w = of->points;
   sums all;
-  begin_blocks(&all, w->step);
-  EACH_BLOCK (all) {
+  EACH_BLOCK (all, w->step) {
     double size = 0.0;
     for (int part = 0; part < X_VECTORS; part++)
       for (long long i = all.here.first; i < all.here.end; i++) {
@@ -179,8 +178,7 @@ static void find_scales(linear_system *of, const solver_options *options)
   const step_points *w = of->points;
   double size[SUMS];
   sums all;
-  begin_blocks(&all, w->step);
-  EACH_BLOCK (all) {
+  EACH_BLOCK (all, w->step) {
     for (int part = 0; part < X_VECTORS; part++) {
       size[part] = DBL_MIN;
       for (long long i = all.here.first; i < all.here.end; i++)
@@ -228,7 +226,7 @@ static int solve(const step_data *step, const solver_data *data, history past, l
       .by_factors = step->run->pattern != NULL};
   progress now = before_iterations();
   const int direct = of.by_factors || X_VECTORS == 2; /* corrections by the preconditioner without GMRES */
-  int status, slow = 0; /* iterations with the factors that reduced the change too little */
+  int slow = 0; /* iterations with the factors that reduced the change too little */
   (void)workspace;
   first_points(&w, past, *guess);
   forces(&w);
@@ -263,9 +261,7 @@ static int solve(const step_data *step, const solver_data *data, history past, l
                                                            * correction */
       now.status = -1, now.last = left;
   }
-  status = outcome(&now, report);
-  if (status != OK)
-    return status;
+  TRY(outcome(&now, report));
   find_increments(&w, own_part(step), dq, dp);
   *guess = next_guess(*guess, &now, report);
   return accept(step, dq, dp, report) ? OK : NOT_FINITE;

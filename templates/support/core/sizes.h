@@ -17,15 +17,10 @@
 #define FORGETTING REAL(0.03) /* of V and A in a tenth of the time V / A, about a tenth of a radian of a vibration */
 #define TENTHS 10
 
-static inline real smallest(real a, real b)
-{
-  return a < b ? a : b;
-}
-
 /* Displacement by the curvature of a step, or of former ones: h^2 A_i, but not above the largest one of them. */
 static inline real curvature_size(const run_memory *former, real h, real curvature, int k)
 {
-  return former ? larger(curvature, smallest(h * h * former->largest_a[k], former->largest_bend[k])) : curvature;
+  return former ? larger(curvature, smaller(h * h * former->largest_a[k], former->largest_bend[k])) : curvature;
 }
 
 /* mu_i of the displacement by a step and by its curvature, with V and A of former steps, unless NULL. The displacement
@@ -33,7 +28,7 @@ static inline real curvature_size(const run_memory *former, real h, real curvatu
  * forgotten. */
 static inline real motion_size(const run_memory *former, real h, real displacement, real curvature, int k)
 {
-  const real by_v = former ? smallest(MATH(fabs)(h) * former->largest_v[k], former->largest_dq[k]) : 0;
+  const real by_v = former ? smaller(MATH(fabs)(h) * former->largest_v[k], former->largest_dq[k]) : 0;
   return displacement + larger(displacement, by_v) + curvature_size(former, h, curvature, k);
 }
 

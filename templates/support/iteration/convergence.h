@@ -41,11 +41,6 @@ static inline double part_of_position(const solver_options *options)
   return options->tolerance > REAL_EPSILON ? REAL_EPSILON / options->tolerance : 1.0;
 }
 
-static inline double smaller(double a, double b)
-{
-  return a < b ? a : b;
-}
-
 /* Factor by which numbers of this size are scaled before they are squared: 1 unless squares overflow or underflow. */
 static inline double scale_of(double size)
 {

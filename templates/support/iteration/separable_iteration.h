@@ -300,9 +300,8 @@ static void prepare_iteration(const step_data *step, iteration_data *data)
 
 static step_points points_in(const step_data *step, const iteration_data *data, history past)
 {
-  const step_points points = {step, data, step->work->X, past.now, step->n, step->work->inverse_size, NULL, NULL,
+  return (step_points){step, data, step->work->X, past.now, step->n, step->work->inverse_size, NULL, NULL,
       NULL};
-  return points;
 }
 
 static void forces(const step_points *w)
@@ -359,8 +358,7 @@ static inline void measure_points(const step_points *w, const solver_options *op
   double largest = 0.0;
   sums all;
   describe_coordinate_arrays(w->step->arrays, array);
-  begin_blocks(&all, w->step);
-  EACH_BLOCK (all) {
+  EACH_BLOCK (all, w->step) {
     double values[COORDINATE_ARRAYS] = {0.0};
     for (int k = 0; k < COORDINATE_ARRAYS; k++) {
       const section part = part_in(all.here, &array[k]);
@@ -394,8 +392,7 @@ static inline void keep_iterate(const step_points *w)
 static inline double measure_stiffness(const step_points *w)
 {
   sums all;
-  begin_blocks(&all, w->step);
-  EACH_BLOCK (all) {
+  EACH_BLOCK (all, w->step) {
     double work = 0.0, size = 0.0;
     for (long long i = all.here.first; i < all.here.end; i++) {
       const double moved = at_point(&w->X[i], OF_EACH * w->n, KEPT - 1) - w->earlier[i];
@@ -412,8 +409,7 @@ static inline double measure_stiffness(const step_points *w)
 static inline double improve(const step_points *w)
 {
   sums all;
-  begin_blocks(&all, w->step);
-  EACH_BLOCK (all) {
+  EACH_BLOCK (all, w->step) {
     const lanes change = improve_points(w, all.here);
     add_block(&all, lanes_total(change + improve_velocities(w, all.here)), 0.0);
   }
@@ -565,7 +561,7 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
   remainder_weights remainder;
   number stiffness = number_of(0.0);
   progress now = before_iterations();
-  int measures, status;
+  int measures;
   w.remainder = &remainder;
   first_points(&w, past, *steps);
   forces(&w);
@@ -595,9 +591,7 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
 #ifndef POINTS
   restore_early(&now, stored[0], F[0]);
 #endif
-  status = outcome(&now, report);
-  if (status != OK)
-    return status;
+  TRY(outcome(&now, report));
   const int unmeasured = !any_positive(magnitude(stiffness));
   if (unmeasured && !has_remainder(&now, options))
     w.former = NULL;

@@ -23,7 +23,7 @@
 #define CARRIES M
 #endif
 
-/* The part of the state that a step changes, in local memory during a call. */
+/* The part of a block that a step changes, its first members; in local memory during a call. */
 typedef struct {
   lanes q[M], p[M], carry_q[CARRIES], carry_p[CARRIES];
 } state;
@@ -130,22 +130,6 @@ void NAME(start)(block_memory *block, double t, double h)
       for (int j = 0; j < LANES; j++)
         block->observed[n][i][j] = NAN;
 #endif
-}
-
-static void load_state(const block_memory *block, state *now)
-{
-  memcpy(now->q, block->q, sizeof now->q);
-  memcpy(now->p, block->p, sizeof now->p);
-  memcpy(now->carry_q, block->carry_q, sizeof now->carry_q);
-  memcpy(now->carry_p, block->carry_p, sizeof now->carry_p);
-}
-
-static void save_state(const state *now, block_memory *block)
-{
-  memcpy(block->q, now->q, sizeof now->q);
-  memcpy(block->p, now->p, sizeof now->p);
-  memcpy(block->carry_q, now->carry_q, sizeof now->carry_q);
-  memcpy(block->carry_p, now->carry_p, sizeof now->carry_p);
 }
 
 /* Stores the states of the first `count` trajectories, one row each. */
@@ -263,7 +247,7 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
 #ifdef SINGLE_PRECISION
   feclearexcept(FE_OVERFLOW | FE_UNDERFLOW);
 #endif
-  load_state(block, &now);
+  memcpy(&now, block, sizeof now);
   memcpy(parameters, block->parameters, sizeof(lanes) * P);
   memcpy(memory, block->memory, sizeof memory);
   prepare_iteration(&step, &data);
@@ -351,7 +335,7 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
     }
   }
   block->iterations += report.iterations;
-  save_state(&now, block);
+  memcpy(block, &now, sizeof now);
   memcpy(block->memory, memory, sizeof memory);
 #ifdef OBSERVED
   memcpy(block->observed, &seen, sizeof seen);

@@ -47,8 +47,7 @@ typedef struct {
 /* Step-size control by default: errors of round-off size. */
 step_control NAME(default_step_control)(void)
 {
-  const step_control control = {.max_step = INFINITY};
-  return control;
+  return (step_control){.max_step = INFINITY};
 }
 
 #ifdef NEWTON_ALONE
@@ -57,11 +56,6 @@ step_control NAME(default_step_control)(void)
 #define SHORT_STEPS_FAIL 0
 #define LEVELS_OUTSIDE 0
 #define LEVELS_INSIDE 0 /* no predictor from a rejected step */
-
-static inline real smaller(real a, real b)
-{
-  return a < b ? a : b;
-}
 
 /* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
  * failed. afresh: without the predictor, which requires the step size of the previous step. */
@@ -303,24 +297,6 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
 #ifdef RATTLE
   now->fallbacks = report->fallback_steps - now->fallbacks;
 #endif
-}
-
-/* Largest increment of x, and the largest number of x. */
-static SELDOM real largest_change(const step_data *step, const real *x, const real *dx, real *size)
-{
-  sums all;
-  begin_blocks(&all, step);
-  EACH_BLOCK (all) {
-    real change = 0, of_x = 0;
-    for (long long i = all.here.first; i < all.here.end; i++) {
-      change = larger(change, MATH(fabs)(dx[i]));
-      of_x = larger(of_x, MATH(fabs)(x[i]));
-    }
-    add_block(&all, change, of_x);
-  }
-  meet(step);
-  *size = largest_over(&all, 1);
-  return largest_over(&all, 0);
 }
 
 /* Returns 1 if the momenta change by a small part of the largest one, as they do where nonsmooth forces shorten a
@@ -612,8 +588,7 @@ static SELDOM int stages_fly(const real *z)
 static SELDOM int is_free_flight(const step_data *step, stored_values of)
 {
   sums all;
-  begin_blocks(&all, step);
-  EACH_BLOCK (all) {
+  EACH_BLOCK (all, step) {
     int flies = 0;
     for (long long i = all.here.first; i < all.here.end; i++) {
       const double start = stored_at(of, i, 0), middle = stored_at(of, i, KEPT / 2), end = stored_at(of, i, KEPT - 1);
@@ -670,11 +645,9 @@ static SELDOM int add_part(step_data *part, const solver_options *options, real 
 static SELDOM int force_sets_in(const trial *now, const solver_options *options)
 {
   const step_data *step = &now->step;
-  const section own = own_part(step);
-  step_data part = *step;
+  step_data part = part_of_step(step, step->h / 2);
   real least, largest, rounded;
   sums all;
-  int status;
   VECTORS(nothing, 1, step);
   VECTORS(q, 1, step);
   VECTORS(p, 1, step);
@@ -684,32 +657,18 @@ static SELDOM int force_sets_in(const trial *now, const solver_options *options)
   VECTORS(first, 1, step);
   set_zero(step, nothing), set_zero(step, halves), set_zero(step, changes);
   set_zero(step, whole), set_zero(step, first);
-  for (long long i = own.first; i < own.end; i++) {
-    q[i] = step->q0[i] + (step->carry_q[i] + now->dq[i]);
-    p[i] = step->p0[i] + (step->carry_p[i] + now->dp[i]);
-  }
-  part.tables = NULL;
-#if defined(ERROR_GROWTH) || defined(MIXED_POINTS)
-  part.points = NULL;
-#endif
-  part.h = step->h / 2;
-  part.first = COMPARISON;
-  status = add_part(&part, options, halves, changes);
-  if (status != OK)
+  if (add_part(&part, options, halves, changes) != OK)
     return 0;
   part.h = BEYOND_END * step->h;
   part.t = step->t + step->h;
-  part.q0 = q, part.p0 = p;
-  part.carry_q = part.carry_p = nothing;
+  begin_part(&part, step, now->dq, now->dp, q, p, nothing);
   part.first = SECOND_HALF;
-  status = add_part(&part, options, whole, first);
-  if (status != OK)
+  if (add_part(&part, options, whole, first) != OK)
     return 0;
   least = largest_change(step, p, now->dp, &largest);
   least = NO_FORCE * (least + largest);
   rounded = size_by_constraints(step);
-  begin_blocks(&all, step);
-  EACH_BLOCK (all) {
+  EACH_BLOCK (all, step) {
     int sets_in = 0;
     for (long long i = all.here.first; i < all.here.end; i++) {
       const real early = 2 * changes[i], late = 2 * (now->dp[i] - changes[i]), beyond = first[i] / BEYOND_END;
@@ -732,8 +691,7 @@ static SELDOM int passes_over_force(const trial *now, real allowed, const solver
 {
 #ifdef LOCALISED_FORCES
   const step_data *step = &now->step;
-  const section own = own_part(step);
-  step_data part = *step;
+  step_data part = part_of_step(step, 0);
   const int count = (int)(PIECES * MATH(fabs)(step->h / (now->t_end - now->at.t)));
   real begin = 0, far = 0;
   VECTORS(nothing, 1, step);
@@ -744,23 +702,13 @@ static SELDOM int passes_over_force(const trial *now, real allowed, const solver
   if (count < LEAST_PIECES)
     return 0;
   set_zero(step, nothing), set_zero(step, halves), set_zero(step, changes);
-  part.tables = NULL;
-#if defined(ERROR_GROWTH) || defined(MIXED_POINTS)
-  part.points = NULL;
-#endif
-  part.first = COMPARISON;
   for (int k = 1; k <= count; k++) {
     const real turn = GOLDEN * (real)k - MATH(floor)(GOLDEN * (real)k);
     const real end = k < count ? ((real)k + UNEVEN * (turn - REAL(0.5))) / (real)count : 1;
     part.h = (end - begin) * step->h;
     if (add_part(&part, options, halves, changes) != OK)
       return 0;
-    for (long long i = own.first; i < own.end; i++) {
-      q[i] = step->q0[i] + (step->carry_q[i] + halves[i]);
-      p[i] = step->p0[i] + (step->carry_p[i] + changes[i]);
-    }
-    part.q0 = q, part.p0 = p;
-    part.carry_q = part.carry_p = nothing;
+    begin_part(&part, step, halves, changes, q, p, nothing);
     begin = end;
   }
   return difference(step, step->h, step->q0, now->dq, halves, &far) > allowed;
@@ -780,7 +728,7 @@ static SELDOM int compare_step(run_memory *run, trial *now, int steps_to_compare
       ALLOWED_TO_HALVES * MATH(pow)(now->limits.most, ERROR_POWER), steps_to_compare ? ROUNDOFF_LEVEL : SPURIOUS);
   for (;;) {
     real apart;
-    int status = compare_trial(now, steps_to_compare, options, &apart);
+    const int status = compare_trial(now, steps_to_compare, options, &apart);
     if (status > STATUS(SPURIOUS_SOLUTION))
       return status;
     if (status == OK && apart <= allowed &&
@@ -796,9 +744,7 @@ static SELDOM int compare_step(run_memory *run, trial *now, int steps_to_compare
     if (!shorten(run, now, MOST_DOWN))
       return STATUS(STEP_SIZE_UNDERFLOW);
     run->error_before = now->limits.most;
-    status = find_step(run, now, options, report);
-    if (status != OK)
-      return status;
+    TRY(find_step(run, now, options, report));
   }
 }
 
@@ -944,11 +890,8 @@ static int take_trials(run_memory *run, const job *way, solver_report *report)
   run->direction = (way->t_end - run->t) - run->t_low < 0 ? -1 : 1;
   while (report->steps < way->steps && (run->t != way->t_end || run->t_low != 0.0)) {
     const long long before = report->iterations;
-    int status = find_step(run, &now, options, report);
-    if (status == OK)
-      status = confirm_step(run, &now, options, report);
-    if (status != OK)
-      return status;
+    TRY(find_step(run, &now, options, report));
+    TRY(confirm_step(run, &now, options, report));
     accept_trial(run, &now);
     run->t = now.at.t, run->t_low = now.at.t_low;
     run->iterations += report->iterations - before;
