@@ -47,7 +47,7 @@ static int external_flow(flow_part part, int count, const double *x, const doubl
 {
   flow_call way = {.steps = FLOW_STEPS, .every = FLOW_EVERY, .count = count};
   solver_report report;
-  return found && flow_rows(part, &way, 1, x, given, found, &report) != OK;
+  return found && flow_rows(part, &way, 1, x, given, NULL, found, &report) != OK;
 }
 
 int EXTERNAL(, )(const double **arg, double **res, casadi_int *iw, double *w, int mem)
@@ -99,7 +99,7 @@ static int external_hessian(const double *x, const double *partials, double *fou
     memcpy(same + i * VALUES, partials, sizeof(double) * VALUES);
   }
   if (same)
-    status = hessian_rows(&way, 1, x, same, each, found, &report);
+    status = flow_rows(FLOW_HESSIAN, &way, 1, x, same, each, found, &report);
   free(same);
   return status;
 }

@@ -14,11 +14,13 @@ enum {
   FLOW_NO_MEMORY = 6
 };
 
-/* Results of a flow: states; tangent vectors of the states (JVP); gradients with respect to the inputs (VJP). */
+/* Results of a flow: states; tangent vectors of the states (JVP); gradients with respect to the inputs (VJP); their
+ * derivatives along tangent vectors of the inputs. */
 typedef enum {
   FLOW_STATES,
   FLOW_JVP,
-  FLOW_VJP
+  FLOW_VJP,
+  FLOW_HESSIAN
 } flow_part;
 
 /* Parameters of the evaluation of a row, and its memory. */
@@ -28,6 +30,8 @@ typedef struct {
   real *states; /* (steps + 1, FLOW_STATE) */
   real *t, *h, *q, *p, *q1, *p1; /* of the steps of a chunk */
   real *vectors; /* (FLOW_CHUNK + 1, count, STEP_INPUTS) */
+  real *room; /* of second derivatives: (steps + 1, count, STEP_INPUTS) tangent vectors, (FLOW_CHUNK + 1, 2, count,
+               * STEP_INPUTS) adjoint vectors with their derivatives */
   real *workspace;
 } flow_call;
 
@@ -36,14 +40,21 @@ static long long kept_states(const flow_call *way)
   return way->steps / way->every + 1;
 }
 
+/* Numbers of all vectors of inputs. */
+static long long numbers_across(const flow_call *way)
+{
+  return (long long)way->count * STEP_INPUTS;
+}
+
 /* Allocates the memory, to be freed at way->workspace; returns 0 if there is none. Intermediate states are stored only
  * for derivatives. */
-static int allocate_flow(flow_call *way)
+static int allocate_flow(flow_part part, flow_call *way)
 {
   const size_t work = STATUS(LINEARISED_WORKSPACE), piece = (size_t)FLOW_CHUNK * (2 + 4 * M);
   const size_t vectors = (size_t)(FLOW_CHUNK + 1) * (size_t)way->count * STEP_INPUTS;
   const size_t states = way->count ? ((size_t)way->steps + 1) * FLOW_STATE : 0;
-  real *place = malloc(sizeof(real) * (work + piece + vectors + states));
+  const size_t room = part == FLOW_HESSIAN ? (size_t)(way->steps + 1 + 2 * (FLOW_CHUNK + 1)) : 0;
+  real *place = malloc(sizeof(real) * (work + piece + vectors + states + room * (size_t)numbers_across(way)));
   way->workspace = place;
   way->t = place + work;
   way->h = way->t + FLOW_CHUNK;
@@ -53,6 +64,7 @@ static int allocate_flow(flow_call *way)
   way->p1 = way->q1 + FLOW_CHUNK * M;
   way->vectors = way->p1 + FLOW_CHUNK * M;
   way->states = way->vectors + vectors;
+  way->room = way->states + states;
   return place != NULL;
 }
 
@@ -122,20 +134,19 @@ static void fill_chunk(const flow_call *way, const real *x, long long done, int 
 static int propagate_chunk_of_steps(const flow_call *way, const real *x, long long done, int length, int back,
     solver_report *report)
 {
-  int status, mismatch;
   fill_chunk(way, x, done, length);
-  status = NAME(linearise)(length, way->t, way->h, way->q, way->p, x + FLOW_STATE, NULL, back, way->count, way->vectors,
-      way->q1, way->p1, report, way->workspace);
+  const int status = NAME(linearise)(length, way->t, way->h, way->q, way->p, x + FLOW_STATE, NULL, back, way->count,
+      way->vectors, way->q1, way->p1, report, way->workspace);
   if (status != OK) {
     report->steps = back ? done + length - 1 - report->steps : done + report->steps;
     return status;
   }
-  mismatch = first_mismatch(way, way->states + done * FLOW_STATE, length);
-  if (mismatch < length) {
-    report->steps = done + mismatch;
-    report->t = way->t[mismatch];
-  }
-  return mismatch < length ? STATUS(SPURIOUS_SOLUTION) : OK;
+  const int mismatch = first_mismatch(way, way->states + done * FLOW_STATE, length);
+  if (mismatch == length)
+    return OK;
+  report->steps = done + mismatch;
+  report->t = way->t[mismatch];
+  return STATUS(SPURIOUS_SOLUTION);
 }
 
 /* Offset of the state at the end of a step in an array (count, kept states, FLOW_STATE) for vector c; -1 if that state
@@ -163,124 +174,113 @@ static void add_adjoints(const flow_call *way, long long step, const real *parti
  * states. */
 static int jvp_along(const flow_call *way, const real *x, const real *changes, real *kept, solver_report *report)
 {
-  const long long across = (long long)way->count * STEP_INPUTS;
-  int status = OK, length = 0;
+  const long long across = numbers_across(way);
+  int length = 0;
   memcpy(way->vectors, changes, sizeof(real) * (size_t)across);
   store_tangents(way, 0, way->vectors, kept);
-  for (long long done = 0; done < way->steps && status == OK; done += length) {
+  for (long long done = 0; done < way->steps; done += length) {
     length = chunk_size_after(way, done);
     memset(way->vectors + across, 0, sizeof(real) * (size_t)(across * length));
-    status = propagate_chunk_of_steps(way, x, done, length, 0, report);
+    TRY(propagate_chunk_of_steps(way, x, done, length, 0, report));
     for (int k = 1; k <= length; k++)
       store_tangents(way, done + k, way->vectors + k * across, kept);
     memcpy(way->vectors, way->vectors + length * across, sizeof(real) * (size_t)across);
   }
-  return status;
+  return OK;
 }
 
 /* From (count, kept states, FLOW_STATE) adjoint vectors of the states to (count, STEP_INPUTS) gradients with respect
  * to the inputs. */
 static int vjp_along(const flow_call *way, const real *x, const real *kept, real *partials, solver_report *report)
 {
-  const long long across = (long long)way->count * STEP_INPUTS;
-  int status = OK, length = 0;
+  const long long across = numbers_across(way);
+  int length = 0;
   memset(way->vectors, 0, sizeof(real) * (size_t)across);
-  for (long long end = way->steps; end > 0 && status == OK; end -= length) {
+  for (long long end = way->steps; end > 0; end -= length) {
     length = chunk_size_after(way, way->steps - end);
     memcpy(way->vectors + length * across, way->vectors, sizeof(real) * (size_t)across);
     memset(way->vectors, 0, sizeof(real) * (size_t)(across * length));
     for (int k = 1; k <= length; k++)
       add_adjoints(way, end - length + k, kept, way->vectors + k * across);
-    status = propagate_chunk_of_steps(way, x, end - length, length, 1, report);
+    TRY(propagate_chunk_of_steps(way, x, end - length, length, 1, report));
   }
   add_adjoints(way, 0, kept, way->vectors);
   memcpy(partials, way->vectors, sizeof(real) * (size_t)across);
-  return status;
-}
-
-/* Evaluates the flow or its derivatives for each of `rows` rows x of STEP_INPUTS inputs. On failure returns the
- * status of the failed step, or FLOW_NO_MEMORY; later results are undefined. */
-static int flow_rows(flow_part part, flow_call *way, long long rows, const real *x, const real *given,
-    real *found, solver_report *report)
-{
-  const long long kept = kept_states(way) * FLOW_STATE, across = (long long)way->count * STEP_INPUTS;
-  const long long values = way->count * kept;
-  int status = OK;
-  memset(report, 0, sizeof *report);
-  if (!allocate_flow(way))
-    return FLOW_NO_MEMORY;
-  for (long long row = 0; row < rows && status == OK; row++, x += STEP_INPUTS)
-    if (part == FLOW_STATES)
-      status = follow(way, x, way->every, found + row * kept, report);
-    else {
-      status = follow(way, x, 1, way->states, report);
-      if (status == OK && part == FLOW_JVP)
-        status = jvp_along(way, x, given + row * across, found + row * values, report);
-      if (status == OK && part == FLOW_VJP)
-        status = vjp_along(way, x, given + row * values, found + row * across, report);
-    }
-  free(way->workspace);
-  return status;
+  return OK;
 }
 
 #ifdef SECOND_DERIVATIVES
 /* Second derivatives of a flow: tangent vectors of its VJP. Requires: second_derivatives.h. */
 
 /* Computes from (count, kept states, FLOW_STATE) adjoint vectors, each with one of (count, STEP_INPUTS) tangent
- * vectors of the inputs, the (count, STEP_INPUTS) derivatives of the gradients along them. `room` is for (steps + 1,
- * count, STEP_INPUTS) tangent vectors and (FLOW_CHUNK + 1, 2, count, STEP_INPUTS) adjoint vectors with their
- * derivatives. */
+ * vectors of the inputs, the (count, STEP_INPUTS) derivatives of the gradients along them. */
 static int hessian_along(const flow_call *way, const real *x, const real *kept, const real *changes, real *found,
-    real *room, solver_report *report)
+    solver_report *report)
 {
-  const long long across = (long long)way->count * STEP_INPUTS;
-  real *partials = room + (way->steps + 1) * across;
-  int status = OK, length = 0;
+  const long long across = numbers_across(way);
+  real *room = way->room, *partials = room + (way->steps + 1) * across;
+  int length = 0;
   memset(room, 0, sizeof(real) * (size_t)((way->steps + 1 + 2 * (FLOW_CHUNK + 1)) * across));
   memcpy(room, changes, sizeof(real) * (size_t)across);
-  for (long long done = 0; done < way->steps && status == OK; done += length) {
+  for (long long done = 0; done < way->steps; done += length) {
     flow_call here = *way;
     here.vectors = room + done * across;
     length = chunk_size_after(way, done);
-    status = propagate_chunk_of_steps(&here, x, done, length, 0, report);
+    TRY(propagate_chunk_of_steps(&here, x, done, length, 0, report));
   }
-  for (long long end = way->steps; end > 0 && status == OK; end -= length) {
+  for (long long end = way->steps; end > 0; end -= length) {
     length = chunk_size_after(way, way->steps - end);
     memcpy(partials + 2 * length * across, partials, sizeof(real) * (size_t)(2 * across));
     memset(partials, 0, sizeof(real) * (size_t)(2 * across * length));
     for (int k = 1; k <= length; k++)
       add_adjoints(way, end - length + k, kept, partials + 2 * k * across);
     fill_chunk(way, x, end - length, length);
-    status = NAME(second_order)(length, way->t, way->h, way->q, way->p, x + FLOW_STATE, NULL, way->count,
+    const int status = NAME(second_order)(length, way->t, way->h, way->q, way->p, x + FLOW_STATE, NULL, way->count,
         room + (end - length) * across, partials, report, way->workspace);
-    if (status != OK)
+    if (status != OK) {
       report->steps = end - 1 - report->steps;
+      return status;
+    }
   }
   memcpy(found, partials + across, sizeof(real) * (size_t)across);
-  return status;
-}
-
-/* hessian_along for each of `rows` rows x of STEP_INPUTS inputs. */
-static int hessian_rows(flow_call *way, long long rows, const real *x, const real *partials, const real *changes,
-    real *found, solver_report *report)
-{
-  const long long across = (long long)way->count * STEP_INPUTS, values = way->count * kept_states(way) * FLOW_STATE;
-  real *room = malloc(sizeof(real) * (size_t)((way->steps + 1 + 2 * (FLOW_CHUNK + 1)) * across));
-  int status = OK, made = allocate_flow(way);
-  memset(report, 0, sizeof *report);
-  if (!made || !room)
-    status = FLOW_NO_MEMORY;
-  for (long long row = 0; row < rows && status == OK; row++, x += STEP_INPUTS) {
-    status = follow(way, x, 1, way->states, report);
-    if (status == OK)
-      status = hessian_along(way, x, partials + row * values, changes + row * across, found + row * across, room,
-          report);
-  }
-  free(way->workspace);
-  free(room);
-  return status;
+  return OK;
 }
 #endif
+
+/* Evaluates the flow or its derivatives for a row of inputs; given: tangent or adjoint vectors. */
+static int flow_row(flow_part part, const flow_call *way, const real *x, const real *given, const real *changes,
+    real *found, solver_report *report)
+{
+  (void)changes;
+  if (part == FLOW_STATES)
+    return follow(way, x, way->every, found, report);
+  TRY(follow(way, x, 1, way->states, report));
+  if (part == FLOW_JVP)
+    return jvp_along(way, x, given, found, report);
+#ifdef SECOND_DERIVATIVES
+  if (part == FLOW_HESSIAN)
+    return hessian_along(way, x, given, changes, found, report);
+#endif
+  return vjp_along(way, x, given, found, report);
+}
+
+/* The same for each of `rows` rows x of STEP_INPUTS inputs; NULL for what a part does not depend on. On failure returns
+ * the status of the failed step, or FLOW_NO_MEMORY; later results are undefined. */
+static int flow_rows(flow_part part, flow_call *way, long long rows, const real *x, const real *given,
+    const real *changes, real *found, solver_report *report)
+{
+  const long long states = kept_states(way) * FLOW_STATE, across = numbers_across(way), values = way->count * states;
+  const long long directions = part == FLOW_JVP ? across : values, results[] = {states, values, across, across};
+  int status = OK;
+  memset(report, 0, sizeof *report);
+  if (!allocate_flow(part, way))
+    return FLOW_NO_MEMORY;
+  for (long long row = 0; row < rows && status == OK; row++)
+    status = flow_row(part, way, x + row * STEP_INPUTS, given ? given + row * directions : NULL,
+        changes ? changes + row * across : NULL, found + row * results[part], report);
+  free(way->workspace);
+  return status;
+}
 
 #ifdef FLOW_OF_ROWS
 /* Flow of many rows, for callers with arrays. part: 0 states, 1 tangent vectors of the states (JVP), 2 gradients with
@@ -290,7 +290,7 @@ int NAME(flow_rows)(int part, long long steps, long long every, int count, long 
     const real *given, real *found, solver_report *report)
 {
   flow_call way = {.steps = steps, .every = every, .count = count};
-  return flow_rows((flow_part)part, &way, rows, x, given, found, report);
+  return flow_rows((flow_part)part, &way, rows, x, given, NULL, found, report);
 }
 
 #ifdef SECOND_DERIVATIVES
@@ -299,7 +299,7 @@ int NAME(hessian_rows)(long long steps, long long every, int count, long long ro
     const real *changes, real *found, solver_report *report)
 {
   flow_call way = {.steps = steps, .every = every, .count = count};
-  return hessian_rows(&way, rows, x, partials, changes, found, report);
+  return flow_rows(FLOW_HESSIAN, &way, rows, x, partials, changes, found, report);
 }
 #endif
 #endif

@@ -37,8 +37,7 @@ static flow_call way_of(const XLA_FFI_CallFrame *frame, int count)
 {
   const long long *every = ((XLA_FFI_Scalar *)frame->attrs.attrs[0])->value;
   const long long *steps = ((XLA_FFI_Scalar *)frame->attrs.attrs[1])->value;
-  const flow_call way = {.steps = *steps, .every = *every, .count = count};
-  return way;
+  return (flow_call){.steps = *steps, .every = *every, .count = count};
 }
 
 static long long rows_of(const XLA_FFI_Buffer *x)
@@ -49,51 +48,39 @@ static long long rows_of(const XLA_FFI_Buffer *x)
   return rows;
 }
 
-/* Evaluates the flow: x (.., STEP_INPUTS), for derivatives also vectors (.., count, size). */
+/* Evaluates the flow: x (.., STEP_INPUTS), for derivatives also vectors (.., count, size), for second ones tangent
+ * vectors behind them. */
 static XLA_FFI_Error *flow_of_frame(flow_part part, XLA_FFI_CallFrame *frame)
 {
+  if (answers_version(frame))
+    return NULL;
   const XLA_FFI_Buffer *x = frame->args.args[0], *given = part == FLOW_STATES ? x : frame->args.args[1];
-  const XLA_FFI_Buffer *found = frame->rets.rets[0];
+  const XLA_FFI_Buffer *changes = part == FLOW_HESSIAN ? frame->args.args[2] : x, *found = frame->rets.rets[0];
   flow_call way = way_of(frame, part == FLOW_STATES ? 0 : (int)given->dims[x->rank - 1]);
   solver_report report;
-  const int status = flow_rows(part, &way, rows_of(x), x->data, given->data, found->data, &report);
+  const int status = flow_rows(part, &way, rows_of(x), x->data, given->data, changes->data, found->data, &report);
   return status == OK ? NULL : failure(frame, status, &report);
 }
 
 XLA_FFI_Error *NAME(xla_states)(XLA_FFI_CallFrame *frame)
 {
-  return answers_version(frame) ? NULL : flow_of_frame(FLOW_STATES, frame);
+  return flow_of_frame(FLOW_STATES, frame);
 }
 
 XLA_FFI_Error *NAME(xla_jvp)(XLA_FFI_CallFrame *frame)
 {
-  return answers_version(frame) ? NULL : flow_of_frame(FLOW_JVP, frame);
+  return flow_of_frame(FLOW_JVP, frame);
 }
 
 XLA_FFI_Error *NAME(xla_vjp)(XLA_FFI_CallFrame *frame)
 {
-  return answers_version(frame) ? NULL : flow_of_frame(FLOW_VJP, frame);
+  return flow_of_frame(FLOW_VJP, frame);
 }
 
 #ifdef SECOND_DERIVATIVES
-/* Derivatives of gradients as an XLA custom call. Requires: flow.h. */
-
-/* x (.., STEP_INPUTS), adjoint vectors (.., count, kept states, FLOW_STATE) and tangent vectors (.., count,
- * STEP_INPUTS); results like the latter. */
+/* Derivatives of gradients. */
 XLA_FFI_Error *NAME(xla_vjp_derivative)(XLA_FFI_CallFrame *frame)
 {
-  flow_call way;
-  solver_report report;
-  const XLA_FFI_Buffer *x, *partials, *changes, *found;
-  int status;
-  if (answers_version(frame))
-    return NULL;
-  x = frame->args.args[0];
-  partials = frame->args.args[1];
-  changes = frame->args.args[2];
-  found = frame->rets.rets[0];
-  way = way_of(frame, (int)partials->dims[x->rank - 1]);
-  status = hessian_rows(&way, rows_of(x), x->data, partials->data, changes->data, found->data, &report);
-  return status == OK ? NULL : failure(frame, status, &report);
+  return flow_of_frame(FLOW_HESSIAN, frame);
 }
 #endif
