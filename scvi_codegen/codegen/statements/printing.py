@@ -1,25 +1,18 @@
 """C of the statements of a step: loops, storage and number types.
 
 Statements on values of the same index become one loop, and values that only this loop uses its local variables. Where
-points of a step are SIMD lanes, loops are inside of a loop over groups of points (:mod:`.schedule`).
+points of a step are SIMD lanes, loops are inside of a loop over groups of points, one group a vector. A statement that
+sums over points, or reads the point before, of a value that the present loop computes needs all its points: there the
+loop over groups ends.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum, auto
 
 from scvi_codegen.codegen.statements.arithmetic import Value, combine, high_word, negated
-from scvi_codegen.codegen.statements.schedule import (
-    PointLoop,
-    in_registers,
-    names_read,
-    over_points,
-    point_loops,
-    reads,
-    target_name,
-)
 from scvi_codegen.common.errors import MethodError
 from scvi_codegen.methods.statements import (
     COUNTS,
@@ -38,6 +31,8 @@ from scvi_codegen.methods.statements import (
     When,
 )
 
+Simple = Assign | Apply
+
 
 class Place(Enum):
     """Where the values of a quantity are."""
@@ -54,10 +49,12 @@ class Place(Enum):
     """In memory, at all points: sums over points read it number by number."""
     GROUPS = auto()
     """``x[i][g]``: vectors of all points."""
-    FLAT = auto()
-    """``x[i * GROUPS + g]``: the same in one array."""
     TABLE = auto()
     """A number for each point."""
+
+
+SHAPES = {Place.ARRAY: "", Place.MEMORY: "[GROUP_LANES]", Place.GROUPS: "[GROUPS]"}
+"""Dimensions of local arrays behind that of their index."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +66,7 @@ class Quantity:
         place: where its values are.
         words: of a value.
         low: the array of the low words of a state.
-        first: the array of the values at the first point, which is not among the points.
+        first: the array of the values at the first point, which is not among the points; of ``x->y`` x->first_y.
         uniform: whether it is one number for all lanes.
         index: letter of its index.
     """
@@ -82,6 +79,10 @@ class Quantity:
     uniform: bool = False
     index: str = "i"
 
+    def at(self, at: At | None) -> str:
+        """Return the C of a value of an array."""
+        return self.text if at is None or self.place is Place.LOCAL else f"{self.text}[{at.text}]"
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -91,71 +92,43 @@ class Layout:
     lanes: bool = False
     word: str = "number"
 
-    @property
-    def number(self) -> str:
-        """Type of a value of the trajectory."""
-        return self.type_of(Quantity("", words=self.words, uniform=not self.lanes))
-
     def type_of(self, quantity: Quantity) -> str:
         """Return the type of a value."""
-        if quantity.words == 1:
-            return self.word
-        return "dd" if quantity.uniform else "ddl"
-
-    def local(self, name: str, place: Place, words: int, index: str) -> Quantity:
-        """Return a quantity that only the statements use."""
-        return Quantity(name, place, words, uniform=not self.lanes, index=index)
-
-    def pair(self, high: str, low: str) -> Value:
-        """Return a number of two words that are in arrays."""
-        if self.lanes:
-            return Value(f"ddl_of_words({high}, {low})", 2)
-        return Value(f"dd_of({high}, {low})", 2, uniform=True)
+        two = "dd" if quantity.uniform else "ddl"
+        return self.word if quantity.words == 1 else two
 
     def read(self, quantity: Quantity, at: At | None) -> Value:
         """Return a value of a quantity."""
-        index = "" if at is None or quantity.place is Place.LOCAL else f"[{at.text}]"
+        text = quantity.at(at)
         if quantity.place is Place.STATE and self.words == 2:
-            return self.pair(f"{quantity.text}{index}", f"{quantity.low}{index}")
-        return Value(f"{quantity.text}{index}", quantity.words, quantity.uniform)
+            of_words = "ddl_of_words" if self.lanes else "dd_of"
+            return Value(f"{of_words}({text}, {quantity.low}[{at and at.text}])", 2, uniform=not self.lanes)
+        return Value(text, quantity.words, quantity.uniform)
 
     def write(self, quantity: Quantity, at: At | None, value: str) -> str:
         """Return the statement that stores a value."""
         return f"{self.read(quantity, at).text} = {value};"
 
-    def former(self, quantity: Quantity, at: At) -> Value:
-        """Return the value at the point before; MethodError if the layout has no points."""
-        raise MethodError(f"former({quantity.text}[{at.text}]) is a value of points, which this step has not")
-
-    def over_points(self, table: str, quantity: Quantity, at: At) -> Value:
-        """Return the sum over points with the row of a table; MethodError if the layout has no points."""
-        raise MethodError(f"{table} @ {quantity.text}[{at.text}] is a sum over points, which this step has not")
+    def at_other_points(self, expression: Former | OverPoints, quantity: Quantity) -> Value:
+        """Return a value that depends on other points; MethodError if the layout has none."""
+        raise MethodError(f"values of '{quantity.text}' at other points are needed, but this step has no points")
 
 
 @dataclass(frozen=True)
 class PointsAsLanes(Layout):
     """Layout of the points of constrained steps, which are SIMD lanes (point_lanes.h)."""
 
-    def type_of(self, quantity: Quantity) -> str:
-        """Return the type of a value."""
-        return "lanes" if quantity.words == 1 else "ddl"
-
-    def local(self, name: str, place: Place, words: int, index: str) -> Quantity:
-        """Return a quantity that only the statements use, a vector."""
-        return Quantity(name, place, words, index=index)
+    lanes: bool = True
+    word: str = "lanes"
 
     def read(self, quantity: Quantity, at: At | None) -> Value:
         """Return the values of a quantity at the points of a vector."""
-        place, words = quantity.place, quantity.words
-        index = "" if at is None or place is Place.LOCAL else f"[{at.text}]"
-        text = f"{quantity.text}{index}"
-        match place:
-            case Place.MEMORY if words == 1:
+        text, words = quantity.at(at), quantity.words
+        match quantity.place:
+            case Place.MEMORY:
                 return Value(f"load({text}, g)")
-            case Place.MEMORY | Place.GROUPS:
+            case Place.GROUPS:
                 return Value(f"{text}[g]", words)
-            case Place.FLAT:
-                return Value(f"{quantity.text}[{at and at.text} * GROUPS + g]", words)
             case Place.TABLE if words == 1:
                 return Value(f"weights({text}, g)")
             case Place.TABLE:
@@ -164,29 +137,22 @@ class PointsAsLanes(Layout):
 
     def write(self, quantity: Quantity, at: At | None, value: str) -> str:
         """Return the statement that stores the values at the points of a vector."""
-        if quantity.place is Place.MEMORY and quantity.words == 1:
-            return f"store({quantity.text}[{at and at.text}], g, {value});"
+        if quantity.place is Place.MEMORY:
+            return f"store({quantity.at(at)}, g, {value});"
         return super().write(quantity, at, value)
 
-    def former(self, quantity: Quantity, at: At) -> Value:
-        """Return the value at the point before."""
-        function = "former" if quantity.words == 1 else "former_pairs"
-        text = f"{function}({quantity.text}[{at.text}], {quantity.first}[{at.text}], g)"
-        return Value(text, quantity.words)
-
-    def over_points(self, table: str, quantity: Quantity, at: At) -> Value:
-        """Return the sum over points with the row of a table."""
-        if quantity.words == 1:
-            return Value(f"times({table}, DEGREE, {quantity.text}[{at.text}], g)")
-        words = f"{quantity.text}_high[{at.text}], {quantity.text}_low[{at.text}]"
-        return Value(f"pair_times({table}, {table}_LOW, {words}, g)", 2)
-
-    def declaration(self, quantity: Quantity) -> str:
-        """Return the declaration of a quantity at all points."""
-        count = COUNTS[quantity.index]
-        if quantity.place is Place.GROUPS or quantity.words == 2:
-            return f"{self.type_of(quantity)} {quantity.text}[{count}][GROUPS];"
-        return f"number {quantity.text}[{count}][GROUP_LANES];"
+    def at_other_points(self, expression: Former | OverPoints, quantity: Quantity) -> Value:
+        """Return the value at the point before, or the sum over points with the row of a table."""
+        at, text, words = expression.value.at, quantity.at(expression.value.at), quantity.words
+        if isinstance(expression, Former):
+            function = "former" if words == 1 else "former_pairs"
+            first = quantity.first or quantity.text.replace("->", "->first_")
+            return Value(f"{function}({text}, {first}[{at and at.text}], g)", words)
+        table = expression.table
+        if words == 1:
+            return Value(f"times({table}, DEGREE, {text}, g)")
+        high, low = (f"{quantity.text}_{word}[{at and at.text}]" for word in ("high", "low"))
+        return Value(f"pair_times({table}, {table}_LOW, {high}, {low}, g)", 2)
 
 
 @dataclass
@@ -206,94 +172,64 @@ class Printer:
 
     def function_body(self, statements: Sequence[Statement]) -> list[str]:
         """Return the lines of a function without points."""
-        for name, letter in _computed(statements).items():
-            if name not in self.quantities:
-                place = Place.LOCAL if _is_of_one_loop(name, statements) else Place.ARRAY
-                self.locals[name] = self.layout.local(name, place, self.layout.words, letter)
+        self._place([statements], ())
         return [*self._declarations(self.locals.values()), *self.lines(statements)]
 
     def function_of_points(self, statements: Sequence[Statement]) -> list[str]:
         """Return the lines of a function with points."""
-        assert isinstance(self.layout, PointsAsLanes)
-        stored = {name for name, quantity in self.quantities.items() if quantity.place in (Place.MEMORY, Place.GROUPS)}
-        loops = point_loops(statements, stored)
-        self._place(loops)
-        quantities = {**self.quantities, **self.locals}
-        memory = {
-            name for name, quantity in quantities.items() if quantity.place is Place.MEMORY and quantity.words == 1
-        }
-        loops = [in_registers(loop, memory) for loop in loops]
-        shared = [quantity for quantity in self.locals.values() if quantity.place in (Place.MEMORY, Place.GROUPS)]
-        lines = [self.layout.declaration(quantity) for quantity in shared]
-        for loop in loops:
-            lines += self._point_loop(loop)
+        loops = point_loops(statements)
+        needed = [set[str]().union(*map(over_points, loop)) for loop in loops]
+        self._place(loops, set[str]().union(*needed))
+        lines = self._declarations(quantity for quantity in self.locals.values() if quantity.place is not Place.ARRAY)
+        for number, loop in enumerate(loops):
+            lines += self._point_loop(loop, set[str]().union(*needed[number + 1 :]))
         return lines
 
-    def _place(self, loops: Sequence[PointLoop]) -> None:
-        """Find the place of each local quantity."""
-        statements = [statement for loop in loops for statement in loop.body]
-        summed = set[str]().union(
-            *(over_points(statement.value) for statement in statements if isinstance(statement, Assign))
-        )
-        for name, letter in _computed(statements).items():
-            if name in self.quantities:
+    def _place(self, blocks: Sequence[Sequence[Statement]], summed: Collection[str]) -> None:
+        """Find places and words of the local quantities; a block is the body of a loop over points."""
+        loops = [list(_loops(block)) for block in blocks]
+        for statement in (statement for block in loops for loop in block for statement in loop):
+            name, index = target_name(statement), statement.target.at if statement.target else None
+            if name is None or index is None or name in self.quantities or name in self.locals:
                 continue
-            users = [k for k, loop in enumerate(loops) if any(name in _all_names(statement) for statement in loop.body)]
-            if name in summed:
-                place = Place.MEMORY
-            elif len(users) > 1:
-                place = Place.GROUPS
+            users = [users for block in loops if (users := [loop for loop in block if _uses(loop, name)])]
+            match statement:
+                case Assign(value=value):
+                    words = self.value(value).words
+                case Apply(argument=argument):
+                    words = self.quantity(argument).words
+            if len(users) > 1:
+                place = Place.MEMORY if name in summed and words == 1 else Place.GROUPS
             else:
-                place = Place.LOCAL if _is_of_one_loop(name, loops[users[0]].body) else Place.ARRAY
-            self.locals[name] = self.layout.local(name, place, self._words(name, statements), letter)
+                place = Place.LOCAL if len(users[0]) == 1 and _is_local(users[0][0], name) else Place.ARRAY
+            self.locals[name] = Quantity(name, place, words, uniform=not self.layout.lanes, index=index.letter)
 
-    def _words(self, name: str, statements: Sequence[Statement]) -> int:
-        """Return the words of a local quantity: those of the first value that it is given."""
-        for statement in statements:
-            if target_name(statement) == name:
-                if isinstance(statement, Apply):
-                    return self.quantity(statement.argument).words
-                assert isinstance(statement, Assign)
-                return self.value(statement.value).words
-        raise AssertionError(name)
-
-    def _point_loop(self, loop: PointLoop) -> Iterator[str]:
-        assert isinstance(self.layout, PointsAsLanes)
-        own = {}
-        for name, letter in _computed(loop.body).items():
-            if name not in self.quantities and name not in self.locals:  # a register
-                original = self.quantity(name.removesuffix("_now"))
-                self.locals[name] = own[name] = self.layout.local(name, Place.ARRAY, original.words, letter)
-            elif name in self.locals and self.locals[name].place is Place.ARRAY:
-                own[name] = self.locals[name]
-        yield "for (int g = 0; g < GROUPS; g++) {"
-        yield from map("  {}".format, [*self._declarations(own.values()), *self.lines(loop.body)])
-        yield "}"
-        for name in loop.summed_later:
-            yield from self._in_memory(self.quantity(name))
+    def _point_loop(self, loop: Sequence[Simple], summed_later: Collection[str]) -> Iterator[str]:
+        """Yield a loop over groups of points, and what makes values that later ones sum readable in memory."""
+        names = [name for name in dict.fromkeys(map(target_name, loop)) if name]
+        own = [self.locals[name] for name in names if name in self.locals and self.locals[name].place is Place.ARRAY]
+        yield from _braced("for (int g = 0; g < GROUPS; g++)", [*self._declarations(own), *self.lines(loop)])
+        for name in names:
+            yield from self._in_memory(self.quantity(name)) if name in summed_later else ()
 
     def _in_memory(self, quantity: Quantity) -> Iterator[str]:
         """Yield what makes values readable number by number; the words of pairs are in arrays of their own."""
-        if quantity.words == 1:
-            yield f"IN_MEMORY({quantity.text});"
-            return
-        text, count = quantity.text, COUNTS[quantity.index]
-        yield f"real {text}_high[{count}][GROUP_LANES], {text}_low[{count}][GROUP_LANES];"
-        yield f"for (int {quantity.index} = 0; {quantity.index} < {count}; {quantity.index}++)"
-        yield "  for (int g = 0; g < GROUPS; g++) {"
-        for word in "high", "low":
-            yield f"    store({text}_{word}[{quantity.index}], g, {text}[{quantity.index}][g].{word});"
-        yield "  }"
-        for word in "high", "low":
-            yield f"IN_MEMORY({text}_{word});"
+        text, index, count = quantity.text, quantity.index, COUNTS[quantity.index]
+        for word in () if quantity.words == 1 else ("high", "low"):
+            yield f"real {text}_{word}[{count}][GROUP_LANES];"
+            yield f"for (int {index} = 0; {index} < {count}; {index}++)"
+            yield "  for (int g = 0; g < GROUPS; g++)"
+            yield f"    store({text}_{word}[{index}], g, {text}[{index}][g].{word});"
+        yield from (f"IN_MEMORY({text}{word});" for word in ([""] if quantity.words == 1 else ["_high", "_low"]))
 
     def _declarations(self, quantities: Iterable[Quantity]) -> list[str]:
         """Return the declarations of arrays, by their types."""
         arrays: dict[str, list[str]] = {}
         for quantity in quantities:
-            if quantity.place is Place.ARRAY:
-                declared = f"{quantity.text}[{COUNTS[quantity.index]}]"
-                arrays.setdefault(self.layout.type_of(quantity), []).append(declared)
+            if quantity.place in SHAPES:
+                kind = "number" if quantity.place is Place.MEMORY else self.layout.type_of(quantity)
+                declared = f"{quantity.text}[{COUNTS[quantity.index]}]{SHAPES[quantity.place]}"
+                arrays.setdefault(kind, []).append(declared)
         return [f"{kind} {', '.join(names)};" for kind, names in arrays.items()]
 
     def lines(self, statements: Sequence[Statement]) -> Iterator[str]:
@@ -303,13 +239,9 @@ class Printer:
                 case tuple():
                     yield from self.loop(statement)
                 case Repeat(row=row, count=count, body=body):
-                    yield f"for (int {row} = 0; {row} < {count}; {row}++) {{"
-                    yield from map("  {}".format, self.lines(body))
-                    yield "}"
+                    yield from _braced(f"for (int {row} = 0; {row} < {count}; {row}++)", self.lines(body))
                 case When(condition=condition, body=body):
-                    yield f"if ({condition.text}) {{"
-                    yield from map("  {}".format, self.lines(body))
-                    yield "}"
+                    yield from _braced(f"if ({condition.text})", self.lines(body))
                 case Apply(name=name, argument=argument, target=target, time=time):
                     text = self.operations[name].replace("ARGUMENT", self.quantity(argument).text)
                     if target is not None:
@@ -327,13 +259,7 @@ class Printer:
         if letter == "e":
             yield "#pragma GCC unroll 64"
         head = f"for (int {letter} = 0; {letter} < {COUNTS[letter]}; {letter}++)"
-        if len(lines) == 1:
-            yield head
-            yield f"  {lines[0]}"
-        else:
-            yield f"{head} {{"
-            yield from map("  {}".format, lines)
-            yield "}"
+        yield from (head, f"  {lines[0]}") if len(lines) == 1 else _braced(head, lines)
 
     def assignment(self, statement: Assign) -> str:
         """Return the C of an assignment."""
@@ -358,7 +284,7 @@ class Printer:
         return self.quantities.get(name) or self.locals[name]
 
     def value(self, expression: Expression) -> Value:
-        """Return the C of an expression."""
+        """Return the C of an expression; what is added to a state is added to its low word first."""
         match expression:
             case Constant(text=text):
                 return Value(text, uniform=True)
@@ -368,49 +294,94 @@ class Printer:
                 return Value(f"dd_of({table}[{row}], {table}_LOW[{row}])", 2, uniform=True)
             case Read(name=name, at=at):
                 return self.layout.read(self.quantity(name), at)
-            case Former(value=Read(name=name, at=At() as at)):
-                return self.layout.former(self.quantity(name), at)
-            case OverPoints(table=table, value=Read(name=name, at=At() as at)):
-                return self.layout.over_points(table, self.quantity(name), at)
-            case Operation():
-                return self.operation(expression)
-        raise AssertionError(expression)
-
-    def operation(self, operation: Operation) -> Value:
-        """Return the C of an operation; what is added to a state is added to its low word first."""
-        match operation:
-            case Operation("+", (Read(name=name, at=At() as at), increment)) if (
-                state := self.quantity(name)
-            ).place is Place.STATE and self.layout.words == 1:
-                low = Value(f"{state.low}[{at.text}]", uniform=state.uniform)
-                return combine("+", self.layout.read(state, at), combine("+", low, self.value(increment)))
+            case Former(value=read) | OverPoints(value=read):
+                return self.layout.at_other_points(expression, self.quantity(read.name))
             case Operation("-", (operand,)):
                 return negated(self.value(operand))
             case Operation("word", (operand,)):
                 return high_word(self.value(operand))
+            case Operation("+", (Read(name=name, at=At() as at) as read, increment)) if (
+                state := self.quantity(name)
+            ).place is Place.STATE and self.layout.words == 1:
+                low = Value(f"{state.low}[{at.text}]", uniform=state.uniform)
+                return combine("+", self.value(read), combine("+", low, self.value(increment)))
             case Operation(operator, (left, right)):
                 return combine(operator, self.value(left), self.value(right))
-        raise AssertionError(operation)
+        raise AssertionError(expression)
+
+
+def point_loops(statements: Sequence[Statement]) -> list[list[Simple]]:
+    """Return the statements of each loop over points."""
+    loops, computed = [list[Simple]()], set[str | None]()
+    for statement in statements:
+        assert isinstance(statement, Assign | Apply), "a repetition is not part of a loop over points"
+        if over_points(statement) & computed:
+            loops.append([])
+            computed = set()
+        loops[-1].append(statement)
+        computed.add(target_name(statement))
+    return loops
+
+
+def target_name(statement: Statement) -> str | None:
+    """Return the name of the quantity that a statement computes."""
+    return statement.target.name if isinstance(statement, Assign | Apply) and statement.target else None
+
+
+def parts(expression: Expression) -> Iterator[Expression]:
+    """Yield an expression and all in it."""
+    yield expression
+    match expression:
+        case OverPoints(value=value) | Former(value=value):
+            yield value
+        case Operation(operands=operands):
+            for operand in operands:
+                yield from parts(operand)
+
+
+def quantities(statement: Assign) -> Iterator[Read]:
+    """Yield the quantities that a statement computes and reads."""
+    yield statement.target
+    yield from (part for part in parts(statement.value) if isinstance(part, Read))
+
+
+def over_points(statement: Simple) -> set[str]:
+    """Return the names of the quantities of which a statement needs other points."""
+    if isinstance(statement, Apply):
+        return set()
+    return {part.value.name for part in parts(statement.value) if isinstance(part, OverPoints | Former)}
+
+
+def all_names(statement: Simple) -> set[str]:
+    """Return the names of all quantities that a statement reads or computes."""
+    match statement:
+        case Assign():
+            return {quantity.name for quantity in quantities(statement)}
+        case Apply(argument=argument, time=time):
+            times = {part.name for part in parts(time) if isinstance(part, Read)} if time is not None else set()
+            return {argument, *times} | {name for name in (target_name(statement),) if name}
+
+
+def _braced(head: str, lines: Iterable[str]) -> Iterator[str]:
+    yield f"{head} {{"
+    yield from map("  {}".format, lines)
+    yield "}"
 
 
 def _letter(statement: Assign) -> str | None:
     """Return the letter of the index of a statement; of a number that is no sum over an index ``None``."""
-    quantities = (statement.target, *reads(statement.value))
-    return next((quantity.at.letter for quantity in quantities if quantity.at is not None), None)
-
-
-def _gathers(statement: Assign) -> bool:
-    """Return whether a statement reads or computes values at indices from tables."""
-    return any(
-        quantity.at is not None and quantity.at.gathers for quantity in (statement.target, *reads(statement.value))
-    )
+    return next((quantity.at.letter for quantity in quantities(statement) if quantity.at is not None), None)
 
 
 def _fused(statements: Sequence[Statement]) -> Iterator[Statement | tuple[Assign, ...]]:
-    """Yield statements, those on the same index one after the other as one loop."""
+    """Yield statements, those on the same index one after the other as one loop, without indices from tables."""
     loop: tuple[Assign, ...] = ()
     for statement in statements:
-        if loop and not (isinstance(statement, Assign) and _continues(loop, statement)):
+        if loop and not (
+            isinstance(statement, Assign)
+            and _letter(loop[0]) == _letter(statement)
+            and not any(each.at and each.at.gathers for part in (*loop, statement) for each in quantities(part))
+        ):
             yield loop
             loop = ()
         if isinstance(statement, Assign):
@@ -421,44 +392,19 @@ def _fused(statements: Sequence[Statement]) -> Iterator[Statement | tuple[Assign
         yield loop
 
 
-def _continues(loop: Sequence[Assign], statement: Assign) -> bool:
-    """Return whether a statement can be in a loop: on the same index, without values at indices from tables."""
-    return _letter(loop[0]) == _letter(statement) and not any(map(_gathers, (*loop, statement)))
-
-
-def _loops(statements: Sequence[Statement]) -> Iterator[Sequence[Statement]]:
+def _loops(statements: Sequence[Statement]) -> Iterator[Sequence[Simple]]:
     """Yield the statements of each loop over an index, and others one by one."""
     for statement in _fused(statements):
-        match statement:
-            case tuple():
-                yield statement
-            case Repeat(body=body) | When(body=body):
-                yield from _loops(body)
-            case _:
-                yield (statement,)
+        if isinstance(statement, Repeat | When):
+            yield from _loops(statement.body)
+        else:
+            yield statement if isinstance(statement, tuple) else (statement,)
 
 
-def _computed(statements: Sequence[Statement]) -> dict[str, str]:
-    """Return the names of the quantities that statements compute, in order, with the letters of their indices."""
-    letters: dict[str, str] = {}
-    for statement in statements:
-        match statement:
-            case Assign(target=Read(name=name, at=At() as at)) | Apply(target=Read(name=name, at=At() as at)):
-                letters.setdefault(name, at.letter)
-            case Repeat(body=body) | When(body=body):
-                letters = {**_computed(body), **letters}
-    return letters
+def _uses(loop: Sequence[Simple], name: str) -> bool:
+    return any(name in all_names(statement) for statement in loop)
 
 
-def _all_names(statement: Statement) -> set[str]:
-    """Return the names of all quantities that a statement reads or computes."""
-    name = target_name(statement)
-    return names_read(statement) | ({name} if name else set())
-
-
-def _is_of_one_loop(name: str, statements: Sequence[Statement]) -> bool:
-    """Return whether one loop over an index computes a quantity, once, and uses it, at its own index alone."""
-    users = [loop for loop in _loops(statements) if any(name in _all_names(statement) for statement in loop)]
-    if len(users) > 1 or any(isinstance(statement, Apply) and name in _all_names(statement) for statement in users[0]):
-        return False
-    return sum(target_name(statement) == name for statement in users[0]) == 1
+def _is_local(loop: Sequence[Simple], name: str) -> bool:
+    """Return whether a loop over an index computes a quantity, once, and uses it, at its own index alone."""
+    return isinstance(loop[0], Assign) and sum(target_name(statement) == name for statement in loop) == 1

@@ -19,35 +19,24 @@ for (int k = 0; k < BODIES; k++) {
 """
 
 
-def splitting_step(split: Splitting, layout: Layout, *, action: bool) -> list[str]:
-    """Return the lines of C that compute the increments of a step of a splitting method."""
+def _of(
+    text: str, names: str, place: Place = Place.ARRAY, words: int = 1, *, uniform: bool = False
+) -> dict[str, Quantity]:
+    """Return quantities, in whose text in C the name is put, or the other name behind a colon."""
+    pairs = (name.partition(":") for name in names.split())
+    return {name: Quantity(text.format(other or name), place, words, uniform=uniform) for name, _, other in pairs}
+
+
+def _features(split: Splitting, action: bool = False) -> list[str]:
     features = {"masses": split.by_masses, "bodies": bool(split.bodies), "action": action}
-    words, alike = layout.words, not layout.lanes
-    pairs, time = ("_pairs", "") if words == 2 else ("", "step->")
-    arrays = {name: Quantity(name, words=words, uniform=alike) for name in ("F", "inverse_mass")}
-    increments = {x: Quantity(x if words == 2 else f"d{x}", words=words, uniform=alike) for x in "qp"}
-    states = {f"{x}0": Quantity(f"step->{x}0", Place.STATE, low=f"step->carry_{x}", uniform=alike) for x in "qp"}
-    numbers = {x: Quantity(f"{time}{x}", Place.NUMBER, words, uniform=True) for x in "th"}
-    of_run = {"L": Quantity("acted[0]", Place.NUMBER), "S": Quantity("acted[1]", Place.NUMBER)}
-    if words == 1:
-        arrays["inverse_mass"] = Quantity("data->inverse_mass", uniform=alike)
-    operations = {
-        "force": f"force{pairs}(ARGUMENT, TIME, step->parameters, TARGET);",
-        "velocity": "drift_velocity(ARGUMENT, TIME, step->parameters, TARGET);",
-        "at_rest": "at_rest(ARGUMENT, TIME, step->parameters, &TARGET);",
-        "turn": TURN.replace("AXES", "PRINCIPAL_AXES[k]" if split.principal else "NULL"),
-    }
-    printer = Printer({**arrays, **increments, **states, **numbers, **of_run}, layout, operations)
-    statements = read(split.statements, [name for name, holds in features.items() if holds])
-    return printer.function_body([*velocities_by_masses(statements)] if split.by_masses else statements)
+    return [name for name, holds in features.items() if holds]
 
 
 def splitting_texts(split: Splitting) -> dict[str, str]:
     """Return the statements of an explicit step and its tables, by titles."""
-    features = [name for name, holds in (("masses", split.by_masses), ("bodies", split.bodies)) if holds]
     rows = (f"{name} = {', '.join(f'{float(x):.17g}' for x in numbers)}\n" for name, numbers in split.numbers.items())
     return {
-        "increments q and p of the state q0, p0": f"{selected(split.statements, features)}\n",
+        "increments q and p of the state q0, p0": f"{selected(split.statements, _features(split))}\n",
         "tables of the statements": "".join(rows),
     }
 
@@ -80,12 +69,31 @@ def velocities_by_masses(statements: Iterable[Statement]) -> Iterator[Statement]
 
 def splitting_header(split: Splitting, layout: Layout, *, action: bool) -> str:
     """Return the header with the function that computes the increments of a step of a splitting method."""
-    lines = splitting_step(split, layout, action=action)
+    words, alike = layout.words, not layout.lanes
+    pairs, time = ("_pairs", "") if words == 2 else ("", "step->")
+    quantities = {
+        **_of("{}", "F", words=words, uniform=alike),
+        **_of("{}" if words == 2 else "data->{}", "inverse_mass", words=words, uniform=alike),
+        **_of("{}" if words == 2 else "d{}", "q p", words=words, uniform=alike),
+        **_of(f"{time}{{}}", "t h", Place.NUMBER, words, uniform=True),
+        "q0": Quantity("step->q0", Place.STATE, low="step->carry_q", uniform=alike),
+        "p0": Quantity("step->p0", Place.STATE, low="step->carry_p", uniform=alike),
+        **_of("acted[{}]", "L:0 S:1", Place.NUMBER),
+    }
+    operations = {
+        "force": f"force{pairs}(ARGUMENT, TIME, step->parameters, TARGET);",
+        "velocity": "drift_velocity(ARGUMENT, TIME, step->parameters, TARGET);",
+        "at_rest": "at_rest(ARGUMENT, TIME, step->parameters, &TARGET);",
+        "turn": TURN.replace("AXES", "PRINCIPAL_AXES[k]" if split.principal else "NULL"),
+    }
+    statements: Sequence[Statement] = read(split.statements, _features(split, action))
+    statements = [*velocities_by_masses(statements)] if split.by_masses else statements
+    lines = Printer(quantities, layout, operations).function_body(statements)
     purpose = "Computes the increments of one step{}. F is the last force; it is that of the first kick if `known`"
     first = [] if split.leaps else ["(void)known, (void)F;"]
-    if split.driven and layout.words == 2:
+    if split.driven and words == 2:
         first += ["known = 0; /* inputs, which may jump between steps, have changed the last force */"]
-    if layout.words == 1:
+    if words == 1:
         acted = ", and if the action is summed\n * acted[1], its part over h, and acted[0], the last L at v = 0"
         arguments = "const solver_data *data, int known, number *F, number *dq, number *dp,\n    number *acted"
         starts = ["memset(dq, 0, sizeof(number) * M);", "memset(dp, 0, sizeof(number) * M);"]
@@ -93,12 +101,12 @@ def splitting_header(split: Splitting, layout: Layout, *, action: bool) -> str:
         starts += [] if split.by_masses or split.bodies else ["(void)data;"]
         head = f"SPLITTING void leap(const step_data *step, {arguments})"
         return _function(purpose.format(acted), head, *starts, *first, *lines)
-    kind, zero = layout.number, f"{layout.number}_word({'lanes_of(0.0)' if layout.lanes else '0.0'})"
+    kind, zero = ("ddl", "ddl_word(lanes_of(0.0))") if layout.lanes else ("dd", "dd_word(0.0)")
     arguments = f"dd t, dd h, const {kind} *inverse_mass, int known, {kind} *F,\n    number *dq, number *dp"
     starts = [f"{kind} q[M], p[M];", "for (int i = 0; i < M; i++)", f"  q[i] = p[i] = {zero};"]
-    words = [f"  d{x}[i] = {x}[i].high, d{x}[M + i] = {x}[i].low;" for x in "qp"]
+    stores = [f"  d{x}[i] = {x}[i].high, d{x}[M + i] = {x}[i].low;" for x in "qp"]
     head = f"static inline void leap_in_pairs(const step_data *step, {arguments})"
-    ends = ["for (int i = 0; i < M; i++) {", *words, "}"]
+    ends = ["for (int i = 0; i < M; i++) {", *stores, "}"]
     return _function(purpose.format(" in pairs"), head, *starts, *first, *lines, *ends)
 
 
@@ -121,11 +129,17 @@ eta with V = W^-1 (bath.h); decay is e^(-k tau) - 1, and the kinetic energy y^2 
 
 def half_step(bath: HeatBath) -> str:
     """Return the function of half a step of a heat bath."""
-    own = {name: Quantity(f"bath->{name}") for name in ("decay", "strength")}
-    own |= {"mean": Quantity("(bath->terms + 1)"), "sigma": Quantity("(bath->terms + BATH_TERMS - STRENGTHS)")}
-    own |= {"xi": Quantity("normals"), "eta": Quantity("(normals + M)"), "carry": Quantity("carry")}
-    own |= {"heat": Quantity("heat", Place.NUMBER), "root": Quantity("bath->root", Place.NUMBER)}
-    own |= {"p": Quantity("p", Place.STATE, low="carry")}
+    own = {
+        **_of("bath->{}", "decay strength"),
+        "mean": Quantity("(bath->terms + 1)"),
+        "sigma": Quantity("(bath->terms + BATH_TERMS - STRENGTHS)"),
+        "xi": Quantity("normals"),
+        "eta": Quantity("(normals + M)"),
+        "carry": Quantity("carry"),
+        "p": Quantity("p", Place.STATE, low="carry"),
+        "heat": Quantity("heat", Place.NUMBER),
+        "root": Quantity("bath->root", Place.NUMBER),
+    }
     sizes, product = [len(block) for block in bath.blocks], ""
     for b, n in enumerate(sizes):
         first, factors = sum(sizes[:b]), sum(size**2 for size in sizes[:b])
@@ -142,14 +156,16 @@ def half_step(bath: HeatBath) -> str:
     )
 
 
-RATTLE = """
-G[e] = former(derivative[e])
-factorise(G)
+FORCE = """
 if velocity_forces:
     f[i] = force[i]
 else:
     f[i] = former(force[i])
-f[col(e)] += G[e] * lam[row(e)]
+"""
+RATTLE = f"""
+G[e] = former(derivative[e])
+factorise(G)
+{FORCE}f[col(e)] += G[e] * lam[row(e)]
 d[i] = mass(f[i])
 if momentum_terms:
     d[i] = d[i] - a[i] - rate * (RATTLE_SHIFT_RESPONSE @ turned[i])
@@ -160,7 +176,8 @@ x[pos(row(e))] += G[e] * d[col(e)]
 x[k] = solve(x[k])
 lam[k] -= x[pos(k)]
 f[col(e)] -= G[e] * x[pos(row(e))]
-a[i] = mass(f[i])
+b[i] = mass(f[i])
+a[i] = b[i]
 moved[i] = hh * (RATTLE_RESPONSE @ a[i])
 if momentum_terms:
     v[i] = base[i] + (moved[i] - h * (RATTLE_SHIFT @ w[i]))
@@ -175,25 +192,28 @@ u = q0 + h c v0 + h^2 R a."""
 
 COUPLED_RATTLE = """
 G[e] = former(derivative[e])
-f[i] = force[i]
-f[col(e)] += (GROWN * G[e]) * lam[row(e)]
+t[i] = force[i]
+t[col(e)] += (GROWN * G[e]) * lam[row(e)]
 invert(masses)
 factorise(G)
-mean[i] = (RATTLE_MEAN @ p[i]) + RATTLE_MEAN_OF_LAST * last_p[i]
-r[i] = (base_p[i] + (h * (RATTLE_IMPULSE @ f[i]) - mean[i])) / GROWN
-y[i] = mass(r[i])
+f[i] = t[i]
+r[i] = (base_p[i] + (h * (RATTLE_IMPULSE @ f[i]) - ((RATTLE_MEAN @ p[i]) + RATTLE_MEAN_OF_LAST * last_p[i]))) / GROWN
+b[i] = mass(r[i])
+y[i] = b[i]
 moved[i] = h * (RATTLE_DISPLACEMENT @ y[i])
-c[k] = g[k]
-c[row(e)] += derivative[e] * moved[col(e)]
+d[k] = g[k]
+d[row(e)] += derivative[e] * moved[col(e)]
+c[k] = d[k]
 x[pos(k)] = (RATTLE_INVERSE @ c[k]) * scale
 x[k] = solve(x[k])
 lam[k] -= x[pos(k)]
 H[e] = former(derivative[e])
 s[i] = zero
 s[col(e)] -= (GROWN * H[e]) * x[pos(row(e))]
-w[i] = h * (RATTLE_IMPULSE @ s[i]) / GROWN
-d[i] = mass(w[i])
-v[i] = v[i] + (y[i] + d[i])
+f[i] = s[i]
+w[i] = h * (RATTLE_IMPULSE @ f[i]) / GROWN
+n[i] = mass(w[i])
+v[i] = v[i] + (y[i] + n[i])
 m[i] = base[i] + h * (RATTLE_DISPLACEMENT @ v[i])
 change[i] = m[i] - u[i]
 u[i] = m[i]
@@ -201,12 +221,7 @@ u[i] = m[i]
 """The same for masses that depend on positions: y = M^-1 r with the residual r of the momenta,
 P x = (D I)^-1 (g + h G D y) / h^2, v += y - h M^-1 I G^T x."""
 
-FORCES = """
-if velocity_forces:
-    f[i] = force[i]
-else:
-    f[i] = former(force[i])
-f[col(e)] += former(derivative[e]) * lam[row(e)]
+FORCES = f"""{FORCE}f[col(e)] += former(derivative[e]) * lam[row(e)]
 """
 MOVE = """
 if velocity_forces:
@@ -236,8 +251,9 @@ if velocity_forces:
 base[i] = q0[i] + (carry_q[i] + (low[i] + RATTLE_DRIFT * (h * v0[i])))
 """
 END = """
-a[i] = mass(f[i])
+b[i] = mass(f[i])
 all[i] = f[i]
+a[i] = b[i]
 push[i] = RATTLE_START * v0[i] + h * ((RATTLE_MOMENTUM @ a[i]) + (RATTLE_MOMENTUM_LOW @ a[i]))
 if momentum_terms:
     z[i] = v0[i] + (push[i] - (RATTLE_PROJECTION @ w[i]))
@@ -248,23 +264,21 @@ else:
 velocities z of the curve."""
 
 COUPLED_FORCES = """
-f[i] = force[i]
-f[col(e)] += GROWN * former(derivative[e]) * lam[row(e)]
+t[i] = force[i]
+t[col(e)] += GROWN * former(derivative[e]) * lam[row(e)]
+f[i] = t[i]
 """
 COUPLED_POSITIONS = """
 base[i] = q0[i] + (carry_q[i] + h * (RATTLE_DISPLACEMENT_LOW @ v[i]))
 u[i] = base[i] + h * (RATTLE_DISPLACEMENT @ v[i])
 """
 COUPLED_MOMENTA = """
-mean[i] = (RATTLE_MEAN_LOW @ p[i]) + RATTLE_MEAN_OF_LAST_LOW * last_p[i]
-base_p[i] = p0[i] + (h * (RATTLE_IMPULSE_LOW @ f[i]) - mean[i])
+base_p[i] = p0[i] + (h * (RATTLE_IMPULSE_LOW @ f[i]) - ((RATTLE_MEAN_LOW @ p[i]) + RATTLE_MEAN_OF_LAST_LOW * last_p[i]))
 """
 COUPLED_END = "z[i] = RATTLE_UNKNOWNS @ v[i]"
 """The same for masses that depend on positions; the guess has the low words of the tables."""
 
-PAIR_RESIDUALS = """
-f[i] = former(force[i])
-f[col(e)] += former(derivative[e]) * lam[row(e)]
+PAIR_RESIDUALS = f"""{FORCES}
 a[i] = mass(f[i])
 moved[i] = RATTLE_DRIFT * drift[i] + square * (RATTLE_RESPONSE @ a[i])
 r[i] = word((q0[i] + moved[i]) - u[i])
@@ -288,10 +302,6 @@ u[i] += r[i]
 """Residuals in two words of the solution in one, and its correction by the same iteration in one word."""
 
 
-def _number(text: str, words: int = 1) -> Quantity:
-    return Quantity(text, Place.NUMBER, words, uniform=True)
-
-
 OF_POINTS = {
     "mass": "find_accelerations(now->inverse_mass, ARGUMENT, TARGET);",
     "solve": "solve_points(l[g], ARGUMENT);",
@@ -300,50 +310,40 @@ OF_POINTS = {
 }
 VARYING_MASS = {name: text.replace("inverse_mass", "inverse_mass[g]") for name, text in OF_POINTS.items()}
 VECTOR_MASS = {"mass": "vector_accelerations(solved->inverse_mass, ARGUMENT, TARGET, g);"}
-
-
-TABLES_OF_POINTS = "DRIFT", "DRIFT_LOW", "START", "VELOCITY_START", "MEAN_OF_LAST", "MEAN_OF_LAST_LOW"
+OF_PARTS = {"rattle": ("a w", OF_POINTS), "coupled_rattle": ("a v y p f c masses", VARYING_MASS)}
+"""Values at all points that only one of the headers has in memory, and its operations."""
+OF_EACH_POINT = "RATTLE_{0} RATTLE_{0}_LOW RATTLE_{1} RATTLE_{1}_LOW RATTLE_START RATTLE_VELOCITY_START"
 """Tables with a number for each point."""
 
 
-def _of_constraints() -> dict[str, Quantity]:
-    """Return the quantities of a constrained step, which the headers declare."""
-    memory = {name: Quantity(f"now->{name}", Place.MEMORY) for name in "auwvyp"}
-    memory |= {name: Quantity(name, Place.MEMORY) for name in ("forced", "all", "z")}
-    memory |= {"at": Quantity("now->at", Place.MEMORY), "velocity": Quantity("now->v", Place.MEMORY)}
-    memory |= {"shift": Quantity("now->A", Place.MEMORY), "u": Quantity("now->u", Place.MEMORY, first="step->q0")}
-    groups = {name: Quantity(f"now->{name}", Place.GROUPS) for name in ("base", "base_v", "base_p")}
-    start = {name: Quantity(f"step->{name}", uniform=True) for name in ("q0", "p0", "carry_q")}
-    start |= {name: Quantity(f"now->{name}", uniform=True) for name in ("v0", "last_p")}
-    tables = {f"RATTLE_{name}": Quantity(f"RATTLE_{name}", Place.TABLE) for name in TABLES_OF_POINTS}
-    return {**memory, **groups, **start, **tables} | {
-        "derivative": Quantity("now->derivative", Place.MEMORY, first="now->first_derivative", index="e"),
-        "force": Quantity("now->force", Place.MEMORY, first="now->first_force"),
-        "turned": Quantity("now->change", Place.MEMORY),
-        "g": Quantity("now->g", Place.MEMORY, index="k"),
-        "lam": Quantity("now->lambda", Place.GROUPS, index="k"),
-        "change": Quantity("change", Place.FLAT),
+def _of_constraints(names: str) -> dict[str, Quantity]:
+    """Return the quantities of a constrained step, which the headers declare; ``names``: of values in memory."""
+    return {
+        **_of("now->{}", f"{names} at g force derivative velocity:v shift:A turned:change", Place.MEMORY),
+        **_of("{}", "forced all z", Place.MEMORY),
+        **_of("now->{}", "base base_v base_p lam:lambda", Place.GROUPS),
+        **_of("{}", "change", Place.GROUPS),
+        **_of("step->{}", "q0 p0 carry_q", uniform=True),
+        **_of("now->{}", "v0 last_p", uniform=True),
+        **_of("{}", OF_EACH_POINT.format("DRIFT", "MEAN_OF_LAST"), Place.TABLE),
+        "u": Quantity("now->u", Place.MEMORY, first="step->q0"),
         "zero": Quantity("lanes_of(0)", Place.NUMBER),
-        "h": _number("step->h"),
-        "hh": _number("(step->h * step->h)"),
-        "rate": _number("(1 / step->h)"),
-        "scale": _number("scale"),
+        "GROWN": Quantity("GROWN(now, g)", Place.NUMBER),
+        "h": Quantity("step->h", Place.NUMBER, uniform=True),
+        "hh": Quantity("(step->h * step->h)", Place.NUMBER, uniform=True),
+        "rate": Quantity("(1 / step->h)", Place.NUMBER, uniform=True),
+        "scale": Quantity("scale", Place.NUMBER, uniform=True),
     }
 
 
-ITERATE = "iterate", ", factors *l, condition factorised, lanes *change"
-UNKNOWNS = ", number (*z)[GROUP_LANES]"
+ITERATE = "iterate", ", factors *l, condition factorised, lanes (*change)[GROUPS]"
+UNKNOWNS, FORCED = ", number (*z)[GROUP_LANES]", "number (*forced)[GROUP_LANES]"
 CONSTRAINED = {
     "rattle": (
         ("An iteration for the positions u and multipliers lam at the points", *ITERATE, RATTLE),
         ("Positions and velocities at all points but the last", "move_points", "", MOVE),
         ("Shifts w of the velocities by momentum terms, and their changes", "find_shifts", "", SHIFTS),
-        (
-            "Accelerations of the guess, positions without them",
-            "begin_points",
-            ", number (*forced)[GROUP_LANES]",
-            BEGIN,
-        ),
+        ("Accelerations of the guess, positions without them", "begin_points", f", {FORCED}", BEGIN),
         ("All forces, and velocities z", "finish_points", f", number (*all)[GROUP_LANES]{UNKNOWNS}", FORCES + END),
     ),
     "coupled_rattle": (
@@ -358,76 +358,62 @@ CONSTRAINED = {
 
 def rattle_functions(part: str, features: Sequence[str]) -> str:
     """Return the functions of a constrained step; ``part`` is the header that they belong to."""
-    own = _of_constraints()
-    if part == "rattle":
-        printer = Printer({name: own[name] for name in own if name not in "vyp"}, PointsAsLanes(), OF_POINTS)
-    else:
-        own["f"] = own["s"] = Quantity("now->f", Place.MEMORY)
-        own["c"] = Quantity("now->c", Place.MEMORY, index="k")
-        own["masses"] = Quantity("now->mass", Place.MEMORY, index="e")
-        own["GROWN"] = Quantity("GROWN(now, g)", Place.NUMBER)
-        printer = Printer({name: own[name] for name in own if name != "w"}, PointsAsLanes(), VARYING_MASS)
+    names, operations = OF_PARTS[part]
     functions = []
     for title, name, arguments, text in CONSTRAINED[part]:
         if not selected(text, features):
             continue
-        lines = replace(printer, locals={}).function_of_points(read(text, features))
+        printer = Printer(_of_constraints(names), PointsAsLanes(), operations)
         first = "const real scale = 1 / (step->h * step->h);" if "scale" in text else "(void)step;"
         head = f"static inline void {name}(const step_data *step, rattle_step *now{arguments})"
-        functions.append(_function(title, head, first, *lines))
+        functions.append(_function(title, head, first, *printer.function_of_points(read(text, features))))
     return "\n".join(functions)
 
 
 def pair_rattle_functions() -> str:
     """Return the functions of the correction in two words of the solution of a constrained step."""
+    corrected = _of("at->{}", "u moved lam:lambda", Place.GROUPS, 2) | _of("{}", "r gh:g_high", Place.MEMORY)
     pairs = {
-        "derivative": Quantity("at->derivative", Place.MEMORY, 2, first="at->first_derivative", index="e"),
-        "force": Quantity("at->force", Place.MEMORY, 2, first="at->first_force"),
-        "lam": Quantity("at->lambda", Place.GROUPS, 2, index="k"),
-        "drift": Quantity("at->drift", words=2, uniform=True),
-        "square": _number("square", 2),
-        "q0": Quantity("at->q0", words=2, uniform=True),
-        "u": Quantity("at->u", Place.GROUPS, 2),
-        "g": Quantity("at->g", Place.GROUPS, 2, index="k"),
-        "moved": Quantity("at->moved", Place.GROUPS, 2),
-        "RATTLE_DRIFT": Quantity("RATTLE_DRIFT", Place.TABLE, 2),
-        "r": Quantity("r", Place.MEMORY),
-        "gh": Quantity("g_high", Place.MEMORY, index="k"),
+        **corrected,
+        **_of("at->{}", "g derivative force", Place.GROUPS, 2),
+        **_of("at->{}", "drift q0", words=2, uniform=True),
+        **_of("{}", "square", Place.NUMBER, 2, uniform=True),
+        **_of("{}", "RATTLE_DRIFT", Place.TABLE, 2),
     }
-    forces = Printer(pairs | {"f": Quantity("at->f", Place.GROUPS, 2)}, PointsAsLanes(2), VECTOR_MASS)
-    residuals = Printer(pairs, PointsAsLanes(2), VECTOR_MASS).function_of_points(read(PAIR_RESIDUALS))
-    words = _of_constraints()
-    own = {name: words[name] for name in ("derivative", "scale", "hh", "zero")}
-    own |= {name: pairs[name] for name in ("r", "gh", "lam", "moved", "u")}
-    corrections = Printer(own, PointsAsLanes(2), OF_POINTS).function_of_points(read(PAIR_CORRECTIONS))
-    corrections = [line.replace("(step->h * step->h)", "hh") for line in corrections]
-    scales = "const real hh = at->h.high * at->h.high, scale = 1 / hh;"
+    words = _of_constraints("") | {"hh": Quantity("hh", Place.NUMBER, uniform=True)}
+    numbers = {name: words[name] for name in ("derivative", "scale", "hh", "zero")}
+    forces, residuals, corrections = (
+        Printer(quantities, PointsAsLanes(2), operations).function_of_points(read(text))
+        for quantities, operations, text in (
+            (pairs | _of("at->{}", "f", Place.GROUPS, 2), VECTOR_MASS, FORCES),
+            (pairs, VECTOR_MASS, PAIR_RESIDUALS),
+            (numbers | corrected, OF_POINTS, PAIR_CORRECTIONS),
+        )
+    )
+    square = "const dd square = dd_multiply(at->h, at->h);"
+    scales = (
+        "const int factorised = 1;",
+        "const real hh = at->h.high * at->h.high, scale = 1 / hh;",
+        "(void)factorised;",
+    )
     head, memory = "static inline void", "real (*r)[GROUP_LANES], real (*g_high)[GROUP_LANES]"
     functions = (
-        _function(
-            "F + G^T lambda at all points but the last",
-            f"{head} all_pair_forces(rattle_pairs *at)",
-            *forces.function_of_points(read(FORCES)),
-        ),
-        _function(
+        ("F + G^T lambda at all points but the last", "all_pair_forces(rattle_pairs *at)", forces),
+        (
             "Residuals r of the positions and g of the constraints, and h^2 R a + h c v0",
-            f"{head} find_pair_residuals(const solved_step *solved, rattle_pairs *at, {memory})",
-            *("const dd square = dd_multiply(at->h, at->h);", *residuals, "IN_MEMORY(*r);", "IN_MEMORY(*g_high);"),
+            f"find_pair_residuals(const solved_step *solved, rattle_pairs *at, {memory})",
+            (square, *residuals, "IN_MEMORY(*r);", "IN_MEMORY(*g_high);"),
         ),
-        _function(
+        (
             "Corrects the multipliers, and replaces r by the correction of the positions",
-            f"{head} correct_points(const rattle_step *now, rattle_pairs *at, factors *l, {memory})",
-            *("const int factorised = 1;", scales, "(void)factorised;", *corrections),
+            f"correct_points(const rattle_step *now, rattle_pairs *at, factors *l, {memory})",
+            (*scales, *corrections),
         ),
     )
-    return "\n".join(functions)
+    return "\n".join(_function(purpose, f"{head} {function}", *lines) for purpose, function, lines in functions)
 
 
 def _function(purpose: str, head: str, *lines: str) -> str:
-    """Return a function from its lines."""
-    return f"/* {purpose}. */\n{head}\n{{\n{_indented(lines)}}}\n"
-
-
-def _indented(lines: Iterable[str]) -> str:
-    """Return the lines of a function; directives are not indented."""
-    return "".join(f"{line.lstrip()}\n" if line.lstrip().startswith("#") else f"  {line}\n" for line in lines)
+    """Return a function from its lines; directives are not indented."""
+    body = (line.lstrip() if line.lstrip().startswith("#") else f"  {line}" for line in lines)
+    return "\n".join((f"/* {purpose}. */", head, "{", *body, "}", ""))

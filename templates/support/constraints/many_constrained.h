@@ -72,7 +72,7 @@ static condition solve_constraints(const step_data *step, rattle_step *now, cond
     movement moved;
     lanes verdict;
     condition may;
-    iterate(step, now, l, factorised, change);
+    iterate(step, now, l, factorised, (lanes(*)[GROUPS])change);
     if (k == 0)
       find_sizes(step, now, &sizes);
     moved = measure_change(change, sizes.inverse, sizes.largest);

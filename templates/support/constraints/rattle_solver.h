@@ -37,7 +37,7 @@ static int solve_constraints(const step_data *step, rattle_step *now, const solv
   for (int k = 0; k < least(options->max_iterations, MOST_ITERATIONS); k++) {
     movement moved;
     int verdict;
-    iterate(step, now, l, factorised, change);
+    iterate(step, now, l, factorised, (lanes(*)[GROUPS])change);
     if (k == 0)
       find_sizes(step, now, &sizes);
     moved = measure_change(change, sizes.inverse, sizes.largest);
