@@ -146,10 +146,12 @@ class Quantities:
     """Functions of the state of named coordinates that a run evaluates or integrates.
 
     Attributes:
-        legendre: p and dp/dv at (q, v); for a Hamiltonian, v and dv/dp at (q, p).
+        legendre: p and dp/dv at (q, v); for a Hamiltonian, v and dv/dp at (q, p); ``None`` if the kernels of the
+            fixed-point iteration determine both p and v.
         mass_entries: (i, j) of the derivatives of ``legendre``.
         inverse_legendre: v at (q, p) of a Lagrangian, if it has a formula.
-        energy: L at (q, v), which with ``legendre`` gives the energy; for a Hamiltonian, H at (q, p).
+        energy: L at (q, v), which with ``legendre`` gives the energy; without it L at (q, 0), and p v is twice the
+            kinetic energy; for a Hamiltonian, H at (q, p).
         hamiltonian: whether the system is Hamiltonian.
         momentum_maps: first integrals from symmetries.
         momentum_kernel: their values at (q, p), then the sums of the squares of their terms; ``None`` if there are

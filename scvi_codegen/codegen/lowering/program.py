@@ -190,6 +190,7 @@ def lower(
     check_solver(solver, method, SOLVERS, iteration=splitting if solver == "explicit" else fixed_point)
     alone = fixed_point is not None and not fallback and not system.integrands
     newton = solver in ("auto", "newton") and splitting is None and not alone
+    in_lanes = bool(fixed_point and "MASS_TERMS" in fixed_point.facts) and not newton and not system.bath
     polynomial = method.exactness.curve != 0
     equations = _equations(system, method, stages, newton=newton, curve=newton and polynomial)
     return Program(
@@ -209,7 +210,7 @@ def lower(
         newton=newton,
         polynomial_curves=polynomial,
         equations=equations,
-        quantities=_quantities(system, method, stages, symmetries),
+        quantities=_quantities(system, method, stages, symmetries, in_lanes=in_lanes),
         constraints=lowered_constraints(system) if system.constraints else None,
         rattle=rattle_of(system, stages, equations.extrapolation) if system.constraints and solver == "auto" else None,
         damping=damping_kernel(system),
@@ -323,18 +324,26 @@ def _equations(
 
 
 def _quantities(
-    system: MechanicalSystem, method: Method, stages: StageSystem, symmetries: Sequence[Symmetry]
+    system: MechanicalSystem, method: Method, stages: StageSystem, symmetries: Sequence[Symmetry], *, in_lanes: bool
 ) -> Quantities:
-    """Return the functions of the state that a run evaluates or integrates."""
+    """Return the functions of the state that a run evaluates or integrates.
+
+    ``in_lanes``: momenta and velocities are by kernels of the iteration.
+    """
     forms, integrates = forms_of(system), any(group.in_action for group in stages.stage_groups)
-    name, purpose = "lagrangian", "L at u = (q, v)."
+    name, purpose, formula = "lagrangian", "L at u = (q, v).", system.formula
     legendre = f"Momenta L_v {'' if forms.inverse_mass else 'and mass matrix L_vv '}at u = (q, v)."
+    if in_lanes:
+        name, purpose = "lagrangian_at_rest", "L at v = 0."
+        formula = formula.xreplace(dict.fromkeys(system.velocities, sympy.S.Zero))
     if system.auxiliaries:
         name, purpose, legendre = "hamiltonian", "H at u = (q, p).", "H_p and H_pp at u = (q, p)."
     if forms.one_form:
         legendre = "Momenta theta and their derivatives by y at u = (q, y)."
     return Quantities(
-        legendre=system_kernel(
+        legendre=None
+        if in_lanes
+        else system_kernel(
             system,
             "legendre",
             forms.regular_legendre,
@@ -342,9 +351,9 @@ def _quantities(
             partials=forms.legendre_jacobian.values(),
             purpose=legendre,
         ),
-        inverse_legendre=_inverse_legendre_kernel(system),
+        inverse_legendre=None if in_lanes else _inverse_legendre_kernel(system),
         mass_entries=tuple(forms.legendre_jacobian),
-        energy=system_kernel(system, name, (system.formula,), u=forms.legendre_arguments, purpose=purpose),
+        energy=system_kernel(system, name, (formula,), u=forms.legendre_arguments, purpose=purpose),
         hamiltonian=bool(system.auxiliaries),
         momentum_maps=tuple(_momentum_map(symmetry, method) for symmetry in symmetries),
         momentum_kernel=_momentum_kernel(system, symmetries),

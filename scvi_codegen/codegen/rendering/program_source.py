@@ -692,6 +692,7 @@ def _context(
         "vector_functions": loop_functions(_kernels_of_points(program)),
         "fallback": fallback,
         "diagonal_masses": _diagonal_masses(program),
+        "legendre_in_lanes": program.fixed_point is not None and program.quantities.legendre is None,
         **_control_context(program, control),
         **_lane_context(program, lanes, changes=beside is not None and bool(lanes)),
     }

@@ -9,7 +9,7 @@
 
 #ifdef FROZEN_MASS
 /* The mass matrices are those of the first of MASS_AGE iterations, which is at extrapolated points: their errors are
- * small and affect only the convergence rate. Requires: the kernel value_lanes. */
+ * small and affect only the convergence rate. Requires: the kernels value_lanes and mass_lanes, not point_lanes. */
 enum { MASS_AGE = 16 };
 #ifndef PROJECTED
 #define COSTLY_POINTS /* their evaluation takes longer than a table of the predictor */
@@ -78,14 +78,14 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
     for (int n = 0; n < GROUPS; n++) {
       place(step, n, scaled, z, u);
 #ifdef FROZEN_MASS
+      value_lanes(u, step->t + step->h * ABSCISSA[n], step->parameters, value[n]);
       if (k % MASS_AGE == 0) {
-        point_lanes(u, step->t + step->h * ABSCISSA[n], step->parameters, value[n], mass[n]);
+        mass_lanes(u, step->t + step->h * ABSCISSA[n], step->parameters, mass[n]);
 #ifdef DAMPED
         grow(&data->damping, n, MASS, mass[n]);
 #endif
         factor_mass(mass[n]);
-      } else
-        value_lanes(u, step->t + step->h * ABSCISSA[n], step->parameters, value[n]);
+      }
 #else
       point_lanes(u, step->t + step->h * ABSCISSA[n], step->parameters, value[n], mass[n]);
 #endif

@@ -80,7 +80,7 @@ from scvi_codegen.codegen.lowering.stage_groups import (
 from scvi_codegen.common.precision import Matrix, Vector, mp
 from scvi_codegen.methods.stage_system import Accelerations, Shape, Velocities, words_of_tables
 from scvi_codegen.methods.tables.basis import matrix_product, transpose
-from scvi_codegen.systems.derived_expressions import forms_of
+from scvi_codegen.systems.derived_expressions import InverseMass, forms_of
 from scvi_codegen.systems.formulas.expressions import gradient_tuple, jacobian
 from scvi_codegen.systems.formulas.intermediates import inner_of
 from scvi_codegen.systems.formulas.symbols import symbol
@@ -363,15 +363,18 @@ def _coupled(system: LagrangianSystem, tables: VelocityTables) -> FixedPointIter
     if lanes > MOST_LANES or (full and lanes * system.dimension**2 > LARGEST_MASS_MATRICES):
         return None
     arguments, projected = (*system.coordinates, *system.velocities), bool(tables.velocity)
-    frozen = bool(inner_of(system.lagrangian))
+    frozen, kernel = bool(inverse or inner_of(system.lagrangian)), partial(system_kernel, system, u=arguments)
     followed = () if tables.projection or frozen else _linearised_forces(system)
     evaluated = "L_q, L_v, their derivatives F_q, F_v and L_vq" if followed else "L_q, L_v"
     values = (*forms.force, *forms.momentum)
-    force = (
-        system_kernel(system, "value_lanes", values, u=arguments, purpose="L_q, L_v at all points.")
-        if frozen
-        else system_kernel(system, "force_lanes", forms.force, u=arguments, purpose="L_q at all points.")
-    )
+    if frozen:
+        force = kernel("value_lanes", values, purpose="L_q, L_v at all points.")
+        purpose = f"{'Terms of the inverse' if inverse else 'The lower triangle'} of L_vv at all points, u = (q, v)."
+        matrices = kernel("mass_lanes", (), partials=forms.mass_terms, purpose=purpose)
+    else:
+        force = kernel("force_lanes", forms.force, purpose="L_q at all points.")
+        purpose = f"{evaluated} and the lower triangle of L_vv at all points, u = (q, v)."
+        matrices = kernel("point_lanes", (*values, *followed), partials=forms.mass_terms, purpose=purpose)
     macros = (("PROJECTED", projected), ("FOLLOWED", followed), ("FROZEN_MASS", frozen))
     sizes = (("MASS_TERMS", len(inverse.terms)),) if inverse else ()
     integrands, damping = integrand_kernel(system, "integrand_lanes", arguments), damping_kernel(system)
@@ -379,20 +382,7 @@ def _coupled(system: LagrangianSystem, tables: VelocityTables) -> FixedPointIter
         "coupled",
         tables,
         lanes,
-        (
-            system_kernel(
-                system,
-                "point_lanes",
-                (*values, *followed),
-                u=arguments,
-                partials=forms.mass_terms,
-                purpose=f"{evaluated} and "
-                f"{'the terms of its inverse' if inverse else 'the lower triangle'} of L_vv at all points, u = (q, v).",
-            ),
-            None if followed else force,
-            integrands,
-            _solution_kernel(system),
-        ),
+        (matrices, None if followed else force, integrands, _solution_kernel(system, inverse) if inverse else None),
         forces=() if followed else ("point_lanes", force.name),
         stored=2 * lanes,
         parts=(
@@ -407,19 +397,11 @@ def _coupled(system: LagrangianSystem, tables: VelocityTables) -> FixedPointIter
     )
 
 
-def _solution_kernel(system: LagrangianSystem) -> Kernel | None:
-    """Return the kernel of solutions with the mass matrix from the terms of its inverse, ``None`` if it is unknown."""
-    inverse = forms_of(system).inverse_mass
-    if inverse is None:
-        return None
+def _solution_kernel(system: LagrangianSystem, inverse: InverseMass) -> Kernel:
+    """Return the kernel of solutions with the mass matrix from the terms of its inverse."""
     arguments = (*inverse.symbols, *system.momentum_symbols)
-    return system_kernel(
-        system,
-        "solve_lanes",
-        inverse.solution,
-        u=arguments,
-        purpose="L_vv^-1 p at all points, u = (terms of L_vv^-1, p).",
-    )
+    purpose = "L_vv^-1 p at all points, u = (terms of L_vv^-1, p)."
+    return system_kernel(system, "solve_lanes", inverse.solution, u=arguments, purpose=purpose)
 
 
 def _linearised_forces(system: LagrangianSystem) -> tuple[Expr, ...]:
