@@ -295,6 +295,21 @@ def test_a_ball_that_returns_to_a_kink_in_its_first_step_does_not_rest_there():
     assert run.tangent([0.0, 1.0])[-1, 0] == pytest.approx(expected, abs=1e-12)
 
 
+def test_a_start_just_below_a_kink_leaves_it_at_the_time_of_the_start():
+    stepper = sc.compile_stepper(lagrange("pad", "x", "x_dot**2/2 - 500*positive_part(-x)**2"), "svi:4")
+    for x in -np.logspace(-60, -17, 50):
+        run = stepper.integrate([x], [1.4], t_end=0.01)
+        assert run.q[-1, 0] == pytest.approx(0.014, rel=1e-15)
+        assert (np.diff(run.t) >= 0.0).all()
+
+
+def test_the_last_output_time_may_be_that_of_a_crossing():
+    stepper = sc.compile_stepper(lagrange("modulus", "x", "x_dot**2/2 - x**2*abs(x)/3"), "svi:8")
+    (switch,) = stepper.integrate([1.0], [0.1], t_end=2.0).switches
+    for end in switch.t + np.array([1e-15, 2e-15, 4e-15]):  # within rounding of the step's end
+        assert stepper.integrate([1.0], [0.1], t_end=end, t_eval=[1.0, end]).t.tolist() == [1.0, end]
+
+
 @pytest.mark.parametrize("constraint", ["y = x**2/4", "y = positive_part(x)**2 + x**2/4"])
 def test_derivatives_of_rest_on_a_constraint(constraint):
     """At rest momenta are rounding of constraint forces; at a kink the derivatives are undefined, by name."""

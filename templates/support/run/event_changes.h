@@ -122,7 +122,7 @@ static int refine_crossing(const event_step *step, long long first, const event_
     TRY(rate_along(step, FUNCTION_OF(crossing), at, &wall.rate));
   else
     TRY(changes_at(step, FUNCTION_OF(crossing), at, &wall));
-  back = at->g / wall.rate; /* in the direction of the run */
+  back = fmin(at->g / wall.rate, fabs(*part)); /* in the direction of the run, at most to the start */
   least = is_kink(crossing->function) ? -CHANGE_SAFETY * DBL_EPSILON * fabs(step->h) : 0.0;
   if (!(back > least && back <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->h)))
     return OK;
@@ -466,6 +466,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     }
     length -= part;
     ends = fabs(length) <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->whole);
+    at.t = ends && !step->watch->ended ? run->t : at.t; /* which output times may equal */
     TRY(store_state(to, &at, part, ends ? iterations : 0, ends ? run->step : within, step->report));
     if (!ends && changes == CHANGES_IN_STEP) {
       step->watch->jammed = step->found[group].function + 1;
@@ -478,7 +479,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
         run->step += adaptive;
         run->t_low = 0.0;
       }
-      set_run(run, ends ? run->t : at.t, &at);
+      set_run(run, at.t, &at);
 #if defined(EVENT_MODES) && EVENTS_CONTROLLED
       if (adaptive) { /* the next step is found and compared as the first one */
         run->error_before = 0.0;

@@ -269,7 +269,7 @@ static int search_part(const event_step *step, int e, const event_sample *left, 
   }
   interpolate(g, c, &doubt, &range);
   follows = doubt <= EVENT_SMALL_PART * range;
-  if (fabs(c[0]) > range + (follows ? doubt : range))
+  if (!changes_sign(left->g, right->g) && fabs(c[0]) > range + (follows ? doubt : range))
     return OK; /* far from zero */
   split = uncertain_abscissa(c, doubt, extrema, &count, zeros, &zero_count);
   if (split < 1.0 || !follows)
