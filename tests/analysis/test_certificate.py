@@ -172,15 +172,6 @@ def test_rounding_of_growing_motions_is_no_drift(method: str) -> None:
     )
 
 
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("method", [sc.SVI(2), sc.Gauss(2)], ids=lambda method: method.name)
-def test_inputs_are_certified_at_small_values(method) -> None:
-    """Nobody gives any: their parts are moved off 0 as all parameters are."""
-    certificate = sc.verify(pushed_pendulum(), method)
-    assert certificate.passed, certificate.to_text()
-    assert len(certificate.checks) > 15
-
-
 def test_constraints_are_certified_with_constant_inputs() -> None:
     """Cubics of time would push with 5000 after 50 units of it, and steps fail."""
     text = "(x_dot**2 + y_dot**2)/2 - y"

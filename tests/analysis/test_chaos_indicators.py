@@ -18,7 +18,6 @@ REGULAR, CHAOTIC = ((0.0, 0.0), (0.5, 0.0)), ((0.0, -0.25), (0.42, 0.0))
 """Of Henon and Heiles near the energy 1/8: Skokos, Bountis & Antonopoulos, Physica D 231 (2007) 30, section 3."""
 
 
-PUMPED = lagrange("pumped", "x", "x_dot**2/2 - k*(1 + cos(t)/2)*x**2/2 - x**4/8", k=1.0)
 ROD = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"])
 
 
@@ -210,25 +209,6 @@ def test_lanes_have_the_derivatives_of_the_steps(system, method, options):
     found = stepper.chaos_indicators_ensemble(*start, **options)
     assert stepper._variants[TangentVectors(found.log_norms.shape[-1])] is not None
     same(found, alone.chaos_indicators_ensemble(*start, **options), 1e-12)
-
-
-@pytest.mark.parametrize(
-    ("system", "method", "q", "p", "common", "parameters"),
-    [
-        (PUMPED, sc.SVI(2), [[1.0], [0.5]], [[0.0], [0.3]], {"h": 0.1, "steps": 20, "t": 0.7}, {"k": [0.5, 2.0]}),
-        (ROD, sc.SVI(1, "gauss-lobatto:2"), [[1.0, 0.0], [0.0, -1.0]], [[0.0, 0.5], [0.3, 0.0]],
-         {"h": 0.01, "steps": 40}, {}),
-    ],
-    ids=["time and parameters", "constraints, for which there are no lanes"],
-)  # fmt: skip
-def test_ensembles_of_other_systems_are_the_same_as_runs(system, method, q, p, common, parameters):
-    stepper = sc.compile_stepper(system, method)
-    found = stepper.chaos_indicators_ensemble(q, p, count=1, save_every=1, parameters=parameters or None, **common)
-    for j in range(2):
-        own = {name: values[j] for name, values in parameters.items()}
-        alone = stepper.integrate(q[j], p[j], parameters=own, **common).chaos_indicators(1)
-        assert_array_equal(found.t, alone.t)
-        assert_allclose(found.log_norms[:, j], alone.log_norms, rtol=0, atol=1e-12)
 
 
 @pytest.mark.tiers(1)

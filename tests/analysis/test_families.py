@@ -62,16 +62,6 @@ def test_periods_of_a_pendulum_are_elliptic_integrals(pendulum):
 
 
 @pytest.mark.second
-def test_a_family_of_one_orbit_goes_on_from_its_file(pendulum, tmp_path):
-    start = sc.equilibrium(pendulum, [0.0])
-    sc.family(pendulum, start, amplitude=0.01, step=0.2, count=1).save(tmp_path / "one.npz")
-    members = sc.Family.load(pendulum, tmp_path / "one.npz").more(3)
-    assert members.ended == "it has as many orbits as were asked for"
-    whole = sc.family(pendulum, start, amplitude=0.01, step=0.2, count=4)
-    assert members.periods.tolist() == whole.periods.tolist()
-
-
-@pytest.mark.second
 def test_family_ends_where_rounding_errors_hide_the_orbit(pendulum):
     """Near the separatrix runs of a period do not close: they pass the upper equilibrium."""
     family = sc.family(pendulum, sc.equilibrium(pendulum, [0.0]), amplitude=0.1, step=1.0)
@@ -172,21 +162,6 @@ def test_start_of_an_orbit_keeps_its_distance_from_impacts():
 
 
 @pytest.mark.rotated
-def test_families_of_rotations():
-    """A body swings about its first and second axis as a pendulum: T = 4 K((E + 1)/2) sqrt(I)."""
-    system = sc.LagrangianSystem.from_text(
-        "body", rotations={"R": "omega"}, lagrangian="(omega_1**2 + 2*omega_2**2 + 2.5*omega_3**2)/2 + R_33"
-    )
-    stepper = sc.compile_stepper(system, "svi:4")
-    rest = sc.equilibrium(stepper, [1.0, 1e-3, 0.0, 0.0])
-    assert rest.frequencies == pytest.approx([1, np.sqrt(0.5)], rel=1e-12)
-    for mode, inertia in enumerate((1, 2)):
-        family = sc.family(stepper, rest, amplitude=0.1, mode=mode, count=4)
-        expected = 4 * ellipk((family.energies + 1) / 2) * np.sqrt(inertia)
-        assert family.periods == pytest.approx(expected, rel=1e-11)
-
-
-@pytest.mark.rotated
 def test_family_of_a_motion_that_drifts():
     """Van der Pol's cycle has w = 1 - m^2/16 + 17 m^4/3072 + 35 m^6/884736; it drives s'' = x^2 - s', ds = int x^2."""
     system = sc.LagrangianSystem.from_text(
@@ -243,30 +218,6 @@ def test_families_of_a_rod_are_elliptic_integrals():
 
 
 @pytest.mark.rotated
-def test_orbits_of_rods_are_those_of_angles():
-    """A double pendulum in Cartesian coordinates, and in the angles of its rods."""
-    rods = sc.LagrangianSystem.from_text(
-        "rods",
-        ["x", "y", "u", "v"],
-        "(x_dot**2 + y_dot**2 + u_dot**2 + v_dot**2)/2 - y - v",
-        constraints=["x**2 + y**2 = 1", "(u - x)**2 + (v - y)**2 = 1"],
-    )
-    angles = sc.LagrangianSystem.from_text(
-        "angles", ["a", "b"], "(2*a_dot**2 + b_dot**2)/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)"
-    )
-    rods, angles = sc.compile_stepper(rods, "svi:6"), sc.compile_stepper(angles, "svi:6")
-    expected = sc.periodic_orbit(angles, [0.5, 0.66], [0.0, 0.0], period=8.3, energy=-2.5)
-    (a, b), (a_dot, b_dot) = expected.q, angles.velocity(expected.q, expected.p)
-    first, second = np.array([[np.sin(a), -np.cos(a)], [np.sin(b), -np.cos(b)]])
-    rates = a_dot * np.array([np.cos(a), np.sin(a)]), b_dot * np.array([np.cos(b), np.sin(b)])
-    at = {"velocity": [*rates[0], *(rates[0] + rates[1])], "period": 8.3, "energy": -2.5}
-    orbit = sc.periodic_orbit(rods, [*first, *(first + second)], **at)
-    assert orbit.period == pytest.approx(expected.period, rel=1e-11)
-    assert orbit.stability_indices == pytest.approx(expected.stability_indices, abs=1e-9)
-    assert orbit.symplectic_error < 1e-13
-
-
-@pytest.mark.rotated
 @pytest.mark.parametrize("guess", [{"energy": 0.2}, {"fixed": ["z"]}, {"steps": 30}])
 def test_a_conical_pendulum_is_found_and_has_the_index_of_its_nutation(guess):
     """Energy and angular momentum have parallel gradients there: w^2 = 1/cos a, nutation w sqrt(1 + 3 cos(a)^2)."""
@@ -301,17 +252,6 @@ def test_families_with_nonholonomic_constraints_are_refused():
     )
     with pytest.raises(sc.MethodError, match="with nonholonomic constraints"):
         sc.equilibrium(sc.compile_stepper(blade, "svi:2"), [0.0, -1.0])
-
-
-@pytest.mark.second
-def test_family_along_a_parameter_at_fixed_energy(pendulum):
-    """The period of q'' = -g sin q with the energy E is 4 K((E + g)/(2 g))/sqrt(g)."""
-    orbit = sc.periodic_orbit(pendulum, [0.5], [0.0], period=6.3)
-    family = sc.family(pendulum, orbit, parameter="g", energy=orbit.energy, count=6, backward=True)
-    g = family.values
-    assert (np.diff(g) < 0).all()
-    assert family.energies == pytest.approx(np.full(6, orbit.energy), abs=1e-12)
-    assert family.periods == pytest.approx(4 * ellipk((orbit.energy + g) / (2 * g)) / np.sqrt(g), rel=1e-9)
 
 
 @pytest.mark.rotated
@@ -349,24 +289,6 @@ def test_resonance_curve_has_two_folds():
         assert np.prod(orbit.multipliers).real == pytest.approx(np.exp(-0.05 * orbit.period), rel=1e-9)
     assert above.parameters[2] == pytest.approx(1.194508, abs=1e-5)
     assert below.parameters[2] == pytest.approx(1.097960, abs=1e-5)
-
-
-@pytest.mark.rotated
-def test_resonance_of_weak_damping_is_a_circle():
-    """The phasor F/(1 - w^2 + icw), of F = c = 1e-5, at w = 1 and beside it; energy is nearly conserved."""
-    system = sc.LagrangianSystem.from_text(
-        name="resonator",
-        coordinates=["x"],
-        lagrangian="x_dot**2/2 - x**2/2 + c*x*cos(w*t)",
-        parameters={"c": 1e-5, "w": 1.0},
-        dissipation="c*x_dot**2/2",
-    )
-    orbit = sc.periodic_orbit(sc.compile_stepper(system, "svi:4"), [0.1], [1.02], period=2 * np.pi, fixed_period=True)
-    curve = sc.family(orbit.stepper, orbit, parameter="w", period="2*pi/w", step=0.3, count=6)
-    for member in curve:
-        c, w = member.parameters
-        phasor = c / (1 - w**2 + 1j * c * w)
-        assert (*member.q, *member.p) == pytest.approx((phasor.real, -w * phasor.imag), abs=1e-8)
 
 
 @pytest.mark.rotated

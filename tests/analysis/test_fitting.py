@@ -78,17 +78,6 @@ def test_estimates_and_errors_agree_with_curve_fit():
     assert "alpha = " in str(found)
 
 
-@pytest.mark.rotated
-def test_standard_errors_agree_with_the_covariance():
-    """The sum of squares of 5 errors, in their own deviations, over 20 series of noise: chi squared, 100 +- 14."""
-    true, total = np.array([*(TRUE[name] for name in SOME), 0.8, 0.1]), 0.0
-    for seed in range(20):
-        found = sc.fit(oscillator(), TIMES, recorded(100 + seed)[0], unknown=SOME, deviations=NOISE, **GUESS)
-        away = found.values - true
-        total += away @ np.linalg.solve(found.covariance, away)
-    assert 58.0 < total < 142.0
-
-
 @pytest.mark.second
 def test_several_quantities_with_gaps_and_individual_noise():
     both = recorded(2).T.copy()

@@ -274,15 +274,6 @@ def test_paths_of_arrays_of_run_time_sizes():
 
 
 @pytest.mark.rotated
-def test_closed_paths_of_run_time_sizes_bind_to_their_start():
-    stepper = compiled(["u[N]"], "sum(i in N, u_dot[i]**2/2 - u[i]**2/2)", "svi:3")
-    cosine = np.cos(np.linspace(0.0, np.pi, 7))[:, None]
-    for start in (cosine, {"u": cosine}, lambda t: [np.cos(t)]):
-        path = stepper.path(T=np.pi, steps=6, closed=-np.eye(1), start=start)
-        assert path.q[-1] == pytest.approx(-path.q[0], abs=1e-12)
-
-
-@pytest.mark.rotated
 def test_sparse_derivatives_of_a_lattice_are_those_of_all_columns():
     lattice = compiled(
         ["u[12]"], "sum(i in 12, u_dot[i]**2/2 + (u[i]**2 - 1)**2/4) + sum(i in 0..10, (u[i+1] - u[i])**2/4)", "svi:2"

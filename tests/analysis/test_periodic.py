@@ -7,7 +7,6 @@ import pytest
 from notation import lagrange
 from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
-from scipy.optimize import brentq
 from scipy.special import ellipk
 
 import scvi_codegen as sc
@@ -86,27 +85,6 @@ def test_the_error_of_equal_steps_is_reported(restricted):
     assert np.abs(coarse.stability_indices - 1.0).min() > 0.1
 
 
-BUTTERFLY = [-1.0, 0.0, 1.0, 0.0, 0.0, 0.0], (0.3068934205, 0.1255065670), 6.2346748391
-"""Positions of three unit masses, velocity and period of the butterfly I of M. Suvakov & V. Dmitrasinovic, Phys. Rev.
-Lett. 110 (2013) 114301."""
-
-
-@pytest.mark.rotated
-def test_an_accurate_guess_stays_accurate():
-    """The butterfly, whose published digits close to 1e-10; 4000 equal steps move its period by 3e-5."""
-    names = ["x1", "y1", "x2", "y2", "x3", "y3"]
-    pairs = " + ".join(f"1/sqrt((x{i} - x{j})**2 + (y{i} - y{j})**2)" for i, j in ((1, 2), (2, 3), (3, 1)))
-    system = lagrange("bodies", " ".join(names), f"({' + '.join(f'{x}_dot**2' for x in names)})/2 + {pairs}")
-    stepper, (q, (vx, vy), period) = sc.compile_stepper(system, "svi:8"), BUTTERFLY
-    guess = {"velocity": [vx, vy, vx, vy, -2 * vx, -2 * vy], "period": period}
-    orbit = sc.periodic_orbit(stepper, q, **guess)
-    run = stepper.integrate(orbit.q, orbit.p, t_end=orbit.period, tolerance=1e-14)
-    assert np.abs(run.q[-1] - orbit.q).max() < 1e-10
-    assert orbit.period == pytest.approx(period, abs=1e-10)
-    assert orbit.error < 1e-10
-    assert orbit.steps < 400
-
-
 def _motion(t, z):
     """Return the rates of positions and momenta: p = v + (-y, x, 0), H = p^2/2 + y p_x - x p_y - .."""
     (x, y, w), p = z[:3], z[3:]
@@ -128,34 +106,6 @@ def _monodromy(orbit):
         a, b, c, d = (end(start + s * unit) for s in (1, -1, 2, -2))
         columns.append((8 * (a - b) - (c - d)) / 12e-5)
     return np.array(columns).T
-
-
-@pytest.mark.rotated
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize("error", [0.01, -0.01, 0.02, -0.02, 0.05, -0.05])
-def test_unstable_orbit_is_found_from_an_inaccurate_velocity(restricted, error):
-    """A Lyapunov orbit about L1: tangent vectors grow by 1190 in a period. The reference is shooting by DOP853."""
-    x, speed, period = 0.8069, *_lyapunov_orbit(0.8069)
-    guess = {"velocity": [0.0, (1.0 + error) * speed, 0.0], "period": period}
-    orbit = sc.periodic_orbit(restricted, [x, 0.0, 0.0], **guess, steps=200, fixed=["x", "y"])
-    assert restricted.velocity(orbit.q, orbit.p) == pytest.approx([0.0, speed, 0.0], abs=1e-9)
-    assert orbit.period == pytest.approx(period, abs=1e-8)
-    assert np.abs(orbit.stability_indices).max() == pytest.approx(594.2, abs=0.1)
-    assert orbit.residual < 1e-11
-
-
-def _lyapunov_orbit(x):
-    """Speed at (x, 0) and period of the planar orbit that crosses y = 0 again at right angles."""
-
-    def half(speed):
-        end = lambda t, z: z[1] if t > 0.5 else 1.0  # noqa: E731  (solve_ivp reads an attribute of it)
-        end.terminal = True
-        start = [x, 0.0, 0.0, 0.0, speed + x, 0.0]
-        found = solve_ivp(_motion, (0, 4), start, method="DOP853", rtol=1e-13, atol=1e-14, events=end)
-        return found.y_events[0][0, 3] + found.y_events[0][0, 1], found.t_events[0][0]
-
-    speed = brentq(lambda v: half(v)[0], 0.29, 0.31, xtol=1e-14)
-    return speed, 2.0 * half(speed)[1]
 
 
 @pytest.mark.second

@@ -19,13 +19,12 @@ import sympy
 from mpmath import mp
 from notation import lagrange
 from oracle import stepper_of
-from samples import GENERIC, ensemble_runs, sample_named
+from samples import GENERIC, sample_named
 
 import scvi_codegen as sc
 from scvi_codegen.codegen.native.building import TUNED_FLAGS
 from scvi_codegen.codegen.rendering.kernels.double_double import FUNCTIONS, arithmetic_headers
 from scvi_codegen.common.errors import MethodError, StateError
-from scvi_codegen.runs.ensembles.lanes import CommonRuns
 from scvi_codegen.runs.states.words import split, two_words, with_low
 
 KEPLER = "m*(x_dot**2 + y_dot**2)/2 + mu/sqrt(x**2 + y**2)"
@@ -240,16 +239,6 @@ def test_automatic_precision() -> None:
     assert np.abs(np.asarray(double.q[-1]) - np.asarray(long.q[-1])).max() > 1e-5
 
 
-@pytest.mark.rotated
-def test_divided_kernels() -> None:
-    """Derivatives of the forces of many coordinates, in parts, compile, and a step is accurate to 30 digits."""
-    entry = sc.problem("outer-solar-system")
-    stepper = sc.compile_stepper(entry.system, "svi:4", precision="double-double")
-    whole = stepper.integrate(entry.q, velocity=entry.velocity, h=0.5, steps=1)
-    halves = stepper.integrate(entry.q, velocity=entry.velocity, h=0.25, steps=2)
-    assert max(abs(whole.mp("q")[-1] - halves.mp("q")[-1])) < 1e-29
-
-
 def test_numbers() -> None:
     """Floats, text, fractions, mpmath numbers and long doubles become two words; other values are refused by name."""
     with mp.workdps(50):
@@ -275,13 +264,6 @@ def test_numbers() -> None:
     for wrong in (float("inf"), "nan", "1e999999999", mp.inf):
         with pytest.raises(StateError, match=r"q is .*: it must be finite"):
             two_words(wrong, "q")
-
-
-def exact_orbit(t: object, e: object = Fraction(1, 2)) -> list:
-    """Return the position at t > 0 on the ellipse of eccentricity e that starts at pericentre."""
-    e, mean = mp.mpf(e.numerator) / e.denominator, mp.fmod(t, 2 * mp.pi)
-    angle = mp.findroot(lambda x: x - e * mp.sin(x) - mean, mean)
-    return [mp.cos(angle) - e, mp.sqrt(1 - e**2) * mp.sin(angle)]
 
 
 @pytest.mark.rotated
@@ -360,21 +342,6 @@ def test_every_quantity_has_both_words(tmp_path: Path) -> None:
 
 
 @pytest.mark.rotated
-def test_arrays_have_both_words() -> None:
-    """Arrays of coordinates by name, and their items."""
-    text = "q_dot[0]**2/2 + q_dot[1]**2/2 + z_dot**2/2 - (q[0] - q[1])**2/2 - z**2*q[0]**2"
-    chain = sc.LagrangianSystem.from_text(name="chain", coordinates=["q[2]", "z"], lagrangian=text)
-    stepper = sc.compile_stepper(chain, "svi:2", precision="double-double")
-    run = stepper.integrate({"q": ["0.1", "1/3"], "z": "0.7"}, p={"q": ["0", "0.1"], "z": 0}, h=0.125, steps=1)
-    with mp.workdps(40):
-        q, (z, third) = run.mp("q"), (mp.mpf(7) / 10, mp.mpf(1) / 3)
-        assert abs(q[0] - [mp.mpf(1) / 10, third, z]).max() < 1e-32
-        assert abs(run.mp("z")[0] - z) + abs(run.mp("p_q")[0][1] - mp.mpf(1) / 10) < 1e-32
-        for by_name in (dict(run.q.items()), stepper.arrays(run.q), {"q": run.q["q"], "z": run.q["z"]}):
-            assert abs(by_name["q"].mp()[0][1] - third) + abs(by_name["z"].mp()[0] - z) < 1e-32
-
-
-@pytest.mark.rotated
 def test_velocities_at_times_of_two_words() -> None:
     """Momenta, velocities, energies, steps and projections of systems that depend on t use both words of t."""
     text = "(2 + sin(t))*(x_dot**2 + y_dot**2)/2 - x**2*cos(t)/2 + t*x_dot"
@@ -416,36 +383,6 @@ def test_entries() -> None:
 
 
 @pytest.mark.rotated
-def test_ensembles(tmp_path: Path) -> None:
-    """States of two words go on, are saved, and end with a failure; adaptive trajectories are one call of C."""
-    stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
-    with mp.workdps(50):
-        root, third = mp.sqrt(3), mp.mpf(1) / 3
-        q, v = [["0.5", "0"], [third, "0"]], [["0", root], ["0", mp.sqrt(third + 3)]]
-        for plan, has_successive in (({"h": 0.07, "t_end": 6.01}, False), ({"t_end": 2.0}, True)):
-            together = ensemble_runs(stepper, q, None, velocity=v, **plan)
-            by_c = not isinstance(together, CommonRuns) and together.successive is not None
-            assert by_c == has_successive
-        ends = stepper.integrate_ensemble(q, velocity=v, h=0.07, t_end=6.01)
-        assert max(abs(x - y) for x, y in zip(ends[0].mp("q")[-1], exact_orbit(6.01), strict=True)) < 1e-29
-        again = stepper.integrate_ensemble([run.q[-1] for run in (ends[0], ends[1])], ends.p[-1], h=-0.07, steps=3)
-        assert (again[1].mp("q")[0] == ends[1].mp("q")[-1]).all()
-    assert np.array_equal(ends.p_low[-1, 1], ends[1].p_low[-1])
-    ends.save(tmp_path / "ends.npz")
-    with np.load(tmp_path / "ends.npz") as saved:
-        for name in ("t", "q", "p", "parameters"):
-            assert np.array_equal(saved[f"{name}_low"], getattr(ends, name).low)
-    with pytest.raises(StateError, match=r"NAME\.npz"):
-        ends.save(tmp_path / "ends.csv")
-    failing = stepper.integrate_ensemble([[0.5, 0], [1e-9, 0]], velocity=[[0, 1], [0, 1]], h=0.07, steps=9)
-    assert failing.status.tolist() == ["ok", "not converged"]
-    assert np.isnan(failing.q[-1, 1]).all()
-    assert failing.q[-1, 0].low.all()
-    with pytest.raises(StateError, match=r"velocity\[1, 0\] must be a real number"):
-        stepper.integrate_ensemble(q, velocity=[[0, 1], ["a", 1]], h=0.07, steps=9)
-
-
-@pytest.mark.rotated
 def test_explicit_ensembles() -> None:
     """Trajectories in SIMD lanes equal the formulas in 50 digits, whatever their neighbours are."""
     driven = lagrange("driven", "x y", "m*(x_dot**2 + 2*y_dot**2)/2 - k*cos(x - y) - x*y**2*sin(t)", m=1.0, k=1.0)
@@ -472,21 +409,6 @@ def test_explicit_ensembles() -> None:
         fewer = stepper.integrate_ensemble(starts[:3], starts[:3], h=-0.07, steps=9)
         assert infinite.status.tolist() == ["ok", "ok", "ok", "not finite"]
         assert (infinite.mp("q")[:, :3] == fewer.mp("q")).all()
-
-
-@pytest.mark.rotated
-def test_lanes_do_not_depend_on_their_neighbours() -> None:
-    """Trajectories whose iterations converge at different rates have equal bits in other blocks and threads."""
-    stepper = sc.compile_stepper(system("kepler"), "svi:3", precision="double-double")
-    rng, count, plan = np.random.default_rng(2), 200, {"h": 0.9, "steps": 200, "save_every": 200}
-    radius, order = rng.uniform(1.0, 9.0, count), rng.permutation(count)[:150]
-    q = np.stack([radius, 0 * radius], axis=1)
-    v = np.stack([0 * radius, rng.uniform(0.8, 1.2, count) / np.sqrt(radius)], axis=1)
-    runs = stepper.integrate_ensemble(q, velocity=v, **plan)
-    others = stepper.integrate_ensemble(q[order], velocity=v[order], threads=2, **plan)
-    assert runs.ok.all()
-    for name in ("q", "p"):
-        assert (others.mp(name) == runs.mp(name)[:, order]).all()
 
 
 @pytest.mark.rotated

@@ -1,7 +1,6 @@
 """Events that change the state of double-double runs, against flights and impacts computed here in 50 digits."""
 
 import pickle
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -80,54 +79,6 @@ def test_ball(steps: dict[str, float]) -> None:
 
 
 @pytest.mark.rotated
-def test_runs_in_parts() -> None:
-    """Thinned runs, output times, parts, checkpoints, ensembles and terminal counts agree with a single run."""
-    stepper = compiled(BALL, events=[FLOOR, sc.Event("y_dot", terminal=3)])
-    whole = stepper.integrate(**START, h=0.125, steps=60)
-    assert len(whole.events[1]) == 3
-    assert whole.t[-1] == whole.events[1].t[-1]
-    assert whole.t[-1].low == whole.events[1].t[-1].low
-    thinned = stepper.integrate(**START, h=0.125, steps=60, save_every=5)
-    assert thinned.t[-1] == whole.t[-1]
-    assert (thinned.mp("q")[-1] == whole.mp("q")[-1]).all()
-    times = stepper.integrate(**START, h=0.125, t_end=2.0, t_eval=[0.1, 1.9])
-    with mp.workdps(50):
-        assert largest(times.mp("q")[1] - as_mpmath(thinned.at([1.9])[0][0])) < 1e-30
-    run = stepper.start(**START, h=0.125)
-    first = run.record(10)
-    second = stepper.from_checkpoint(run.checkpoint()).record(50)
-    assert len(first.events[0]) + len(second.events[0]) == len(whole.events[0])
-    assert (second.mp("q")[-1] == whole.mp("q")[-1]).all()
-    assert second.mp("t")[-1] == whole.mp("t")[-1]
-    many = stepper.integrate_ensemble([START["q"]] * 2, [START["p"]] * 2, h=0.125, steps=12, parameters=PARAMETERS)
-    alone = stepper.integrate(**START, h=0.125, steps=12)
-    assert (many[1].mp("q")[-1] == alone.mp("q")[-1]).all()
-    back = stepper.with_events(FLOOR).integrate(
-        whole.q[-1], whole.p[-1], t=float(whole.t[-1]), h=-0.125, t_end=0.0, parameters=PARAMETERS
-    )
-    assert len(back.events[0]) == len(whole.events[0])
-
-
-@pytest.mark.rotated
-def test_return() -> None:
-    """A pendulum between elastic walls, integrated forward and back, returns, with its energy and 31 digits."""
-    pendulum = sc.LagrangianSystem.from_text(name="pendulum", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)")
-    walls = [sc.impact("q + 1/2"), sc.impact("0.8 - q")]
-    stepper = compiled(pendulum, "svi:12", events=walls)
-    run = stepper.integrate(["0.1"], ["1.3"], h=0.25, steps=40)
-    assert min(map(len, run.events)) > 3
-    assert run.energy_error() < 2e-30
-    with mp.workdps(50):
-        for crossings, wall in zip(run.events, (mp.mpf(-0.5), mp.mpf("0.8")), strict=True):
-            assert largest(crossings.q.mp()[:, 0] - wall) < 1e-31
-        back = stepper.integrate(run.q[-1], run.p[-1], t=float(run.t[-1]), h=-0.25, steps=40)
-        assert abs(back.mp("q")[-1, 0] - mp.mpf("0.1")) < 1e-28
-        period = run.events[0].t.mp()
-        intervals = [b - a for a, b in pairwise(period)]
-        assert largest(each - intervals[0] for each in intervals) < 1e-29
-
-
-@pytest.mark.rotated
 def test_edge() -> None:
     """Inelastic impacts on two walls alternate, to 31 digits, and leave the velocity along their edge, (1, 1, 1).
 
@@ -185,61 +136,6 @@ def test_energies_of_impacts() -> None:
             change = new - p
             assert abs(change[0] - change[1] / 3) < 1e-31  # along the normal
             assert abs(change[1]) > 0.01
-
-
-@pytest.mark.rotated
-def test_constraints() -> None:
-    """A rod that hits a wall is a pendulum that reverses its angular velocity, times a restitution."""
-    rod = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 - 1"])
-    angle = sc.LagrangianSystem.from_text(name="angle", coordinates=["a"], lagrangian="a_dot**2/2 + cos(a)")
-    with mp.workdps(50):
-        a, rate = mp.mpf("0.75"), mp.mpf("0.5")
-        q, v = [mp.sin(a), -mp.cos(a)], [rate * mp.cos(a), rate * mp.sin(a)]
-        run = compiled(rod, "svi:12").integrate(
-            q, velocity=v, h=0.0625, t_end=6.0, events=sc.impact("x - 1/5", restitution="0.9")
-        )
-        swing = compiled(angle, "svi:12").integrate(
-            [a], [rate], h=0.0625, t_end=6.0, events=sc.impact("sin(a) - 1/5", restitution="0.9")
-        )
-        assert len(run.events[0]) > 1
-        assert largest(run.events[0].t.mp() - swing.events[0].t.mp()) < 1e-27
-        end = swing.mp("q")[-1, 0]
-        assert largest([run.mp("q")[-1, 0] - mp.sin(end), run.mp("q")[-1, 1] + mp.cos(end)]) < 1e-27
-        assert max(np.abs(each).max() for each in run.constraint_values()) < 1e-30
-
-
-@pytest.mark.rotated
-def test_corner() -> None:
-    """In a corner both walls act: the velocity is reversed."""
-    free = sc.LagrangianSystem.from_text(name="free", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2")
-    stepper = compiled(free, "svi:2", events=[sc.impact("1 - x"), sc.impact("1 - y", restitution="0.5")])
-    run = stepper.integrate(["1/3", "1/3"], ["0.25", "0.25"], h=0.5, t_end=5.0)
-    assert list(map(len, run.events)) == [1, 1]
-    with mp.workdps(50):
-        assert abs(run.mp("p")[-1] - [mp.mpf(-0.25), mp.mpf(-0.125)]).max() < 1e-32
-        t = mp.mpf(8) / 3
-        assert abs(run.events[0].t[0].mp() - t) < 1e-31
-        assert abs(run.mp("q")[-1, 1] - (1 - (5 - t) / 8)) < 1e-31
-
-
-@pytest.mark.rotated
-def test_derivatives() -> None:
-    """Derivatives through impacts are those of the run in double, at the states of two words."""
-    starts = {"q": [-1.0, 1.1], "p": [0.3, 0.0], "h": 0.125, "steps": 14, "events": FLOOR}
-    run, double = compiled(BALL).integrate(**starts), sc.compile_stepper(BALL, "svi:4").integrate(**starts)
-    assert len(double.events[0]) == len(run.events[0]) > 0
-    assert np.abs(run.sensitivity().state - double.sensitivity().state).max() < 1e-10
-
-
-@pytest.mark.rotated
-def test_reversible_controller() -> None:
-    """Impacts in runs of equal steps of tau: those of adaptive runs."""
-    g = {"time_transformation": "1/(1 + y**2/4)"}
-    run = compiled(BALL, "svi:12", **g).integrate(**START, h=0.125, t_end=3.0, events=FLOOR)
-    adaptive = compiled(BALL).integrate(**START, t_end=3.0, events=FLOOR)
-    with mp.workdps(50):
-        assert largest(run.events[0].t.mp() - adaptive.events[0].t.mp()) < 1e-28
-        assert largest(run.mp("q")[-1] - adaptive.mp("q")[-1]) < 1e-28
 
 
 @pytest.mark.rotated

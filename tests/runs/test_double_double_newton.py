@@ -138,37 +138,6 @@ def test_first_order() -> None:
         assert abs(v.mp()[0] + mp.sin(x) / (1 + 2 * (x * x + y * y))) < 1e-31
 
 
-def test_numbers_of_first_order_states() -> None:
-    """Values of variables in order or by name, and coordinates beside a rotation, have both words."""
-    text = "(1 + x**2 + y**2)*(x*y_dot - y*x_dot)/2 - cos(x) - sin(y)"
-    particle = sc.LagrangianSystem.from_text(name="particle", coordinates=PLANE, lagrangian=text)
-    stepper = sc.compile_stepper(particle, "svi:1", precision="double-double")
-    step = {"h": 1 / 1024, "steps": 1}
-    with mp.workdps(40):
-        expected = [mp.mpf(1) / 3, mp.mpf(1) / 10]
-        for state in ({"x": Fraction(1, 3), "y": "0.1"}, ["1/3", expected[1]]):
-            run = stepper.integrate(state, **step)
-            assert abs(run.variables.mp()[0] - expected).max() < 1e-32
-            assert (stepper.integrate(run.variables[1], **step).q_low[0] == run.q_low[1]).all()
-        many = stepper.integrate_ensemble({"x": ["1/3", np.int64(1)], "y": "0.1"}, **step)
-        assert abs(many.mp("x")[0] - [expected[0], 1]).max() < 1e-32
-        assert abs(many.mp("y")[0] - expected[1]).max() < 1e-32
-        turning = lagrange(
-            "turning", "x", "x_dot**2/2 + (w_1**2 + 2*w_2**2 + 3*w_3**2)/2 - x**2/2 - R_11*x", rotations={"R": "w"}
-        )
-        body = sc.compile_stepper(turning, "svi:1", precision="double-double")
-        run = body.integrate({"x": "1/3", "R": np.eye(3)}, velocity={"x": "0.1", "w": [1, 2, 3]}, **step)
-        assert abs(run.mp("x")[0] - expected[0]) + abs(run.mp("x_dot")[0] - expected[1]) < 1e-32
-
-
-def test_constraints_hold() -> None:
-    """Constraints of a four-bar and their rates hold to 1e-30, and so does the energy but for the order."""
-    stepper = compiled("four-bar", "svi:8")
-    run = stepper.integrate(*consistent(stepper, "four-bar"), h=0.0625, steps=1000, save_every=10)
-    assert all(np.abs(values).max() < 1e-30 for values in run.constraint_values())
-    assert run.energy_error() < 1e-19
-
-
 @pytest.mark.parametrize("h", [0.02, 0.001, 1e-5])
 def test_constraints_from_rest_at_zero(h: float) -> None:
     """A four-bar linkage that starts from rest where its angles are 0 moves as with another origin of an angle.

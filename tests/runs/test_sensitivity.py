@@ -148,18 +148,3 @@ def test_vector_products_agree_with_the_jacobian(name):
         sc.StateError, match=rf"tangents must have the shape \({size},\) or \(k, {size}\), not \(2, 1\)"
     ):
         stepper.jvp(*at, tangents=np.zeros((2, 1)))
-
-
-@pytest.mark.rotated
-@pytest.mark.parametrize("name", NAMES)
-def test_the_adjoint_is_the_transpose(name):
-    """(J v, w) = (v, J^T w) for all v and w of a basis."""
-    _, stepper, q, p, h = given(name)
-    size = stepper._input_size
-    starts = Starts.chain(q, p, np.array([T, T + h, T + 2 * h]), np.array([h, h, 0.5 * h]))
-    forward, back = np.zeros((2, 4, size, size))
-    forward[0] = back[-1] = np.eye(size)
-    stepper._propagate(starts, forward, stepper.defaults, None)
-    stepper._propagate(starts, back, stepper.defaults, None, transpose=True)
-    assert np.abs(forward[-1]).max() > 1.0
-    assert np.abs(forward[-1].T - back[0]).max() < 1e-13 * np.abs(forward[-1]).max()
