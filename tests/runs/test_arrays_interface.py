@@ -61,25 +61,6 @@ def test_functions_of_states_equal_those_of_known_sizes(steppers) -> None:
             assert values[:, any_size.momentum_map_names.index("momentum of q")] == pytest.approx(flat.sum(axis=1))
 
 
-@pytest.mark.rotated
-def test_energies_in_the_memory_of_a_run_do_not_change_it(steppers) -> None:
-    any_size, _, (q, p), parameters = steppers
-    array = any_size.interface.coordinates[0]
-    runs = [any_size.start({array: q[0]}, {array: p[0]}, h=0.05, parameters=parameters) for _ in range(2)]
-    for run in runs:
-        run.advance(3)
-    run, other = runs
-    binding, state = run.stepper.binding, (np.array([run.t]), run._q.copy(), run._p.copy())
-    values = np.empty(1)
-    for _ in range(2):
-        pointers = [*map(binding.pointer, state), run._arguments[0], binding.pointer(values)]
-        assert binding.function("energies")(1, *pointers, binding.workspace(run._memory)) == 0
-        assert values[0] == other.energy
-    for each in runs:
-        each.advance(3)
-    assert run.snapshot == other.snapshot
-
-
 def test_methods_of_states_bind_the_sizes_of_their_arrays():
     """A new method of steppers whose first argument is a position needs a line in the class of run-time sizes."""
     methods = {name: method for name, method in inspect.getmembers(sc.Stepper, inspect.isfunction) if name[0] != "_"}

@@ -56,25 +56,6 @@ def test_linear_system_is_scale_invariant(method, solver, h):
     assert small.iterations == one.iterations
 
 
-@pytest.mark.tiers(0, 1)
-@pytest.mark.sampled(3)
-@pytest.mark.parametrize(("method", "solver"), WAYS)
-@pytest.mark.parametrize("force", [0.0, 2.0**-90])
-def test_forces_from_rest_at_the_origin_are_scale_invariant(method, solver, force):
-    """The initial state is 0, so no relative change is defined."""
-    hamiltonian = {"momenta": ["p[N]"], "hamiltonian": "sum(i in N, p[i]**2/2 + q[i]**2/2) - e*cos(t)*q[0]"}
-    lagrangian = {"lagrangian": "sum(i in N, q_dot[i]**2/2 - q[i]**2/2) + e*cos(t)*q[0]"}
-    form = hamiltonian if method == "hamiltonian" else lagrangian
-    driven = either_system(name="driven", coordinates=["q[N]"], parameters={"e": 1}, **form)
-    made = sc.compile_stepper(driven, "svi:4" if method == "hamiltonian" else method, solver=solver)
-    ends = []
-    for e in (1.0, force):
-        run = made.start(np.zeros(6), h=0.1, parameters={"e": e})
-        run.advance(3)
-        ends.append(run.q["q"])
-    assert np.abs(ends[1] - force * ends[0]).max() <= 1e-15 * force
-
-
 def test_nan_momentum_fails_the_step():
     """The last kick of a leapfrog step is at a wall, which the positions just reach."""
     wall = lagrange("wall", "q[N]", "sum(i in N, q_dot[i]**2)/2 - sum(i in N, 1/(q[i] - 1))")

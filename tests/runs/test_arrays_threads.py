@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
-from itertools import pairwise, repeat
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -213,26 +213,6 @@ def leapfrog(q: Any, v: Any, h: float, steps: int, forces: Callable[[Any], Any])
     return q.astype(float)
 
 
-@pytest.mark.parametrize("method", ["stoermer-verlet", "svi:2"])
-def test_periodic_lattice_of_three_axes(method: str) -> None:
-    text = "sum(i in L periodic, j in M periodic, k in N periodic, u_dot[i,j,k]**2/2 - u[i,j,k]**4/4 - ("
-    text += "(u[i+1,j,k] - u[i,j,k])**2 + (u[i,j+1,k] - u[i,j,k])**2 + (u[i,j,k+1] - u[i,j,k])**2)/2)"
-    system = sc.LagrangianSystem.from_text(name="lattice", coordinates=["u[L, M, N]"], lagrangian=text)
-    q, v = np.random.default_rng(1).normal(size=(2, 5, 3, 4))
-
-    def forces(u: Any) -> Any:
-        return sum(np.roll(u, way, axis) - u for axis in range(3) for way in (1, -1)) - u**3
-
-    run = sc.compile_stepper(system, method).start(q, velocity=v, h=0.01)
-    run.advance(20)
-    np.testing.assert_allclose(
-        np.reshape(run.q, q.shape),
-        leapfrog(q, v, 0.01, 20, forces),
-        rtol=0,
-        atol=1e-13 if method == "stoermer-verlet" else 2e-3,
-    )
-
-
 @pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("before", ["", " - sum(i in N, q[i]**4/4)"])
 @pytest.mark.parametrize("boundary", ["periodic", "free"])
@@ -259,19 +239,6 @@ def test_coordinates_are_continued_behind_their_last_force(sums: str, boundary: 
             assert [np.asarray(run.p).tobytes() for run in runs] == [np.asarray(runs[0].p).tobytes()] * 2
         for run in runs:
             np.testing.assert_allclose(run.q, leapfrog(q, v, 0.02, 50, forces), rtol=0, atol=4e-14)
-
-
-@pytest.mark.rotated
-def test_newton_iteration_with_threads() -> None:
-    """The last bits of a large step from q = 0 depend on the order in which inner products are summed."""
-    stepper, start = stepper_of("ring", "svi:2", "newton"), start_of("ring")
-    found = [bits(stepper.integrate(start, h=0.2, steps=3, threads=threads)) for threads in THREADS]
-    assert found[1:] == found[:1] * (len(THREADS) - 1)
-    one, two = (
-        bits(stepper.integrate(np.zeros(2000), 3.0 * start[:2000], h=0.7, steps=1, threads=threads))
-        for threads in THREADS[:2]
-    )
-    assert one == two
 
 
 @pytest.mark.rotated
@@ -322,85 +289,6 @@ def test_invalid_thread_counts_are_rejected() -> None:
     rods = lagrange("rods", ["r[N, 2]"], text, constraints=["sum(a in 2, r[i, a]**2) = 1 for i in N"])
     with pytest.raises(sc.MethodError, match="the step uses one"):
         sc.compile_stepper(rods, "stoermer-verlet").start(np.array([[1.0, 0.0]]), h=0.1, threads=2)
-
-
-WINDOWS = """
-#include "shared.c"
-#include <stdio.h>
-static void tell(const char *what, long long size, sharing how)
-{
-  for (long long round = 0; round < how.rounds; round++)
-    for (long long k = 0; k < tasks_in(&how, round); k++) {
-      const window here = window_of(&how, round, k);
-      printf("%s %lld %lld %lld %lld %lld %lld\\n", what, size, round, here.of.first, here.of.end, here.behind.first,
-             here.behind.end);
-    }
-}
-int main(void)
-{
-  static const long long sizes[] = {1, 63, 64, 100, 191, 192, 800, 3500, 5000, 70000, 1000003};
-  for (int k = 0; k < 11; k++) {
-    tell("turn", sizes[k], alternating_blocks(3, 3 + sizes[k], 5, 1));
-    tell("wide", sizes[k], alternating_blocks(3, 3 + sizes[k], 5, 2000));
-    if (sizes[k] < 10000)
-      tell("tiles", sizes[k], pairs_of_blocks(sizes[k]));
-  }
-  return 0;
-}
-"""
-
-
-@pytest.fixture(scope="module")
-def windows(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], list[list[int]]]:
-    """Return rounds and windows of term groups of several sizes, as computed in C."""
-    folder = tmp_path_factory.mktemp("windows")
-    source, _ = ArraySources(system_of(CASES["ring"]), sc.as_method("stoermer-verlet"), prefix="shared").integrator()
-    for path, text in {**source.files, "main.c": WINDOWS}.items():
-        (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        (folder / path).write_text(text)
-    subprocess.run([*find_compiler(), "-std=c99", "-w", "main.c", "-lm", "-o", "main"], cwd=folder, check=True)
-    found: dict[tuple[str, int], list[list[int]]] = {}
-    for line in subprocess.run(["./main"], cwd=folder, check=True, capture_output=True, text=True).stdout.splitlines():
-        what, size, *numbers = line.split()
-        found.setdefault((what, int(size)), []).append([int(number) for number in numbers])
-    return found
-
-
-def test_neighbouring_blocks_are_never_processed_concurrently(windows: dict[tuple[str, int], list[list[int]]]) -> None:
-    """Blocks of a round are disjoint, and every index is in one block."""
-    several = 0
-    for (what, size), each in windows.items():
-        if what == "tiles":
-            continue
-        assert sorted(each, key=lambda window: window[1])[0][1] == 3
-        assert sum(end - first for _, first, end, *_ in each) == size
-        for number in (0, 1):
-            blocks = sorted((first, end) for round_, first, end, *_ in each if round_ == number)
-            several += len(blocks) > 1
-            assert all(after - before >= 5 for (_, before), (after, _) in pairwise(blocks))
-    assert several >= 10
-
-
-@pytest.mark.rotated
-def test_pair_blocks_form_a_round_robin_schedule(windows: dict[tuple[str, int], list[list[int]]]) -> None:
-    most = 0
-    for (what, size), each in windows.items():
-        if what != "tiles":
-            continue
-        met = np.zeros((size, size), dtype=int)
-        for _, first, end, behind, last in each:
-            met[first:end, behind:last] += 1
-        assert np.array_equal(np.triu(met, 1), np.triu(np.ones_like(met), 1))
-        for number in {window[0] for window in each}:
-            places = [
-                place
-                for round_, first, end, behind, last in each
-                if round_ == number
-                for place in {*range(first, end), *range(behind, last)}
-            ]
-            assert len(places) == len(set(places)) == size
-            most = max(most, number)
-    assert most == 31
 
 
 RACES = """

@@ -48,31 +48,6 @@ def test_axes_of_symmetry(lagrangian, arguments, axes):
     assert (core is system) == (not axes)
 
 
-@pytest.mark.parametrize("others", ["", " + x_dot**2/2 - x**2/2"], ids=["in the moving frame", "beside others"])
-def test_actions_are_those_with_three_moments(others):
-    names, q, v = (["x"], {"x": 0.2}, {"x": 0.1}) if others else ([], {}, {})
-    moments, actions = {"A": 1.0, "B": 1.0, "C": 0.5, "w": 1.0}, []
-    for kinetic in (KINETIC, THREE):
-        top = body(f"{kinetic} - w*R_33{others}", coordinates=names, parameters=moments)
-        run = sc.compile_stepper(top, "svi:6").integrate(START | q, velocity=OMEGA | v, h=0.05, steps=20)
-        actions.append(run.action())
-    assert abs(actions[1] - actions[0]) < 1e-11
-
-
-@pytest.mark.parametrize("solver", ["auto", pytest.param("newton", marks=pytest.mark.full)])
-def test_a_symmetric_top_moves_as_one_with_three_moments(solver):
-    ours, other = (sc.compile_stepper(each, "svi:6", solver=solver) for each in (body(f"{KINETIC} - w*R_33"), three()))
-    run, expected = (each.integrate(START, velocity=OMEGA, h=0.1, steps=40) for each in (ours, other))
-    np.testing.assert_allclose(run.q, expected.q, rtol=0, atol=3e-10)
-    np.testing.assert_allclose(run.p, expected.p, rtol=0, atol=3e-9)
-    if solver == "auto":
-        assert run.iterations.sum() < 0.8 * expected.iterations.sum()
-    q, p = run.q[-1], run.p[-1]
-    np.testing.assert_allclose(ours.jacobian(q, p, 0.05), other.jacobian(q, p, 0.05), rtol=0, atol=1e-10)
-    momentum = run.angular_momentum()[:, 2]
-    assert abs(momentum - momentum[0]).max() < 1e-13 * abs(momentum[0])
-
-
 def test_a_predictor_turns_with_the_body():
     """Only bodies without further coordinates have a moving frame."""
     lagrangian = " - w*R_33 + x_dot**2/2 - x**2/2 + x*R_33/5"

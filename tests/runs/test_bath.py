@@ -12,7 +12,6 @@ from samples import QUICK_FLAGS
 from scipy.linalg import expm, solve_discrete_lyapunov
 
 import scvi_codegen as sc
-from scvi_codegen.codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.runs.stepping.noise import normal_numbers
 
 MASS = np.array([[1, 0.5, 0], [0.5, 2, 0], [0, 0, 1]])
@@ -148,11 +147,6 @@ def test_lanes_have_the_bits_of_single_runs_and_return_to_the_state_before_a_fai
 
 STIFF = {**WELL, "lagrangian": "x_dot**2/2*(1 + x**2) - 50*x**4"}
 PLAIN = {"parameters": {"kT": 1, "g": 1}, "temperature": "kT"}
-SLIDER = PLAIN | {  # of a pendulum, with a singular R
-    "coordinates": ["x", "a"],
-    "lagrangian": "x_dot**2 + a_dot**2/2 + x_dot*a_dot*cos(a) + cos(a) - x**2/2",
-    "dissipation": "g*a_dot**2/2",
-}
 ROD = PLAIN | {
     "coordinates": ["x", "y"],
     "lagrangian": "(x_dot**2 + 2*y_dot**2)/2 - y",
@@ -166,32 +160,6 @@ SPHERICAL = ROD | {
 }
 LAGRANGIAN_OF_BODY = "(omega_1**2 + 2*omega_2**2 + 5*omega_3**2/2)/2 + 2*R_33"
 DIPOLE = PLAIN | {"rotations": {"R": "omega"}, "lagrangian": LAGRANGIAN_OF_BODY, "damping": "g"}
-
-
-@pytest.mark.rotated
-@pytest.mark.parametrize(
-    ("method", "arguments", "h"),
-    [
-        *[("svi:1", WELL, 0.3), ("svi:3", CHAIN_OF_TWO | {"temperature": "kT"}, 0.2), ("svi:1", STIFF, 0.6)],
-        *[("svi:1", SLIDER, 0.3), ("svi:2", ROD, 0.1), ("svi:1", DIPOLE, 0.2)],
-    ],
-)
-def test_implicit_steps_in_lanes_have_the_bits_of_single_runs(method, arguments, h):
-    """Separable, coupled, constrained and rotating; steps that fail leave the lanes and are repeated in halves."""
-    system, settings = sc.LagrangianSystem.from_text("body", **arguments), {"h": h, "steps": 60, "seed": 3}
-    stepper = sc.compile_stepper(system, method, flags=PORTABLE_FLAGS)
-    assert stepper.ensemble is not None
-    q = np.random.default_rng(1).normal(size=(9, stepper.dimension))
-    if arguments in (ROD, DIPOLE):
-        q /= np.linalg.norm(q, axis=1)[:, np.newaxis]
-    runs = [stepper.integrate_ensemble(states, 0 * q, **settings, threads=2) for states in (q, q[::-1])]
-    for states, ensemble in zip((q, q[::-1]), runs, strict=True):
-        single = stepper.integrate(states[0], 0 * q[0], **settings)  # stream 0
-        assert np.array_equal(ensemble.q[:, 0], single.q)
-        assert np.array_equal(ensemble.p[:, 0], single.p)
-    assert np.array_equal(runs[0].q[:, 4], runs[1].q[:, 4])  # with other neighbours
-    assert (runs[0].status == "ok").all()
-    assert runs[0].fallback_steps.any() or arguments is not STIFF
 
 
 @pytest.mark.second
@@ -212,16 +180,6 @@ def test_lanes_accept_and_reject_as_single_runs(method):
         assert np.array_equal(runs.q[:, 0], single.q)
     seen = steep.integrate_ensemble(q, p, **settings, observe="extremes").observed
     assert np.array_equal(seen[1, :, 0], whole.q[..., 0].max(axis=0))
-
-
-@pytest.mark.rotated
-def test_observed_ensembles_with_metropolis_have_the_bits_of_single_runs():
-    stiff, q = compiled("svi:1", "folded", **STIFF), np.ones((3, 1))
-    settings = {"h": 0.6, "steps": 40, "seed": 3, "metropolis": True}
-    seen = stiff.integrate_ensemble(q, 0 * q, **settings, observe="extremes")
-    single = stiff.integrate(q[0], 0 * q[0], **settings)
-    assert np.array_equal(seen.q[:, 0], single.q)
-    assert seen.observed[1, 0, 0] == single.q.max()
 
 
 @pytest.mark.second
@@ -304,32 +262,6 @@ def test_rods_by_constraints_and_by_angles_agree_with_quadrature():
     assert agrees(*averages(rods, [0, -1, 0, -2], 0.2, 6000, of_rods, metropolis=True), exact, 0.02)
     run = rods.integrate([0, -1, 0, -2], [0, 0, 0, 0], h=0.2, steps=300)
     assert np.abs(rods.constraint_values(run.q, run.p)).max() < 1e-13
-
-
-@pytest.mark.rotated
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        {"damping": 1.0},
-        {"dissipation": "omega_1**2 + omega_2**2/2"},
-        {"damping": 1.0, "lagrangian": "(omega_1**2 + omega_2**2 + omega_3**2/2)/2 + 2*R_33"},  # in a moving frame
-    ],
-)
-def test_rigid_dipole_has_the_average_of_langevin(arguments):
-    dipole = compiled(
-        "svi:1",
-        "dipole",
-        rotations={"R": "omega"},
-        parameters={"kT": 1},
-        temperature="kT",
-        **{"lagrangian": "(omega_1**2 + 2*omega_2**2 + 5*omega_3**2/2)/2 + 2*R_33", **arguments},
-    )
-    exact = np.array([1 / np.tanh(2) - 0.5])
-
-    def observe(q):
-        return (q[..., :1] ** 2 + q[..., 3:] ** 2) * 2 - 1  # R_33 of unit quaternions
-
-    assert agrees(*averages(dipole, [1, 0, 0, 0], 0.4, 4000, observe, metropolis=True), exact, 0.02)
 
 
 @pytest.mark.second
@@ -524,24 +456,6 @@ def test_model_files_and_generated_programs_have_the_same_noise(tmp_path):
         ["scvi-codegen", "generate", "well.toml", "-o", "program"], cwd=tmp_path, check=True, capture_output=True
     )
     subprocess.run(["make", "run"], cwd=tmp_path / "program", check=True, capture_output=True)
-
-
-@pytest.mark.second
-def test_acceptance_does_not_depend_on_units():
-    """In a unit of length of 1e-10 the same implicit steps are accepted; a quarter is rejected."""
-    runs = []
-    for unit in (1.0, 2.0**-33):
-        well = sc.LagrangianSystem.from_text(
-            *("well", ["x"], "x_dot**2/2 - k*x**4/4"),
-            parameters={"kT": unit**2, "k": 1 / unit**2, "gamma": 1.0},
-            damping="gamma",
-            temperature="kT",
-        )
-        runs.append(
-            sc.compile_stepper(well, "svi:2").integrate([0.0], [0.0], h=3.0, steps=300, seed=1, metropolis=True)
-        )
-    assert runs[0].acceptance == runs[1].acceptance < 0.9
-    assert np.array_equal(runs[0].q, runs[1].q * 2.0**33)
 
 
 def test_words_of_philox_and_normals_of_c():

@@ -78,42 +78,6 @@ def test_bias_of_harmonic_averages_has_the_order_of_the_method(method, bias, ord
 
 
 @pytest.mark.second
-def test_rejections_have_the_order_of_the_energy_error():
-    # O(h^3) of one Verlet step; exact rate by quadrature over exp(-H/kT); sees another factor of dH, h or kT
-    well = compiled("stoermer-verlet", "well", coordinates=["x"], lagrangian="x_dot**2/2 - x**4/4")
-    x, p = np.meshgrid(*[np.linspace(-6, 6, 1201)] * 2, indexing="ij")
-    weight, rates = np.exp(-(p**2) / 2 - x**4 / 4), []
-    for h in (0.4, 0.2):
-        half = p - h / 2 * x**3
-        end, low = x + h * half, (p**2) / 2 + x**4 / 4
-        change = (half - h / 2 * end**3) ** 2 / 2 + end**4 / 4 - low
-        rates.append(-(weight * np.expm1(-np.maximum(change, 0))).sum() / weight.sum())
-        runs = [well.integrate([0.5], [0.5], h=h, steps=20000, seed=k, metropolis=True) for k in range(16)]
-        assert agrees(np.array([1 - run.acceptance for run in runs]), rates[-1], 0.0008)
-    assert 6.5 < rates[0] / rates[1] < 9.5
-
-
-@pytest.mark.second
-def test_correlations_of_velocities_and_diffusion():
-    # sees a friction or a noise of another strength; noise of a half step that is used twice changes the diffusion
-    count, g = 50000, 0.7
-    momenta = np.random.default_rng(1).normal(size=(count, 1))
-    free = compiled("svi:1", "free particle", g, **OSCILLATOR, parameters={"k": 0.0})
-    h, steps = 0.5, 16
-    lag = np.abs(np.subtract.outer(np.arange(steps), np.arange(steps)))
-    runs = ensemble(free, 0 * momenta, momenta, h, steps)
-    # steps of h p with the correlation e^(-g h |i - j|), at any h
-    assert agrees(runs.q[-1, :, 0] ** 2, h**2 * np.exp(-g * h * lag).sum(), 0.2)
-    assert agrees((runs.p[4] * runs.p[7])[:, 0], np.exp(-3 * g * h), 0.006)
-    oscillator = compiled("svi:2", "oscillator", g, **OSCILLATOR, parameters={"k": 4.0})
-    x = np.random.default_rng(2).normal(size=(count, 1)) / 2
-    runs = ensemble(oscillator, x, momenta, 0.05, 40, save_every=10)
-    t, w = runs.t, np.sqrt(4 - g**2 / 4)  # Ornstein-Uhlenbeck: <v v(t)> of the damped oscillator
-    exact = np.exp(-g * t / 2) * (np.cos(w * t) - g / (2 * w) * np.sin(w * t))
-    assert agrees((runs.p[..., 0] * momenta[:, 0]).T, exact, 0.012)
-
-
-@pytest.mark.second
 def test_additive_noise_acts_half_before_and_half_after_a_step():
     # sees all of the noise on one side, or noise of h instead of h/2
     h, s, count = 0.8, 0.5, 40000
@@ -205,32 +169,3 @@ def test_axes_of_a_rigid_body_have_the_temperature():
     values = independent(((w * u - v * p - np.cross(v, u)) / 2) ** 2 / [1, 2, 2.5])
     assert agrees(values, 1, 0.004)
     assert agrees(values.mean(axis=-1), 1, 0.002)
-
-
-@pytest.mark.rotated
-@pytest.mark.parametrize(
-    ("constraints", "degrees"),
-    [
-        (["2*x_2 - x_1 - x_3", "2*y_2 - y_1 - y_3", "2*z_2 - z_1 - z_3", (1, 3, 2)], 5),  # three in a line
-        ([(1, 2, 1), (2, 3, 1)], 7),
-    ],
-)
-def test_molecules_have_a_kinetic_energy_for_each_degree_that_constraints_leave(constraints, degrees):
-    # sees momenta that are not projected, with 9 degrees, and a projection in another metric than that of M
-    def rod(i, j, length):
-        return " + ".join(f"({axis}_{i} - {axis}_{j})**2" for axis in "xyz") + f" - {length**2}"
-
-    mass = np.repeat([1.0, 2.0, 1.0], 3)
-    names = [f"{axis}_{i}" for i in (1, 2, 3) for axis in "xyz"]
-    molecule = compiled(
-        "svi:1",
-        *("molecule", 10.0),
-        coordinates=names,
-        lagrangian=" + ".join(f"{m / 2}*{name}_dot**2" for m, name in zip(mass, names, strict=True)),
-        constraints=[each if isinstance(each, str) else rod(*each) for each in constraints],
-    )
-    q = np.tile([-1.0, 0, 0, 0, 0, 0, 1, 0, 0], (16, 1))
-    p = ensemble(molecule, q, 0 * q, 0.2, 8000).p
-    assert agrees(independent((p**2 / mass).sum(axis=-1)) / degrees, 1, 0.004)
-    centre = p.reshape(*p.shape[:2], 3, 3).sum(axis=2)
-    assert agrees(independent(centre**2) / 4, 1, 0.008)

@@ -78,64 +78,6 @@ def test_equilibria_and_free_particles_need_few_steps():
     assert len(free.integrate([3.0], [1.0], t=5.0, t_end=5.0)) == 1
 
 
-MASSES = {
-    "relativistic": ({"coordinates": ["x"], "lagrangian": "-sqrt(1 - x_dot**2) - x**4/4"}, sc.LagrangianSystem),
-    "coupled": (
-        {"coordinates": ["x", "y"], "lagrangian": "x_dot**2 + y_dot**2 + x_dot*y_dot - x**4 - y**2*x**2"},
-        sc.LagrangianSystem,
-    ),
-    "of momenta": (
-        {"coordinates": ["x"], "momenta": ["p"], "hamiltonian": "sqrt(1 + p**2*(1 + x**2)) + x**4/4"},
-        sc.HamiltonianSystem,
-    ),
-    "of arrays": (
-        {
-            "coordinates": ["x[N]"],
-            "momenta": ["p[N]"],
-            "hamiltonian": "sum(a in N, sqrt(1 + p[a]**2*(1 + x[a]**2)) + x[a]**4/4)",
-        },
-        sc.HamiltonianSystem,
-    ),
-}
-
-
-@pytest.mark.second
-@pytest.mark.covering
-@pytest.mark.parametrize("method", [sc.StoermerVerlet(), sc.SVI(2, "gauss-lobatto:2")])
-@pytest.mark.parametrize(
-    ("name", "solver"),
-    [(name, solver) for name in MASSES for solver in ("auto", "newton")[: 2 - (name == "of arrays")]],
-)
-def test_equal_velocities_at_both_points_give_no_estimate_by_a_curve(name, solver, method):
-    """The momenta of a Lobatto IIIA-IIIB pair of two stages are the same at both, whatever the forces are.
-
-    Fixed steps of named coordinates are compared with half steps.
-    """
-    text, kind = MASSES[name]
-    system = kind.from_text(name="quartic", **text)
-    if name == "of arrays":
-        stepper, start = sc.compile_stepper(system, method), ({"x": [0.5]}, {"x": [0.3]})
-    else:
-        stepper = sc.compile_stepper(system, method, solver=solver)
-        start = ([0.5] * system.dimension, [0.3] * system.dimension)
-    with pytest.raises(sc.MethodError, match=r"without an error estimate .* requires"):
-        stepper.integrate(*start, t_end=2.0, tolerance=1e-6)
-    estimate = stepper.integrate(*start, h=0.1, steps=2).step_error
-    assert math.isnan(estimate) if name == "of arrays" else 1e-6 < estimate < 1e-2
-
-
-@pytest.mark.rotated
-@pytest.mark.parametrize("solver", ["auto", "newton"])
-def test_three_lobatto_points_estimate_errors_by_the_momentum_derivative(solver):
-    """The highest coefficient of the velocities is 0 in every step."""
-    system = sc.LagrangianSystem.from_text(name="quartic", **MASSES["relativistic"][0])
-    stepper = sc.compile_stepper(system, sc.SVI(3, "gauss-lobatto:3"), solver=solver)
-    run = stepper.integrate([0.5], velocity=[0.3], t_end=2.0, tolerance=1e-6)
-    exact = sc.compile_stepper(system, sc.SVI(10)).integrate([0.5], velocity=[0.3], t_end=2.0)
-    assert np.abs(run.q[-1] - exact.q[-1]).max() < 1e-5 < np.abs(run.q[-1] - run.q[0]).max()
-    assert 1e-8 < run.step_error < 2e-5
-
-
 @pytest.mark.rotated
 def test_newton_solves_stiff_systems_with_steps_of_the_slow_time_scale():
     system = lagrange("penalty pendulum", "x y", "(x_dot**2 + y_dot**2)/2 - y - k*(x**2 + y**2 - 1)**2/8", k=1e10)

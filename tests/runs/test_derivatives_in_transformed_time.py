@@ -4,7 +4,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from notation import hamilton, lagrange
 from numpy.testing import assert_allclose
 from samples import QUICK_FLAGS
 
@@ -13,7 +12,6 @@ from scvi_codegen.common.precision import mp
 from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.methods.exact.solution import exact_motion
 from scvi_codegen.methods.exact.step import compiled_equations
-from scvi_codegen.runs.stepping.step_derivatives import Starts
 from scvi_codegen.systems.formulas.expressions import Tape
 
 KEPLER = sc.problem("kepler").system
@@ -187,28 +185,3 @@ def test_run_that_ends_at_a_step_ends_at_its_time():
     assert_allclose(run.pullback(weights).q, np.einsum("ni,nij->j", weights, columns_of(found))[:2], rtol=1e-11)
     still = made.integrate(Q, P, h=H, t_end=0.0)
     assert_allclose(still.tangent(), np.stack([np.eye(4)] * 2))
-
-
-@pytest.mark.rotated
-def test_derivatives_of_a_rod_in_transformed_time():
-    """With a constraint, compare with the transpose and with differences of steps."""
-    rod = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - g*y", g=1.0, constraints=["x**2 + y**2 - 1"])
-    made = sc.compile_stepper(sc.reparametrise(rod, "1/(3 + y)"), sc.SVI(2, "gauss-lobatto:3"), flags=QUICK_FLAGS)
-    q, p = made.project([0.6, -0.8], [0.8, 0.6])
-    starts, size = Starts.chain(q, p, np.array([0.0]), np.array([0.3])), made._input_size
-    values, (forward, back) = made._parameters_at(q, p), np.zeros((2, 2, size, size))
-    forward[0] = back[1] = np.eye(size)
-    made._propagate(starts, forward, values, None)
-    made._propagate(starts, back, values, None, transpose=True)
-    assert np.abs(forward[1].T - back[0]).max() < 1e-13 * np.abs(forward[1]).max()
-    ends = [made.integrate(q, p, h=0.3 + by, steps=1, parameters=values).t[-1] for by in (1e-4, -1e-4)]
-    assert forward[1, -1, -2] == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=1e-7)
-
-
-@pytest.mark.rotated
-def test_hamiltonian_linear_in_momenta_has_an_energy_surface():
-    vortex = hamilton("turn", "q", "w*(q**2 + p**2)/2", momenta="p", w=1.5)
-    made = sc.compile_stepper(sc.reparametrise(vortex, "1/(1 + q**2)"), sc.Gauss(2), flags=QUICK_FLAGS)
-    assert_allclose(
-        made._energy_gradient(np.array([0.6]), np.array([0.3]), made.defaults), [0.9, 0.45, 0.225, 0.0, 0.0, 0.0]
-    )

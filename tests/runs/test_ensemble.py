@@ -21,10 +21,8 @@ from samples import ensemble_runs, pushed_pendulum, sample_named, stepper_for
 
 import scvi_codegen as sc
 from benchmarks.cases.robots import chain
-from scvi_codegen.codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.interfaces.models.model_files.ensemble_file import load_ensemble
 from scvi_codegen.methods import Method
-from scvi_codegen.runs.ensembles.lanes import LaneRuns
 
 KNOTS = np.array([0.0, 0.37, 0.9, 1.41, 2.05, 2.6])
 VALUES = np.array([0.0, 1.2, -0.7, 0.4, 1.9, -1.0])
@@ -225,23 +223,6 @@ def test_each_trajectory_equals_the_single_run(name: str) -> None:
 
 
 @pytest.mark.rotated
-@pytest.mark.parametrize("count", [1, 2, 7, 33])
-def test_heavy_tops_in_lanes_have_the_bits_of_single_runs(count: int) -> None:
-    """With flags that fuse no products."""
-    energy = "omega_1**2/2 + omega_2**2 + 3*omega_3**2/2 - 1.3*rotate_3(R, 0.1, 0.2, 1)"
-    top = sc.LagrangianSystem.from_text("heavy top", rotations={"R": "omega"}, lagrangian=energy)
-    stepper = sc.compile_stepper(top, sc.SVI(4), flags=PORTABLE_FLAGS)
-    assert stepper.ensemble is not None
-    q = {"R": np.tile([0.6, 0.0, 0.8, 0.0], (count, 1))}
-    velocity = {"omega": np.random.default_rng(1).uniform(-2.0, 2.0, (count, 3))}
-    runs = stepper.integrate_ensemble(q, velocity=velocity, h=0.1, steps=50)
-    for j in range(count):
-        alone = stepper.integrate({"R": q["R"][j]}, velocity={"omega": velocity["omega"][j]}, h=0.1, steps=50)
-        assert runs.q[:, j].tobytes() == alone.q.tobytes()
-        assert runs.p[:, j].tobytes() == alone.p.tobytes()
-
-
-@pytest.mark.rotated
 def test_parameters_are_named_rows_or_one_row_per_trajectory() -> None:
     stepper = stepper_for("planar-pendulum", sc.SVI(5))
     q, p = states("planar-pendulum", 3)
@@ -270,33 +251,6 @@ def test_ensembles_with_few_or_no_steps() -> None:
     assert still.t.tolist() == [0.4]
     assert still.ok.all()
     assert still.energy().shape == (1, COUNT)
-
-
-@pytest.mark.rotated
-def test_rows_in_transformed_time_keep_their_tau() -> None:
-    """Each trajectory reaches t_end within a step of its own; those that leave x > 0 fail, one in its first step."""
-    system = sc.LagrangianSystem.from_text(name="root", coordinates=["x"], lagrangian="x_dot**2/2 - x**(5/2)")
-    stepper, h = sc.compile_stepper(sc.reparametrise(system, "1/(1 + x**2)"), "svi:3"), 0.1
-    q, p = [[1.0], [2.0], [1e-3], [1.0]], [[0.0], [0.0], [-5.0], [-2.0]]
-    runs = stepper.integrate_ensemble(q, p, h=h, t_end=0.7)
-    assert runs.ok.tolist() == [True, True, False, False]
-    assert runs.tau is not None
-    for j in range(4):
-        try:
-            alone = stepper.integrate(q[j], p[j], h=h, t_end=0.7)
-        except sc.StepFailedError as failure:
-            alone = failure.trajectory
-        rows, run = len(alone), runs[j]
-        assert np.array_equal(run.tau, alone.tau)
-        assert np.array_equal(run.t, alone.t)
-        assert_allclose(runs.tau[: rows - 1, j], h * np.arange(rows - 1), atol=1e-15)
-        assert np.isnan(runs.tau[rows:, j]).all()
-    assert len(runs[2]) == 1 < len(runs[3]) < len(runs[0]) < len(runs[1])
-    assert_allclose(runs.ends[0][:2], 0.7, rtol=1e-14)
-    assert 0.0 < np.diff(runs[0].tau)[-1] < h  # the last step ends at t_end
-    by_steps = stepper.integrate_ensemble(q[:2], p[:2], h=h, steps=4)
-    assert_allclose(by_steps.tau, h * np.arange(5), atol=1e-15)
-    assert np.array_equal(by_steps.t, by_steps.times)
 
 
 @pytest.mark.second
@@ -332,24 +286,6 @@ class TestFailures:
         settings = {"parameters": nothing, "progress": report}
         result = stepper.integrate_ensemble(q, p, h=0.05, steps=10**9, save_every=10**8, **settings)
         assert set(result.steps) == {0}
-
-    def test_inactive_lanes_change_neither_bits_nor_iterations_of_others(self, kepler: sc.Stepper):
-        """Nor the predictor: a narrow orbit and undefined states beside a circular one."""
-        ends = []
-        for radius in (1.0, 1e-4, 0.0, np.nan):
-            q, p = np.tile([1.0, 0.0], (2, 1)), np.tile([0.0, 1.0], (2, 1))
-            runs = ensemble_runs(kepler, q, p, h=0.1, steps=20)
-            batch = runs.batch()
-            assert isinstance(batch, LaneRuns)
-            block = batch.part(0, 2)
-            block.begin()
-            block.lanes("q")[0, 1:] = radius
-            block.active[1:] = 0.0
-            block.struct.end = 1  # others are not continued
-            block.advance()
-            states = runs.q[:, 0].tobytes(), runs.p[:, 0].tobytes()
-            ends.append((*states, block.memory.iterations, block.memory.guess))
-        assert len(set(ends)) == 1
 
 
 @pytest.mark.rotated
@@ -615,28 +551,3 @@ def test_files_contain_individual_times(tmp_path: Path) -> None:
     dataset = runs.to_xarray()
     assert np.array_equal(dataset.time, runs.times, equal_nan=True)
     assert np.array_equal(np.isfinite(dataset.energy), np.isfinite(runs.times))
-
-
-@pytest.mark.rotated
-@pytest.mark.sampled(2)
-@pytest.mark.usefixtures("as_users_compile")
-@pytest.mark.parametrize("h", [6e-2, 1e-2, 1e-4, 2e-14])
-def test_lanes_converge_as_single_runs(h: float) -> None:
-    """Slowly, with steps repeated from another predictor, and at the level of rounding.
-
-    Changes below rounding are random, and relative to a velocity near 0 they exceed any fixed level.
-    """
-    count, steps = 32, 64
-    stepper = sc.compile_stepper(chain(4).system, "svi:2")
-    generator = np.random.default_rng(1)
-    q, v = generator.uniform(-1, 1, (count, 4)), generator.normal(size=(count, 4))
-    p = np.array([stepper.momentum(*each) for each in zip(q, v, strict=True)])
-    runs = ensemble_runs(stepper, q, p, h=h, steps=steps)
-    batch = runs.batch()
-    assert isinstance(batch, LaneRuns)
-    batch.run(progress=None, threads=1)
-    assert (batch.status == 0).all()
-    for j in range(0, count, 5):
-        single = stepper.integrate(q[j], p[j], h=h, steps=steps)
-        np.testing.assert_allclose(runs.q[-1, j], single.q[-1], rtol=0, atol=1e-12)
-        np.testing.assert_allclose(runs.p[-1, j], single.p[-1], rtol=0, atol=1e-11)

@@ -21,21 +21,6 @@ from scvi_codegen.systems.system import MechanicalSystem
 
 pytestmark = pytest.mark.rotated
 
-METHODS = (sc.SVI(3), sc.SpectralCollocation(6), sc.Composition(8))
-MORE_METHODS = (
-    sc.SCVI(3),
-    sc.Gauss(3),
-    sc.RadauIIA(2),
-    sc.LobattoIIIA(3),
-    sc.StoermerVerlet(),
-    sc.SVI(4),
-    sc.SVI(4, "gauss-lobatto:5"),
-)
-each_method = pytest.mark.parametrize(
-    "method",
-    [*METHODS, *(pytest.param(method, marks=pytest.mark.full) for method in MORE_METHODS)],
-    ids=lambda method: method.name,
-)
 FLAGS = ("-O0",)
 CHANGES = [sc.impact("q - sin(t)", where="q > 0"), sc.Event("q", then={"q_dot": "-q_dot"})]
 FREE = sc.LagrangianSystem.from_text(name="free particle", coordinates=["q"], lagrangian="q_dot**2/2")
@@ -58,15 +43,6 @@ def kepler() -> sc.Stepper:
 
 def at_perihelion(e: float) -> dict[str, list[float]]:
     return {"q": [1 - e, 0.0], "p": [0.0, math.sqrt((1 + e) / (1 - e))]}
-
-
-def crossings_in_one_step(function: str, h: float = 1.0) -> np.ndarray:
-    """Return the crossings of a function of t along one step from 0."""
-    stepper = sc.compile_stepper(FREE, sc.StoermerVerlet(), flags=FLAGS)
-    return stepper.integrate([0.0], [1.0], h=h, steps=1, events=function).events[0].t
-
-
-# Exact times.
 
 
 # None missed.
@@ -118,19 +94,6 @@ def test_pairs_of_close_roots_are_found(polynomials, middle, exponent, sign):
     values = {"a": middle, "b": distance, "s": sign}
     found = polynomials.integrate([0.0], [1.0], h=1.0, steps=1, parameters=values).events[5]
     assert np.abs(found.t - [middle - distance, middle + distance]).max() < 1e-15 / distance
-
-
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize(
-    "function", ["cos(6*t) - 0.97", "exp(t) - 1.8 - 0.05*sin(20*t)", "sin(3*pi*t + 0.1)*(t + 1)", "sin(15*pi*t + 0.1)"]
-)
-def test_crossings_of_other_functions_are_found(function):
-    t = np.linspace(0, 1, 100_001)
-    g = sympy.lambdify(sympy.Symbol("t"), sympy.sympify(function))(t)
-    expected = t[1:][np.diff(np.sign(g)) != 0]
-    found = crossings_in_one_step(function)
-    assert len(found) == len(expected)
-    assert np.abs(found - expected).max() < 1e-5
 
 
 def test_tangency_gives_two_crossings_or_none():
@@ -328,87 +291,6 @@ def test_a_stepper_may_be_compiled_with_events():
     assert "free_particle" in stepper.source.prefix
     assert stepper.integrate([0.0], [1.0], h=0.3, steps=10).t[-1] == pytest.approx(1.0, abs=1e-15)
     assert stepper.integrate([0.0], [1.0], h=0.3, steps=10, events=()).t[-1] == pytest.approx(3.0)
-
-
-# Runs that go on from a crossing with another velocity.
-
-
-BALL = lagrange("ball", "y", "y_dot**2/2 - g*y", g=9.81)
-BALLS = lagrange("balls", "y[N]", "sum(i in N, y_dot[i]**2/2 - g*y[i])", g=9.81)
-DISC = sc.LagrangianSystem.from_text(name="puck", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2")
-DISCS = sc.LagrangianSystem.from_text(name="pucks", coordinates=["r[N]"], lagrangian="sum(i in N, r_dot[i]**2/2)")
-CORNERS = [(0.5, (0.5, 0.5), (1, 1)), (5.0, (0.5, 0.5), (1, 1)), (0.5, (0.25, 0.5), (0.7, 1.4))]
-WALLS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-
-
-def until_event(stepper, events, q, v, t, h):
-    """The end of a run by a terminal event: t, q, v, and the events met there."""
-    run = stepper.integrate(q, velocity=v, t=t, h=h, steps=400, events=events)
-    q, v = run.q, run.velocity
-    if isinstance(q, dict):
-        (q,), (v,) = q.values(), v.values()
-    return (
-        run.t[-1],
-        q[-1],
-        v[-1],
-        [k for k, found in enumerate(run.events) if found.t.size and found.t[-1] == run.t[-1]],
-    )
-
-
-@pytest.fixture(scope="module", params=["coordinates", "arrays"])
-def thrown(request):
-    """Steppers of a ball and a puck with the names of their coordinates, scalar and indexed."""
-    if request.param == "arrays":
-        return sc.compile_stepper(BALLS, "svi:2"), sc.compile_stepper(DISCS, "svi:2"), ("y[0]", "r[0]", "r[1]")
-    return compiled_plainly(BALL, sc.SVI(2)), compiled_plainly(DISC, sc.SVI(2)), ("y", "x", "y")
-
-
-@pytest.mark.covering
-@pytest.mark.filterwarnings("ignore::scvi_codegen.AccuracyWarning")
-@pytest.mark.parametrize(("floor", "error"), [(0.0, 1e-12), (1000.0, 2e-5)])
-@pytest.mark.parametrize("h", [0.1, -0.02])
-def test_bouncing_ball_runs_until_its_bounces_accumulate(thrown, floor, error, h):
-    """Times of bounces form a geometric series; hops get shorter than rounding before its end."""
-    ball, _, (height, *_) = thrown
-    restitution, fall = 0.5, math.sqrt(2.0 / 9.81)
-    end = fall * (1.0 + restitution) / (1.0 - restitution)
-    q, v, t, times = np.array([floor + 1.0]), np.zeros(1), 0.0, []
-
-    def bounce():
-        """Integrate until bounces can no longer be resolved."""
-        nonlocal t, q, v
-        for _ in range(100):
-            t, q, v, met = until_event(ball, [sc.Event(f"{height} - {floor}", -1, terminal=True)], q, v, t, h)
-            assert met == [0]
-            v = -restitution * v
-            times.append(abs(t))
-
-    with pytest.raises(sc.EventError, match="accumulate at t = ") as raised:
-        bounce()
-    expected = end - 2.0 * fall * restitution ** np.arange(1, len(times) + 1) / (1.0 - restitution)
-    assert len(times) > 15
-    assert np.abs(times - expected).max() < error
-    assert abs(abs(float(str(raised.value).split("t = ")[1].split(":")[0])) - end) < error
-
-
-@pytest.mark.covering
-@pytest.mark.parametrize("t0", [0.0, 7e4])
-@pytest.mark.parametrize(("h", "start", "velocity"), CORNERS)
-def test_walls_hit_in_a_corner_are_both_found(thrown, t0, h, start, velocity):
-    """A puck in a square that hits corners exactly, both walls at once or within rounding: a folded straight line."""
-    _, puck, (_, x, y) = thrown
-    events = [sc.Event(g, -1, terminal=True) for g in (x, f"1 - {x}", y, f"1 - {y}")]
-    q, v, t, corners = np.array(start), np.array(velocity, dtype=float), t0, 0
-    for _ in range(12):
-        before = t
-        t, q, v, met = until_event(puck, events, q, v, t, h)
-        for wall in met:
-            v = v - 2.0 * (WALLS[wall] @ v) * WALLS[wall]
-        corners += len(met) == 2 or abs(t - before) < 1e-13 * max(1.0, t)
-        folded = np.abs((np.array(start) + np.array(velocity) * (t - t0) + 1.0) % 2.0 - 1.0)
-        assert met
-        assert np.abs(q - folded).max() < (1e-9 if t0 else 1e-13)
-    assert corners >= 2
 
 
 def test_simultaneous_crossings_are_ordered_within_the_step():

@@ -5,7 +5,6 @@ import pytest
 from notation import lagrange
 
 import scvi_codegen as sc
-from scvi_codegen.analysis.verification.certificate import Outcome
 from scvi_codegen.runs.events import detection
 
 pytestmark = pytest.mark.rotated
@@ -191,86 +190,6 @@ def test_states_of_crossings_have_a_limit_of_memory(gas, monkeypatch):
     assert np.abs(run.q["r"][-1] - folded(r, v, 0.04)).max() < 1e-14
     assert [each.element.tolist() for each in run.events] == [each.element.tolist() for each in saved.events]
     assert np.isnan(run.events[0].q["r"]).all()
-
-
-GRAINS = sc.LagrangianSystem.from_text(
-    name="grains",
-    coordinates=["r[N, 2]"],
-    parameters={"g": 1.0},
-    inputs=["u"],
-    lagrangian="sum(i in N, (r_dot[i, 0]**2 + r_dot[i, 1]**2)/2 - g*r[i, 1])",
-    forces={"r[i, 0]": "u - r_dot[i, 0]/10"},
-)
-AROUND = [
-    sc.impact("r[i, 1] + r[i, 0]**2/20 for i in N", 0.8),
-    sc.impact("2 + sin(t)/5 - r[i, 0] for i in N"),
-    sc.impact("r[i, 0] + 1 for i in N", where="r[i, 1] < 3"),
-    sc.Event("r_dot[i, 1] for i in N", -1),
-]
-
-
-@pytest.mark.parametrize("of_known_sizes", [False, pytest.param(True, marks=pytest.mark.full)])
-@pytest.mark.parametrize("h", [0.05, None])
-def test_ensembles_with_inputs_and_events_equal_single_runs(of_known_sizes, h):
-    """Moving walls, walls of finite size, inputs whose breakpoints end steps; known sizes equal any size."""
-    stepper, random = sc.compile_stepper(GRAINS, "svi:4", flags=FLAGS, events=AROUND), np.random.default_rng(0)
-    r = np.stack([random.uniform(-0.9, 1.8, 4), random.uniform(0.5, 2.0, 4)], axis=1)
-    v, plan = random.normal(size=(4, 2)), {"t_end": 3.0} | ({"h": h} if h else {"tolerance": 1e-10})
-    given = {"inputs": {"u": ([-1.0, 1.31, 2.7, 9.0], [0.0, 1.0, -1.0, 0.5])}, **plan}
-    starts = np.stack([r, r + 0.01])
-    chosen = stepper.with_sizes(N=4).with_events(AROUND) if of_known_sizes else stepper
-    several = chosen.integrate_ensemble({"r": starts}, velocity={"r": np.stack([v, v])}, **given)
-    assert list(several.status) == ["ok", "ok"]
-    for (t, q, *_), start in zip(several.each(), starts, strict=True):
-        run = stepper.integrate({"r": start}, velocity={"r": v}, **given)
-        assert min(map(len, run.events)) > 0
-        assert t[-1] == run.t[-1] == 3.0
-        assert np.abs(np.asarray(q)[-1] - np.asarray(run.q)[-1]).max() < (1e-8 if of_known_sizes else 1e-15)
-
-
-def test_cloth_in_wind_at_a_wall():
-    """Constraints of arrays, forces that depend on velocities, and impacts: order 2, rods and pins to round-off."""
-    squares = [f"(r[{{0}}, {k}] - r[i, j, {k}])**2" for k in range(3)]
-    along, across = (" + ".join(squares).format(each) for each in ("i+1, j", "i, j+1"))
-    cloth = sc.LagrangianSystem.from_text(
-        name="cloth",
-        coordinates=["r[N, N, 3]"],
-        parameters={"l": 0.25, "y[N]": 0.0},
-        lagrangian="sum(i in N, j in N, (r_dot[i,j,0]**2 + r_dot[i,j,1]**2 + r_dot[i,j,2]**2)/2 - 10*r[i,j,2])",
-        forces={"r[i, j, 0]": "0.6*(1 + sin(t)) - 0.4*r_dot[i,j,0]", "r[i, j, 2]": "-0.4*r_dot[i,j,2]"},
-        constraints=[
-            "r[0, j, 0] = 0 for j in N",
-            "r[0, j, 1] = y[j] for j in N",
-            "r[0, j, 2] = 0 for j in N",
-            f"{along} = l**2 for i in N-1, j in N",
-            f"{across} = l**2 for i in 1..N-1, j in N-1",
-        ],
-    )
-    stepper, n = sc.compile_stepper(cloth, "stoermer-verlet", flags=FLAGS), 5
-    i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
-    r, given = np.stack([0 * i, 0.25 * j, -0.25 * i], axis=-1), {"t_end": 1.0, "parameters": {"y": 0.25 * np.arange(n)}}
-    wall = sc.impact("1/10 - r[i, j, 0] for i in N, j in N", 0.5)
-    runs = [stepper.integrate({"r": r}, h=h, events=wall, **given) for h in (0.01, 0.005, 0.0025)]
-    ends = [run.q["r"][-1] for run in runs]
-    assert len(runs[0].events[0]) > 5
-    assert {len(run.events[0]) for run in runs} == {len(runs[0].events[0])}
-    assert np.abs(np.linalg.norm(np.diff(ends[-1], axis=0), axis=-1) - 0.25).max() < 1e-14
-    assert np.abs(ends[-1][0] - r[0]).max() < 1e-14
-    one, two = np.abs(ends[0] - ends[1]).max(), np.abs(ends[1] - ends[2]).max()
-    assert 1.8 < np.log2(one / two) < 2.2
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("tolerance", [None, 1e-9])
-def test_certificates_of_known_sizes_measure_impacts(tolerance):
-    """Adaptive steps, and sites with Hamiltonians of their own, which are verified at known sizes."""
-    sites = "-4*sum(i in N, sqrt(1 - q_dot[i]**2/4)) - sum(i in N-1, (q[i+1] - q[i])**2/2)"
-    system = CHAIN if tolerance else sc.LagrangianSystem.from_text(name="sites", coordinates=["q[N]"], lagrangian=sites)
-    walls = [sc.impact("q[i] + 1 for i in N"), sc.impact("3/2 - q[i] for i in N")]
-    stepper = sc.compile_stepper(system, "svi:2", flags=FLAGS, events=walls)
-    certificate = sc.verify(system, "svi:2", [0.1, 0.5], [1.0, 0.2], h=0.1, stepper=stepper, tolerance=tolerance)
-    names = {"event surfaces", "saltation", "impacts", "symplecticity, impacts", "reversal, impacts"}
-    assert names <= {each.name for each in certificate.checks if each.outcome is Outcome.SATISFIED}
 
 
 def test_a_recorded_run_has_its_events(gas, tmp_path):

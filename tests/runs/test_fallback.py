@@ -1,6 +1,5 @@
 """Newton's iteration from a fallback library equals a built-in one and is compiled on demand."""
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -159,20 +158,3 @@ def test_iteration_that_fails_is_tried_again_after_growing_numbers_of_steps():
     after.update(parameters={"k": 40.0})
     after.advance(4)
     assert after.fallback_steps == 35
-
-
-@pytest.mark.second
-def test_steps_are_counted_that_fail_without_newtons_method():
-    system = sc.LagrangianSystem.from_text(name="stiff", **STIFF)
-    source, interface = sc.generate_source(system, "svi:4")
-    without = replace(source, code=f"#define NO_FALLBACK\n{source.code}")
-    run, alone = (
-        sc.Stepper(each, interface, flags=PORTABLE_FLAGS).start([0.3], [0.0], h=0.7, parameters={"k": 30.0})
-        for each in (source, without)
-    )
-    with pytest.raises(sc.StepFailedError, match="not converge"):
-        alone.advance(60)
-    run.advance(alone.steps)
-    assert run.fallback_steps == 0
-    run.advance(1)
-    assert run.fallback_steps == 1

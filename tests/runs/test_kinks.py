@@ -107,33 +107,6 @@ def test_trajectories_of_ensembles_have_the_bits_of_runs(family, plan):
         assert np.array_equal(together.ends[2][j], run.p[-1])
 
 
-@pytest.mark.rotated
-@pytest.mark.parametrize("degree", [2, 4, 8])
-def test_derivatives_across_kinks_are_those_of_coarse_fixed_steps(degree):
-    """A stiff floor, drag and a force that jumps, at steps whose own error is up to 1e-2."""
-    force = {"y": "-g*y_dot*abs(y_dot)/50 - k*unit_step(y - 1/2)/100"}
-    system = lagrange("drop", "y", "y_dot**2/2 - g*y - k*positive_part(-y)**2/2", g=9.8, k=300.0, forces=force)
-    stepper = sc.compile_stepper(system, f"svi:{degree}")
-
-    def end(x):
-        run = stepper.integrate(x[:1], x[1:2], h=0.11, steps=12, parameters={"g": x[2], "k": x[3]})
-        return run, np.concatenate([run.q[-1], run.p[-1]])
-
-    x, places = np.array([1.0, 0.1, 9.8, 300.0]), (-3, -2, -1, 1, 2, 3)
-    run, _ = end(x)
-    assert sum(map(len, run.switches)) >= 6
-    found, columns = run.sensitivity(), []
-    for step in np.diag(2e-5 * x.clip(1.0)):
-        differences = np.dot([-1, 9, -45, 45, -9, 1], [end(x + place * step)[1] for place in places])
-        columns.append(differences / (60 * step.sum()))
-    exact = np.array(columns).T
-    by = np.hstack([found.state[-1], found.parameters[-1][:, [stepper.parameters.index(name) for name in "gk"]]])
-    seeds = np.stack([*np.zeros((len(run) - 1, 2, 2)), np.eye(2)])
-    assert np.abs(by / exact - 1).max() < 1e-9
-    assert np.abs(run.tangent()[-1] / exact[:, :2] - 1).max() < 1e-9
-    assert np.abs(run.pullback(seeds).q[0] / exact[:, 0] - 1).max() < 1e-9
-
-
 @pytest.mark.tiers(1, 1)
 @families
 def test_derivatives_across_kinks_are_those_of_the_motion(family):

@@ -169,26 +169,6 @@ def test_ensemble_states_are_within_a_rounding_of_exact_sums(name: str) -> None:
             assert abs(exact(*(q * MASSES)) - begun_at - first * 64 * k * Fraction(H)) <= most_q * 1.01
 
 
-@pytest.mark.rotated
-@pytest.mark.parametrize("lengths", ["tolerance", "inputs"])
-def test_times_are_sums_of_all_steps(lengths: str) -> None:
-    """Adaptive steps, the last of which ends at t_end, and segments between breakpoints."""
-    own = Begun("svi")
-    if lengths == "tolerance":
-        own.run = own.stepper.start(own.q, own.p, t_end=1.7, tolerance=1e-6, t=1 / 3)
-    start = (own.time(), *own.invariants())
-    if lengths == "inputs":
-        for h in (0.1, 0.03, 1 / 7):
-            own.run.update(h=h)
-            own.run.advance(5)
-        assert abs(own.time() - (start[0] + 5 * exact(0.1, 0.03, 1 / 7))) < Fraction(1, 2**100)
-        return
-    while not own.run.arrived:
-        own.run.advance(1)
-        assert max(map(abs, own.off(start))) < 1e-15  # steps are long, and their increments as large as the state
-    assert own.run.t == 1.7
-
-
 def tables(code: str) -> dict[str, list[float]]:
     """Numbers of every table of doubles that a text has."""
     found = re.findall(r"static const (?:lanes|double) (\w+)(?:\[[^=]*\])? = (\{.*?\});", code, re.S)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import cache, partial
@@ -12,10 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 from notation import lagrange
-from programs import needs
 
 import scvi_codegen as sc
-from scvi_codegen.codegen.native.compilers import find_compiler
 from scvi_codegen.interfaces.models.packages.package import generate_package
 
 SQUARE = "sum(a in 3, wrap(r[i, a] - r[j, a], box)**2)"
@@ -135,41 +132,6 @@ def test_steps_longer_than_the_skin_miss_no_pair(method: str) -> None:
         stepper("svi:2", 0.01, SOFT).integrate(r, velocity=20 * v, h=0.1, steps=1)
 
 
-def of_other_kind(kind: str, near: str) -> Any:
-    """Return a Hamiltonian, a system with bonds of fixed length, or one with friction between neighbours."""
-    given: dict[str, Any] = {"name": kind, "coordinates": ["r[N, 3]"], "parameters": {"box": BOX, "cut": CUT}}
-    if near == "near":
-        given["neighbours"] = {"near": {"of": "r", "box": "box", "cutoff": "cut", "skin": 0.05}}
-    lagrangian = f"{KINETIC} - sum(i < j in {near}, {SOFT})"
-    if kind == "hamiltonian":
-        formula = f"sum(i in N, sum(a in 3, p_r[i, a]**2)/2) + sum(i < j in {near}, {SOFT})"
-        return sc.HamiltonianSystem.from_text(**given, hamiltonian=formula)
-    if kind == "bonds":
-        bond = "sum(a in 3, (r[bonds[b, 0], a] - r[bonds[b, 1], a])**2) = (box/4)**2 for b in B"
-        return sc.LagrangianSystem.from_text(
-            **given, lagrangian=lagrangian, tables={"bonds[B, 2]": [[0, 1], [2, 3]]}, constraints=[bond]
-        )
-    friction = f"sum(i < j in {near}, {SOFT}*sum(a in 3, (r_dot[i, a] - r_dot[j, a])**2))"
-    return sc.LagrangianSystem.from_text(**given, lagrangian=lagrangian, dissipation=friction)
-
-
-@pytest.mark.rotated
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize(
-    ("kind", "method"), [("hamiltonian", "svi:2"), ("bonds", "stoermer-verlet"), ("friction", "svi:2")]
-)
-def test_hamiltonians_constraints_and_friction_have_lists(kind: str, method: str) -> None:
-    r, v = start()
-    r[[1, 3]] = r[[0, 2]] + np.array([[0, 0, BOX / 4], [0, BOX / 4, 0]])
-    v[:4] = 0.0
-    run, other = (
-        sc.compile_stepper(of_other_kind(kind, near), method, kinks="as formulas").integrate(r, v, h=0.01, steps=40)
-        for near in ("near", "N")
-    )
-    assert abs(np.diff(run.q["r"][[0, -1]], axis=0)).max() > 0.2
-    assert run.q["r"] == pytest.approx(other.q["r"], abs=1e-11)
-
-
 @pytest.mark.second
 def test_parameters_that_change_make_another_list() -> None:
     r, v = start()
@@ -212,42 +174,6 @@ def test_boxes_of_other_shapes_and_none(box: Any) -> None:
         runs.append((run.q["r"], run.energy()))
     assert runs[0][0] == pytest.approx(runs[1][0], abs=1e-11)
     assert runs[0][1] == pytest.approx(runs[1][1], abs=1e-10)
-
-
-@pytest.mark.rotated
-@pytest.mark.parametrize("sanitizer", ["address,undefined", pytest.param("thread", marks=pytest.mark.full)])
-def test_programs_of_packages_make_their_lists(sanitizer: str, tmp_path: Path) -> None:
-    """With three threads and the compiler's sanitizers, from the same start to the same bits."""
-    needs("setarch")
-    r, v = start(3.0, side=7)
-    model = sc.Model(system=liquid(0.1, SOFT), q={"r": r}, velocity={"r": v}, h=0.02, method=sc.SVI(2), span=0.1)
-    folder = sc.generate_package(model, tmp_path / "soft")
-    flags = ["-std=c99", "-O1", "-ffp-contract=off", f"-fsanitize={sanitizer}", "-DSCVI_THREADS", "-pthread"]
-    command = [*find_compiler(), *flags, "-Wno-psabi", "main.c", "soft.c", "-lm", "-o", "main"]
-    built = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-    if built.returncode:
-        pytest.skip(f"no sanitizer: {built.stderr[-200:]}")
-    for threads in ("1", "3"):
-        done = subprocess.run(
-            ["setarch", "-R", "./main", threads], cwd=folder, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
-        end = np.loadtxt(folder / "end.txt")
-        assert end[: r.size] == pytest.approx(model.integrate().q["r"][-1].reshape(-1), abs=1e-12)
-
-
-def test_a_list_in_sympy() -> None:
-    from sympy import IndexedBase, Sum, exp, symbols
-
-    q, velocity, (i, j, N, near) = IndexedBase("q"), IndexedBase("q_dot"), symbols("i j N near", integer=True)
-    pairs = Sum(exp(-((q[i] - q[j]) ** 2)), (j, i + 1, near - 1), (i, 0, near - 2))
-    system = sc.LagrangianSystem.from_sympy(
-        name="line",
-        coordinates=["q[N]"],
-        lagrangian=Sum(velocity[i] ** 2 / 2, (i, 0, N - 1)) - pairs,
-        neighbours={"near": {"of": "q", "cutoff": 2}},
-    )
-    assert "sum(i < j in near, -exp(-(q[i] - q[j])**2)*unit_step(4 - (q[i] - q[j])**2))" in map(str, system.terms)
 
 
 INVALID: tuple[tuple[dict[str, float], str], ...] = (

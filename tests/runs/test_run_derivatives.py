@@ -116,29 +116,6 @@ def differences(function, x, width=1e-4):
     return np.array(columns).T
 
 
-@pytest.mark.rotated
-@pytest.mark.parametrize(("name", "changes"), CASES)
-def test_derivatives_of_runs_are_products_of_those_of_steps(name, changes):
-    motion = MOTIONS[name]
-    run, whole = motion.run(**changes), motion.run(**changes | {"save_every": 1})
-    size, found = 2 * motion.stepper.dimension, derivatives_of(run)
-    product = np.eye(size, found.shape[2])
-    products = [product]
-    for piece in whole.pieces or (whole,):
-        for k, (t, h) in enumerate(zip(piece.t[:-1], np.diff(piece.t), strict=True)):
-            step = piece.stepper.sensitivity(piece.q[k], piece.p[k], h, t, piece.parameters)
-            product = step.state @ product
-            if found.shape[2] > size:
-                by_h = [(step.h + k * step.t)[:, np.newaxis]] * (found.shape[2] - size - step.parameters.shape[1] - 1)
-                product[:, size:] += np.concatenate([step.parameters, step.t[:, np.newaxis], *by_h], axis=1)
-            products.append(product)
-    expected = np.array(products)[np.searchsorted(whole.t * whole.forward, run.t * run.forward)]
-    assert_close(found, expected, 1e-9)
-    assert_close(run.tangent(), found[:, :, :size], 1e-12)
-    direction = np.arange(1.0, size + 1)
-    assert_close(run.tangent(direction)[-1], found[-1, :, :size] @ direction, 1e-11)
-
-
 @pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("name", "changes"), CASES)
 def test_gradients_are_the_transpose_of_sensitivities(name, changes):
