@@ -91,26 +91,6 @@ def made_and_run(folder, q, *, precision=None, system=LINKAGE, exit_status=0):
     return np.array([line.split() for line in found.stdout.splitlines() if line[0] != "#"], dtype=float), found
 
 
-@pytest.mark.parametrize("precision", [None, "double", "single"])
-def test_generated_folders_project_constraints_and_equal_python(precision, tmp_path):
-    """Slightly inconsistent states are projected with a message and integrated, also with adaptive steps."""
-    near = [0.001, 1.0, 1.94, 1.5]
-    states, found = made_and_run(tmp_path / "linkage", near, precision=precision)
-    stepper = sc.compile_stepper(LINKAGE, "svi:3", solver="newton")
-    with pytest.warns(sc.AccuracyWarning, match="projected onto the constraints"):
-        run = stepper.integrate(near, [0.0] * 4, h=0.05, steps=40, save_every=2)
-    assert "violates the constraints" in found.stderr
-    assert len(states) == len(run)
-    bound = 2e-4 if precision == "single" else 2e-13
-    assert np.abs(states[:, 1:5] - run.q).max() < bound
-    assert np.abs(states[:, 5:9] - run.p).max() < 10 * bound
-    values = stepper.constraint_values(states[:, 1:5], states[:, 5:9], states[:, 0])
-    assert np.abs(values).max() < 0.1 * bound
-    if precision is None:
-        (away,) = [line for line in found.stdout.splitlines() if "adaptive steps," in line]
-        assert np.abs(np.array(away.rpartition(" end ")[2].split(), dtype=float)).max() < 1e-5
-
-
 def test_states_that_cannot_be_projected_are_rejected_in_c(tmp_path):
     """States far off the constraints and stretched linkages with dependent constraints are rejected."""
     states, found = made_and_run(tmp_path / "far", [0.3, 1.0, 1.94, 1.5], exit_status=1)

@@ -120,15 +120,6 @@ def derivatives_in_order(group: Any) -> list[sympy.Expr]:
 # Sharing and size.
 
 
-def test_negative_half_integer_powers_are_separate_functions():
-    r2 = x**2 + y**2
-    half = sympy.Rational(1, 2)
-    counts = kernel_of(*(r2 ** (-n * half) for n in (1, 3, 5, 7)), r2 ** (-9 * half), a / r2).operation_counts()
-    assert [counts[f"inverse_root_{k}"] for k in (1, 3, 5, 7)] == [1, 1, 1, 1]
-    assert counts["/"] == counts["sqrt"] == 1
-    assert "pow" not in counts
-
-
 def test_gradient_of_kepler_has_no_division():
     system = KEPLER
     forces = gradient(system.lagrangian, system.coordinates)
@@ -145,17 +136,6 @@ def test_gradient_of_kepler_has_no_division():
     assert (counts["inverse_root_3"], counts["inverse_root_5"]) == (1, 1)
     assert "/" not in counts
     assert sum(counts.values()) < 40
-
-
-def test_odd_quarter_powers_share_a_root_of_a_root():
-    """r^(3/2) of the squared distance, and its gradient: as in the time transformation "frequency" of Kepler's
-    problem."""
-    r2 = x**2 + y**2
-    quarters = [r2 ** sympy.Rational(n, 4) for n in (-7, -3, -1)]
-    counts = kernel_of(*quarters).operation_counts()
-    assert counts == {"sqrt": 1, "inverse_root_1": 1, "inverse_root_3": 1, "*": 4, "+": 1}
-    positive = kernel_of(*(r2 ** sympy.Rational(n, 4) for n in (1, 3, 5)))
-    assert positive.operation_counts() == {"sqrt": 2, "*": 4, "+": 1}  # 0 at 0
 
 
 def test_integer_powers_are_products_and_others_are_calls():

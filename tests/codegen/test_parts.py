@@ -66,22 +66,3 @@ def test_split_kernels_give_bitwise_equal_trajectories(name, solver, cut_after, 
     np.testing.assert_array_equal(whole.energy(), cut.energy())
     if many is not None:
         np.testing.assert_array_equal(many.q, many_cut.q)
-
-
-@pytest.mark.rotated
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize(
-    ("method", "solver"), [("svi:3", "newton"), ("svi:3", "fixed-point"), ("stoermer-verlet", "fixed-point")]
-)
-def test_array_systems_have_bitwise_equal_trajectories(method, solver, cut_after, monkeypatch, tmp_path):
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
-    lagrangian = "sum(i in N, q_dot[i]**2/2 - q[i]**2/2 - t*q[i]) - sum(i in 0..N-2, cosh(q[i+1] - q[i])*sin(q[i]))"
-    system = sc.LagrangianSystem.from_text(name="chain", coordinates=["q[N]"], lagrangian=lagrangian)
-    found = []
-    for operations, prefix in ((1000, "whole"), (4, "cut")):
-        cut_after(operations)
-        stepper = sc.compile_stepper(system, method, solver=solver, flags=PORTABLE_FLAGS, prefix=prefix)
-        found.append([stepper.integrate([0.3, -0.5, 0.7], h=0.1, steps=10).q["q"], stepper.source.code])
-    (whole, text), (cut, cut_text) = found
-    assert ("kept[" in text, "kept[" in cut_text) == (False, True)
-    np.testing.assert_array_equal(whole, cut)

@@ -87,29 +87,6 @@ def test_inverse_roots_are_right_to_two_units(tmp_path, k, flags):
 SHORT, LONG = ("-O1", "-march=x86-64"), ("-O1", "-march=native")
 
 
-@pytest.mark.sampled(3)
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="the lengths of vectors of other processors are not chosen")
-@pytest.mark.parametrize(
-    ("name", "method"),
-    [
-        ("kepler", sc.SVI(8)),  # in four vectors of two points, or in one of eight
-        ("outer-solar-system", sc.SVI(9)),  # in eight, or in two
-        ("double-pendulum", sc.SVI(5)),  # coupled
-        ("double-pendulum", sc.SVI(4, "gauss-legendre:6")),  # projected
-        ("point-vortices", sc.SVI(6)),  # a Hamiltonian
-    ],
-)
-def test_points_use_the_vectors_that_registers_allow(name, method):
-    given = sc.problem(name)
-    ends = []
-    for flags in (SHORT, LONG):
-        stepper = sc.compile_stepper(given.system, method, flags=flags)
-        p = given.p if given.p is not None else stepper.momentum(given.q, given.velocity)
-        run = stepper.integrate(given.q, p, h=given.step, steps=20)
-        ends.append(np.concatenate([run.q[-1], run.p[-1]]))
-    assert np.abs(ends[0] - ends[1]).max() < 1e-13 * np.abs(ends[1]).max()
-
-
 @pytest.mark.sampled(2)
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the lengths of vectors of other processors are not chosen")
 @pytest.mark.parametrize("points", [2, 3, 8, 10])

@@ -15,7 +15,6 @@ from browsing import seen_by_firefox
 from printed_formulas import mp, names, trees_of_mathml, value
 from sympy import Float, Function, Matrix, Mul, Pow, Rational, Symbol, cos, exp, pi, sin, sqrt, symbols
 
-from scvi_codegen import SCVI, SVI, Gauss, SpectralCollocation, derive, problem
 from scvi_codegen.common.display.mathml import latex_name, mathml, mathml_terms
 from scvi_codegen.common.display.page import mathematics_font
 
@@ -47,16 +46,6 @@ EXPRESSIONS = [
     h * (x + y + 3) * (x + 2 * y + 5) * sin(x + y + h) / 7, (x + y) * (x - y) / (h * (x + 3) * (y + 4)),
 ]  # fmt: skip
 
-DERIVED = [
-    ("planar-pendulum", SVI(2), True),
-    ("planar-pendulum", SCVI(2), False),
-    ("double-pendulum", SVI(1), True),
-    ("double-pendulum", SVI(2), False),
-    ("kepler", SCVI(2), True),
-    ("duffing", SpectralCollocation(3), True),
-    ("henon-heiles", Gauss(2), False),
-]
-
 
 def check_read_back(expression: sympy.Expr, seed: int = 1) -> None:
     """One element, and all terms, read as the expression."""
@@ -73,14 +62,6 @@ def check_read_back(expression: sympy.Expr, seed: int = 1) -> None:
 @pytest.mark.parametrize("expression", EXPRESSIONS, ids=str)
 def test_mathml_evaluates_to_the_expression(expression):
     check_read_back(expression)
-
-
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize(("name", "method", "radicals"), DERIVED, ids=lambda value: getattr(value, "name", str(value)))
-def test_derived_equations_survive_a_round_trip(name, method, radicals):
-    derived = derive(problem(name).system, method, radicals=radicals)
-    for equation in (*derived.equations, *derived.end_momentum):
-        check_read_back(equation.residual)
 
 
 GREEK = '<mi mathvariant="normal" style="font-style:italic">'

@@ -60,25 +60,6 @@ def test_one_clamped_element():
     assert run.q["u"][-1] == pytest.approx(shape(mesh.points["x"]) * cos(k * k * 0.1), abs=1e-9)
 
 
-def test_energy_of_a_nonlinear_density_is_its_quadrature():
-    """Values, first and second derivatives and the coordinate at points within elements and between them."""
-    field = sc.FieldSystem.from_text(
-        "beam",
-        ["u"],
-        {"x": (0, 2)},
-        "u_t**2/2 - (1 + x)*(1 + u**2 + u_x)*u_xx**2/2",
-        boundary={"x": ("clamped", "clamped")},
-    )
-    u = np.polynomial.Polynomial([0, 0, 1]) * np.polynomial.Polynomial([2, -1]) ** 2
-    mesh = field.discretise("spectral-elements", degree=6, elements=[0, 0.4, 1, 2])
-    stepper = sc.compile_stepper(mesh.system, "svi:1", flags=QUICK_FLAGS)
-    run = stepper.integrate({"u": u(mesh.points["x"])}, h=1e-6, steps=1)
-    x = np.array([0, *mesh.points["x"], 2])
-    weights = np.array([0.2 / 21, *mesh.weights, 0.5 / 21])
-    values = (1 + x) * (1 + u(x) ** 2 + u.deriv()(x)) * u.deriv(2)(x) ** 2 / 2
-    assert run.energy()[0] == pytest.approx(np.sum(weights * values), rel=1e-12)
-
-
 @pytest.mark.full
 def test_supported_plate():
     field = sc.FieldSystem.from_text(

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy import cos, exp, pi, sin
 from samples import QUICK_FLAGS
-from scipy.optimize import brentq
 
 import scvi_codegen as sc
 
@@ -140,22 +139,3 @@ def test_spectrum_and_derivative_of_a_line_with_ends():
     assert mesh.unresolved(sin(61.5 * pi * x)) > 0.5
     assert mesh.derivative(x * exp(x), "x") == pytest.approx((1 + x) * exp(x), abs=1e-9)
     assert mesh.integral(x * exp(x)) == pytest.approx(1, abs=1e-10)
-
-
-@pytest.mark.rotated
-def test_points_and_hamiltonian_densities_have_ends():
-    """A mass at the end, m w = cot w; a particle in a box, w = pi^2/2 k^2."""
-    w = brentq(lambda w: 0.7 * w * sin(w) - cos(w), 0.1, 1.5)
-    mesh = line((0, "natural"), point_lagrangians=[{"x": 1, "lagrangian": "0.7*u_t**2/2"}]).discretise(
-        "finite-differences", order=8, points=33
-    )
-    u = sin(w * mesh.points["x"])
-    run = sc.compile_stepper(mesh.system, "svi:4", flags=QUICK_FLAGS).integrate({"u": u}, h=0.01, steps=50)
-    assert np.abs(run.q["u"][-1] - u * cos(w / 2)).max() < 2e-7
-    box = sc.FieldSystem.from_text(
-        "box", ["a"], {"x": (0, 1)}, momenta=["b"], hamiltonian="(a_x**2 + b_x**2)/4", boundary={"x": (0, 0)}
-    )
-    mesh = box.discretise("finite-differences", order=6, points=41)
-    a = sin(pi * mesh.points["x"])
-    run = sc.compile_stepper(mesh.system, "svi:2", flags=QUICK_FLAGS).integrate({"a": a}, h=5e-4, steps=200)
-    assert np.abs(run.q["a"][-1] - a * cos(pi**2 / 2 * 0.1)).max() < 2e-5

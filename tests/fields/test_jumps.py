@@ -59,31 +59,6 @@ def test_errors_fall_exponentially_where_a_coefficient_jumps_between_elements(de
         assert np.abs(found / exact - 1).max() < error
 
 
-@pytest.mark.rotated
-def test_errors_fall_exponentially_where_the_stiffness_of_a_beam_jumps():
-    """A beam on two supports, of which one half is four times as stiff: roots of its determinant."""
-
-    def determinant(w):
-        a, b = np.sqrt(w), np.sqrt(w / 2)  # k^4 = w^2/EI
-        s, c, S, C = np.sin(a / 2), np.cos(a / 2), np.sinh(a / 2), np.cosh(a / 2)
-        t, d, T, D = np.sin(b / 2), np.cos(b / 2), np.sinh(b / 2), np.cosh(b / 2)
-        rows = [
-            [s, S, -t, -T],
-            [a * c, a * C, b * d, b * D],
-            [-a * a * s, a * a * S, 4 * b * b * t, -4 * b * b * T],
-            [-(a**3) * c, a**3 * C, -4 * b**3 * d, 4 * b**3 * D],
-        ]
-        return np.linalg.det(np.array(rows)) / (S * T)
-
-    grid = np.linspace(8.0, 20.0, 40)
-    signs = np.sign([determinant(w) for w in grid])
-    k = int(np.flatnonzero(np.diff(signs))[0])
-    exact = brentq(determinant, grid[k], grid[k + 1], xtol=1e-13)
-    for degree, error in ((4, 1e-3), (6, 1e-6), (10, 1e-9)):
-        found = lowest_frequencies(mesh_of("u_t**2/2 - (1 + 3*unit_step(x - a))*u_xx**2/2", degree, [0, 0.5, 1]), 1)
-        assert abs(found[0] / exact - 1) < error
-
-
 def test_the_value_at_a_common_end_is_that_of_each_element():
     """Masses and damping at the points, of which one is at the jump, by the quadrature of both elements."""
     mesh = mesh_of(MASS[0], 4, [0, 0.5, 1], dissipation="unit_step(x - a)*u_t**2/2")

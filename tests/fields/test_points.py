@@ -57,34 +57,6 @@ def test_oscillator_on_a_spring_at_a_place_inside():
     assert max(change(mesh, {"u": u, "X": np.array(k / (k - mass * w * w))}, to=cos(w))) < 2e-12
 
 
-@pytest.mark.rotated
-@pytest.mark.parametrize(
-    ("method", "options", "bound"),
-    [
-        ("spectral-elements", {"degree": 10, "elements": 4}, 4e-15),
-        ("finite-differences", {"order": 4, "points": 64}, 8e-3),
-        ("fourier", {"points": 64}, 7e-3),
-    ],
-)
-def test_spring_between_equidistant_points_is_of_first_order_and_on_elements_exact(method, options, bound):
-    """2 w tan(w pi) = k on a ring; the derivative jumps at the spring."""
-    k, a = 1.5, 1.0 + pi / 64
-    w = brentq(lambda w: 2 * w * tan(w * pi) - k, 1e-3, 0.49)
-    system = sc.FieldSystem.from_text(
-        "ring",
-        ["u"],
-        {"x": (0, "2*pi")},
-        WAVES,
-        boundary={"x": "periodic"},
-        parameters={"k": k},
-        point_lagrangians=[{"x": a, "lagrangian": "-k*u**2/2"}],
-    )
-    mesh = system.discretise(method, **options)
-    u = cos(w * (pi - np.abs((mesh.points["x"] - a + pi) % (2 * pi) - pi)))
-    (error,) = change(mesh, {"u": u}, to=cos(w))
-    assert bound / 20 * (method != "spectral-elements") < error < bound
-
-
 @pytest.mark.parametrize(
     ("method", "options", "degree"),
     [
@@ -118,27 +90,6 @@ def test_highest_frequency_contains_points():
     weight = mesh.weights[np.isclose(mesh.points["x"], 0.5)].item()
     assert mesh.highest_frequency() == pytest.approx(np.sqrt(1e8 * (1 / weight + 1 / 0.3)), rel=1e-5)
     assert mesh.highest_frequency(k=0.0) < 60
-
-
-@pytest.mark.rotated
-def test_plane_with_a_mass_conserves_energy_and_is_derived():
-    plane = sc.FieldSystem.from_text(
-        "membrane",
-        ["u"],
-        {"x": (0, 1), "y": (0, 1)},
-        "u_t**2/2 - u_x**2/2 - u_y**2/2",
-        boundary={"x": (0, 0)},
-        point_lagrangians=[{"x": 0.5, "y": 0.25, "lagrangian": "3*u_t**2/2 - 10*u**4/4"}],
-    )
-    assert "at x = 0.5, y = 0.25: -5*u**4/2 + 3*u_t**2/2" in plane.derive().to_text()
-    mesh = plane.discretise("spectral-elements", degree=4, elements=2)
-    x, y = mesh.points["x"], mesh.points["y"]
-    rows, columns = np.nonzero(np.isclose(x, 0.5) & np.isclose(y, 0.25))
-    assert f"u_dot[{rows[0]}, {columns[0]}]" in mesh.derive().semidiscrete["semi-discrete Lagrangian"]
-    change(mesh, {"u": sin(pi * x) * cos(pi * y)}, to=1, steps=20)
-    mesh = string([{"x": 0.5, "lagrangian": "X_t**2/2 - (u - X)**2/2"}], scalars=["X"]).discretise("legendre", degree=2)
-    assert mesh.derive().semidiscrete["semi-discrete energy"].endswith("(-(-X + u[0])**2/2)")
-    assert "+ (X_dot**2/2)\n- (" in mesh.derive().semidiscrete["semi-discrete energy"]
 
 
 def test_equal_elements_are_divided_at_places():

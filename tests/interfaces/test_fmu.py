@@ -84,18 +84,6 @@ def test_states_equal_those_of_the_stepper_bitwise(name, tmp_path):
     assert_allclose(np.array(found), expected, rtol=0, atol=0)
 
 
-@pytest.mark.rotated
-def test_a_slave_locates_kinks_as_runs_do(tmp_path):
-    system = lagrange("floor", "y", "y_dot**2/2 - 9.8*y - 1e4*positive_part(-y)**2")
-    model = sc.Model(system=system, method=sc.SVI(4), q=(1.0,), velocity=(0.0,), h=H, steps=30)
-    one, run = Slave(Fmu(sc.generate_fmu(model, tmp_path / "one.fmu"), tmp_path / "unpacked")), model.integrate()
-    assert one.start(0.0) == OK
-    for k in range(30):
-        assert one.step(k * H, H) == OK, one.log
-    assert len(run.modes.t) > 0
-    assert_allclose(one.get("y", "p_y"), [run.q[-1, 0], run.p[-1, 0]], rtol=0, atol=1e-13)
-
-
 def check_event_mode(fmu, model, run):
     """Steps end at changes of the state, which appear when the discrete states are updated in event mode."""
     assert fmu.description.find("CoSimulation").get("hasEventMode") == "true"
@@ -180,21 +168,6 @@ def test_inputs_are_zero_order_hold_and_parameters_may_change(fmu):
     assert one.set(m=2.5) == OK
     assert one.get("energy") < before  # the same momentum of a larger mass
     assert one.get("q_dot") == [run.p[0] / (2.5 + w)]
-
-
-@pytest.mark.second
-def test_communication_steps_of_any_length_are_divided_equally(fmu):
-    one, stepper = Slave(fmu), stepper_of(pushed())
-    assert one.start(0.5) == OK
-    assert one.step(0.5, 0.25) == OK
-    p = stepper.momentum([0.3], [0.5], 0.5)
-    run = stepper.integrate([0.3], p, h=0.25 / 3, steps=3, t=0.5, parameters={"w_0": 0.0, "u_0": 0.0})
-    assert [*one.get("t"), *one.get("q")] == [run.t[-1], *run.q[-1]]
-    assert one.step(0.75, 0.25) == OK
-    run = stepper.integrate([0.3], p, h=0.25 / 3, steps=6, t=0.5, parameters={"w_0": 0.0, "u_0": 0.0})
-    assert [*one.get("t"), *one.get("q")] == [run.t[-1], *run.q[-1]]  # the steps before are continued
-    assert one.step(1.0, 1e-3) == OK
-    assert_allclose(one.get("t"), 1.001, rtol=1e-15)
 
 
 @pytest.mark.second

@@ -15,7 +15,6 @@ import scvi_codegen as sc
 from scvi_codegen.analysis import verification
 from scvi_codegen.interfaces.cli import command_group, main
 from scvi_codegen.interfaces.models.model_files.model_file import dump_model, parse_model
-from scvi_codegen.methods import specification_of
 
 pytestmark = pytest.mark.usefixtures("here")
 KEPLER = ("kepler", "--step", "0.1", "--steps", "50", "--method", "svi:4")
@@ -84,29 +83,6 @@ def test_errors_are_entries_of_the_document(words, status, error):
     assert found["exit_status"] == status
     assert found["message"] in result.stderr
     assert all(type(found[name]) is type(value) for name, value in error.items())
-
-
-@pytest.mark.rotated
-def test_json_of_lists_and_model_files():
-    listed = json_of("systems")["systems"]
-    assert [entry["name"] for entry in listed] == list(sc.PROBLEMS)
-    assert listed[0]["parameters"]["m"] == 1.0
-    sections = json_of("systems", "kepler")
-    again = parse_model(invoke("systems", "kepler").stdout)
-    assert sections["initial"]["q"] == list(again.q)
-    by_name = {" ".join([entry["example"], *entry["options"]]): entry for entry in json_of("methods")["methods"]}
-    for example, entry in by_name.items():
-        specification_of(entry["example"])  # as --method reads it
-        if not entry["options"]:
-            method = sc.methods.as_method(example)
-            assert example.startswith(entry["name"])
-            assert all(entry[name] == getattr(method, name) for name in ("order", "symplectic", "symmetric"))
-        if " " in example:
-            assert json_of("derive", "kepler", "--method", *example.split())["equations"]
-    assert by_name["svi:4"]["order"] == 8
-    tableau = json_of("methods", "--tableau", "gauss:2")
-    assert tableau["b"] == [0.5, 0.5]
-    assert np.sum(tableau["A"], axis=1) == pytest.approx(tableau["c"], abs=1e-16)
 
 
 @pytest.mark.second

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from commands import error_of, output_of
 
@@ -55,24 +54,6 @@ def test_step_size_of_another_time_is_not_reused(model: sc.Model) -> None:
     )
     with pytest.raises(ModelFileError, match="cannot be represented"):
         dump_model(sc.Model(system=changed, method=sc.SVI(4), q=(1.0, 0.0), p=(0.0, 1.0), h=0.1, steps=3))
-
-
-@pytest.mark.tiers(3, 4)
-@pytest.mark.parametrize("run", [{"tolerance": 1e-8}, {"tolerance": 1e-8, "span": -5.0}, {"step": 0.1}])
-@pytest.mark.parametrize("system", [{}, {"time_transformation": "frequency"}], ids=["t", "tau"])
-def test_single_step_functions_use_the_first_step_of_the_run(run: dict[str, float], system: dict[str, str]) -> None:
-    """Single steps, as certificates take them, are steps of tau in transformed time."""
-    model = catalogue_model("kepler", {"run": run, "system": system})
-    stepper = model.stepper()
-    h = model.first_step_size(stepper)
-    started = model.start(stepper)
-    started.advance(1)
-    if system:
-        level = {"E": stepper.energy(model.q, model.momenta(stepper))}
-        assert np.array_equal(stepper.step(model.q, model.momenta(stepper), h, parameters=level)[0], started.q)
-    else:
-        assert h == started.t
-    assert (h < 0.0) == (run.get("span", 1.0) < 0.0)
 
 
 def test_folders_contain_a_number_of_steps(tmp_path: Path) -> None:

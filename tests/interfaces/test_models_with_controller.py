@@ -1,16 +1,13 @@
 """Models whose steps the reversible controller chooses: files, the command line, ``solve_ivp`` and inputs."""
 
-import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 from commands import error_of
 
 import scvi_codegen as sc
-from scvi_codegen import ModelFileError, StateError, SystemDefinitionError, generate_package
+from scvi_codegen import ModelFileError, generate_package
 from scvi_codegen.interfaces.models.model_files.model_file import catalogue_model, dump_model, parse_model
 
 pytestmark = pytest.mark.second
@@ -46,10 +43,6 @@ def shaken(tmp_path: Path) -> Path:
     return path
 
 
-def plain(model: sc.Model) -> sc.Stepper:
-    return sc.compile_stepper(model.system, model.method)
-
-
 @pytest.mark.rotated
 def test_controller_of_a_time_transformation_can_be_replaced() -> None:
     both = {
@@ -73,28 +66,6 @@ FAR = (
 @pytest.mark.parametrize("controller", ["symplectic", "reversible"])
 def test_unsuitable_time_transformation_is_reported(controller: str) -> None:
     assert "use another time transformation" in error_of(f"{FAR} {controller}", status=1)
-
-
-@pytest.mark.rotated
-def test_integrate_uses_the_controller(shaken: Path) -> None:
-    model = sc.load_model(shaken)
-    state: Any = [*model.q, *(model.p or ())]
-    exact = plain(model).integrate(model.q, model.p, t_end=12.0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # of pilot runs, too
-        found = sc.solve_ivp(
-            model.system, (0.0, 12.0), state, time_transformation=model.time_transformation, controller="reversible"
-        )
-    assert found.success
-    assert np.abs(found.y[:2, -1] - exact.q[-1]).max() < 1e-11
-    compiled = sc.solve_ivp(model.stepper(), (0.0, -3.0), state, h=0.1, t_eval=[0.0, -1.5, -3.0])
-    earlier = plain(model).integrate(model.q, model.p, t_eval=[-1.5, -3.0], t_end=-3.0)
-    assert np.abs(compiled.y[:2, 1:].T - earlier.q).max() < 1e-9
-    for wrong in ({"controller": "reversible"}, {"time_transformation": "frequency", "controller": "pi"}):
-        with pytest.raises(SystemDefinitionError, match="controller"):
-            sc.solve_ivp(model.system, (0.0, 1.0), state, **wrong)
-    with pytest.raises(StateError, match="need a system, not a compiled stepper"):
-        sc.solve_ivp(model.stepper(), (0.0, 1.0), state, h=0.1, controller="reversible")
 
 
 @pytest.mark.quick

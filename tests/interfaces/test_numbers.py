@@ -342,30 +342,6 @@ def test_every_field_and_line_of_an_ensemble_is_correct(springs):
     assert len(lines) == 7
 
 
-@pytest.mark.second
-def test_every_field_and_line_of_a_recorded_run_is_correct(springs):
-    words = ("run", "model.toml", *flags(springs.run))
-    numbers, memory = json_of(*words, "-o", "long.run"), json_of(*words)
-    checks = {
-        "system": "springs",
-        "method": sc.SVI(2).name,
-        "folder": "long.run",
-        "steps": 90,
-        "states": 31,
-        "final": memory["final"],
-        "finished": True,
-        "failure": None,
-        "missed": None,
-        "written": ["long.run"],
-    }
-    assert_fields(numbers, checks)
-    text = output_of(*words, "-o", "again.run").splitlines()
-    assert text[1] == f"90 steps (all) of 0.125 from t = {T:g} to t = {T + 11.25:g}; 31 states saved in 'again.run'"
-    assert text[3:5] == output_of(*words).splitlines()[4:6]
-    finals = [float(x) for line in text for x in re.findall(r"= +(-?[\d.]{9,})", line)]
-    assert finals == [memory["final"][letter][name] for name in ("x", "y") for letter in "qp"]
-
-
 RING = """
 [system]
 name = "ring"

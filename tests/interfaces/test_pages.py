@@ -176,13 +176,6 @@ def test_a_page_has_no_address_no_text_as_code_and_the_licences(tmp_path):
     assert (tmp_path / "page.html").read_text(encoding="utf-8").rstrip("\n") == text.rstrip("\n")
 
 
-@pytest.mark.rotated
-@pytest.mark.usefixtures("without_compiler")
-def test_momenta_become_velocities(tmp_path):
-    text = OSCILLATOR.replace("q_dot = [0.0, 0.5]", "p = [0.0, 1.0]").replace("m = 1.0", "m = 2.0")
-    assert described(sc.page(written(tmp_path, text)).html)["v"] == [0.0, 0.5]
-
-
 @pytest.mark.parametrize(
     ("old", "new", "ranges", "message"),
     [
@@ -264,32 +257,6 @@ def test_the_section_page_sets_sliders_speed_and_plots_and_arguments_replace_it(
 def test_mistakes_in_the_section_page_are_errors(tmp_path, old, new, message):
     with pytest.raises(sc.ModelFileError, match=message):
         sc.load_model(written(tmp_path, OSCILLATOR + PAGE.replace(old, new, 1)))
-
-
-@pytest.mark.rotated
-@pytest.mark.rotated
-@pytest.mark.usefixtures("without_compiler")
-def test_a_family_has_its_orbits_bifurcations_and_range_and_belongs_to_its_system():
-    formula, period = "x_dot**2/2 - x**2/2 - x**4/20 + F*x*cos(1.15*t)", 2 * np.pi / 1.15
-    system = lagrange("driven oscillator", "x", formula, F=0.1, dissipation="x_dot**2/40")
-    stepper = sc.compile_stepper(system, "svi:4")
-    start = sc.periodic_orbit(stepper, [0.7109], [1.5385], period=period, fixed_period=True)
-    family = sc.family(stepper, start, parameter="F", fixed_period=True, step=0.5, count=4, backward=True)
-    about = described(sc.page(system, family=family).html)
-    shown, (fold,) = about["family"], family.bifurcations
-    assert (shown["value"], shown["sizes"]) == ("F", "|multiplier|")
-    assert [orbit["bifurcation"] for orbit in shown["orbits"]] == ["fold" * (k == fold.after + 1) for k in range(5)]
-    values = [orbit["value"] for orbit in shown["orbits"]]
-    assert values == [*family.values[: fold.after + 1], family.value_of(fold.orbit), *family.values[fold.after + 1 :]]
-    assert [about["q"], about["v"]] == [family[0].q.tolist(), family[0].p.tolist()]
-    (slider,) = about["parameters"]
-    assert [slider["low"], slider["high"]] == [min(family.values), max(family.values)]
-    other = lagrange("pendulum", "x", "x_dot**2/2 + cos(x)")
-    with pytest.raises(sc.StateError, match="is one of 'driven oscillator', not of 'pendulum'"):
-        sc.page(other, family=family)
-    rows = sc.LagrangianSystem.from_text("rows", ["q[n]"], "sum(i in n, q_dot[i]**2 - q[i]**2)/2")
-    with pytest.raises(sc.StateError, match="'rows' has arrays of run-time sizes: give unroll_sums"):
-        sc.page(rows, family=family)
 
 
 @pytest.mark.usefixtures("without_compiler")

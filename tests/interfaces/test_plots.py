@@ -108,16 +108,6 @@ def test_section_contains_the_states_at_the_crossings(orbits, tmp_path):
     assert one.read_bytes() == two.read_bytes()
 
 
-@pytest.mark.second
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [({"axes": ("y", "z")}, "'z' is neither"), ({"axes": ("y", "p_y"), "event": 2}, "no event 2")],
-)
-def test_section_reports_missing_arguments(orbits, arguments, words, tmp_path):
-    with pytest.raises(sc.StateError, match=words):
-        sc.plot_section(orbits[0], tmp_path / "section.png", **arguments)
-
-
 @pytest.fixture(scope="module")
 def ellipse() -> sc.Trajectory:
     stepper = sc.compile_stepper(sc.problem("kepler").system, sc.SVI(4), flags=("-O0",))
@@ -142,15 +132,6 @@ class TestAdaptiveSteps:
         (image,) = sc.plot_motion(run).collections
         edges = np.asarray(image.get_coordinates())[0, :, 0]
         assert edges[1:-1] == pytest.approx((run.t[1:] + run.t[:-1]) / 2)
-
-    def test_values_of_a_name_are_one_array(self, ellipse):
-        assert (ellipse["q2"] == ellipse.q[:, 1]).all()
-        assert (ellipse["p_q2"] == ellipse.p[:, 1]).all()
-        assert (ellipse["q2_dot"] == ellipse.velocity[:, 1]).all()
-        assert (ellipse["t"] == ellipse.t).all()
-        assert (ellipse["energy"] == ellipse.energy()).all()
-        with pytest.raises(sc.StateError, match=r"there is no quantity 'q3'.*Known: q1, q2, p_q1"):
-            ellipse["q3"]
 
     @pytest.mark.rotated
     def test_ensembles_are_drawn_together(self, ellipse, tmp_path):

@@ -57,26 +57,6 @@ def test_equations_of_motion_of_the_catalogue(name: str) -> None:
     assert accelerations(system, values) == pytest.approx(expected, rel=1e-12, abs=1e-14)
 
 
-def test_double_pendulum_in_the_textbook_form() -> None:
-    system = problem("double-pendulum").system
-    values = random_point(system)
-    a, b, da, db, m1, m2, l1, l2, g = (values[Symbol(name, real=True)] for name in (
-        "theta1", "theta2", "theta1_dot", "theta2_dot", "m1", "m2", "l1", "l2", "g"
-    ))  # fmt: skip
-    difference = a - b
-    bottom = 2 * m1 + m2 - m2 * np.cos(2 * difference)
-    first = (
-        -g * (2 * m1 + m2) * np.sin(a)
-        - m2 * g * np.sin(a - 2 * b)
-        - 2 * np.sin(difference) * m2 * (db**2 * l2 + da**2 * l1 * np.cos(difference))
-    ) / (l1 * bottom)
-    second = (
-        2 * np.sin(difference)
-        * (da**2 * l1 * (m1 + m2) + g * (m1 + m2) * np.cos(a) + db**2 * l2 * m2 * np.cos(difference))
-    ) / (l2 * bottom)  # fmt: skip
-    assert accelerations(system, values) == pytest.approx([first, second], rel=1e-12)
-
-
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_every_entry_has_a_finite_state_and_a_text_round_trip(name: str) -> None:
     entry = problem(name)
