@@ -10,7 +10,6 @@ from benchmarks.cases import references
 from benchmarks.cases.adaptive import ADAPTIVE_CASES, adaptive_case
 from benchmarks.cases.references import reference
 from benchmarks.contenders.ours import adaptive_contenders
-from scvi_codegen.common.errors import StateError
 
 needs_extended = pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="long double is no wider than double")
 
@@ -32,22 +31,6 @@ def test_steps_of_a_reference_are_the_shortest_of_its_runs():
     assert np.array_equal(steps, [0.75, 1.0, 0.5, 1.75])
     third = references._shortest([np.linspace(0.0, 4.0, 4), np.linspace(0.0, 4.0, 3)])
     assert third.sum() == 4.0
-
-
-def test_reference_uses_smaller_steps_where_large_ones_fail(monkeypatch):
-    asked = []
-
-    def states_after(field, start, steps):
-        asked.append(float(steps[0]))
-        if steps[0] > 0.3:
-            raise StateError("no")
-        return start
-
-    monkeypatch.setattr(references, "states_after", states_after)
-    references._with_two_steps(lambda x: x, np.zeros((1, 2)), np.ones(3, dtype=np.longdouble))
-    assert asked == [1.0, 0.5, 0.25, 0.125]
-    with pytest.raises(StateError):
-        references._with_two_steps(lambda x: x, np.zeros((1, 2)), np.full(3, 9.0))
 
 
 @pytest.mark.rotated

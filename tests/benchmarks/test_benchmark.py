@@ -16,16 +16,16 @@ from mpmath import mp
 
 import benchmarks as bench
 from benchmarks import __main__ as command
-from benchmarks import comparison, digits, report
+from benchmarks import digits, report
 from benchmarks.cases import unforced
 from benchmarks.cases.adaptive import adaptive_case
 from benchmarks.cases.forced import driven_pendulum
-from benchmarks.cases.references import Reference, equal_steps, gauss_tables, reference, rms_error, states_after
+from benchmarks.cases.references import equal_steps, gauss_tables, reference, rms_error, states_after
 from benchmarks.cases.rods import rods
 from benchmarks.cases.suites import SUITE_CASES, SUITE_ENDS, suite_case
 from benchmarks.contenders import peers
 from benchmarks.contenders.tracing import rates_text
-from benchmarks.report import FLOOR, Contender, Point, ResultTable, common_error, time_at
+from benchmarks.report import FLOOR, Point, ResultTable, common_error, time_at
 from scvi_codegen import SVI, StateError, compile_stepper
 
 ROOT = Path(bench.__file__).parents[1]
@@ -109,17 +109,6 @@ class TestDigits:
         assert row["our_ms"] == pytest.approx(1e3 * 2**0.6)
         assert 300 < row["peer_ms"] / 1e3 < 400
         assert [*digits.compared(ours, [], ())] == [{"our_smallest": 1e-30, "smallest": None}]
-
-    @pytest.mark.second
-    def test_section_compares_with_a_reference_of_200_bits(self, monkeypatch):
-        pytest.importorskip("heyoka")
-        monkeypatch.setattr(digits, "SPANS", {"planar-pendulum": (256.0, 1024)})
-        monkeypatch.setattr(digits, "METHODS", ("svi:12",))
-        monkeypatch.setattr(digits, "KINDS", {"heyoka long double": ("longdouble", (0.0,), ())})
-        (row,) = digits.run_digits(bench.Plan(quick=True, peers=("heyoka",)), lambda text: None).rows
-        assert row["reference"] < 1e-40
-        assert row["our_smallest"] < 1e-27
-        assert 1e-21 < row["smallest"] < 1e-16
 
 
 def kepler_position(q, v, t):
@@ -235,32 +224,6 @@ class TestReport:
         assert line.endswith("not reached: broken, CyRK DOP853")
 
 
-class TestMeasuring:
-    def test_rounds_alternate_and_failures_are_recorded(self):
-        order = []
-
-        def contender(name):
-            def prepare(index):
-                def integrate():
-                    order.append(name)
-                    if name == "bad":
-                        raise ArithmeticError("no")
-                    return np.array([float(index)])
-
-                return integrate
-
-            return Contender(method=name, setting="", options="", compile_seconds=0.0, prepare=prepare)
-
-        high = np.arange(8.0)[:, None]
-        exact = Reference(positions=high, accuracy=0.0)
-        good, bad, last = comparison.measure(
-            [contender("one"), contender("bad"), contender("two")], lambda _: exact, repeats=2
-        )
-        assert order == [*["one"] * 8, "bad", *["two"] * 8, *(["one"] * 8 + ["two"] * 8) * 2]
-        assert (good.error, good.repeats, last.repeats) == (0.0, 2, 2)
-        assert bad.failure == "ArithmeticError: no"
-
-
 @needs_extended
 class TestCommand:
     @pytest.mark.rotated
@@ -285,12 +248,6 @@ class TestCommand:
         assert head == ["prob", "name", "setting", "error", "time", "numruns", "compile_time"]
         assert [row[0] for row in rows] == names[:1] * len(data["cases"][0]["measurements"])
         assert float(rows[-1][3]) == data["cases"][0]["measurements"][-1]["error"]
-
-    @pytest.mark.rotated
-    def test_families_have_orbits_a_second(self):
-        (table,) = bench.benchmark(["families"], bench.Plan(peers=(), quick=True)).data()["tables"]
-        assert [row["orbits"] for row in table["rows"]] == [4, 4]
-        assert all(row["error"] < 1e-9 < row["orbits_a_second"] for row in table["rows"])
 
     def test_interrupt_saves_completed_measurements(self, tmp_path, monkeypatch):
         def interrupt(plan, report_activity):

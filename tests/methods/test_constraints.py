@@ -400,26 +400,6 @@ def test_constraints_from_sympy_and_lagranges_method():
     assert one.constraints == rod().with_parameters(m=2.0).constraints
 
 
-@pytest.mark.rotated
-def test_time_transformation_preserves_constraints_and_orders():
-    """A bead on a circle past a centre; multipliers are forces in the time as it is."""
-    bead = lagrange(
-        "bead", "x y", "(x_dot**2 + y_dot**2)/2 - y + 3/sqrt((x - 13/10)**2 + y**2)", constraints=["x**2 + y**2 = 1"]
-    )
-    start = [-(0.5**0.5), -(0.5**0.5)], [0.5, -0.5]
-    plain = sc.compile_stepper(bead, lobatto(6)).integrate(*start, h=0.01, steps=200)
-    slowed = sc.reparametrise(bead, "(x - 13/10)**2 + y**2")
-    for s in (1, 2, 3):
-        stepper, errors = sc.compile_stepper(slowed, lobatto(s)), []
-        for h in (0.05, 0.025):
-            run = stepper.integrate(*start, h=h, t_end=2.0)
-            assert run.t[-1] == 2.0
-            assert np.abs(run.constraint_values()).max() < 1e-13
-            errors.append(np.abs([*(run.q[-1] - plain.q[-1]), *(run.p[-1] - plain.p[-1])]).max())
-        assert np.log2(errors[0] / errors[1]) > 2 * s - 0.4
-    assert_allclose(run.multipliers()[-1], plain.multipliers()[-1], rtol=1e-5)
-
-
 def test_constraints_of_a_hamiltonian_equal_those_of_its_lagrangian():
     """Also in model files: the same momenta, the same motion."""
     text = {"name": "rod", "coordinates": ["x", "y"], "parameters": {"m": 2.0, "g": G, "l": 1.5}}

@@ -9,9 +9,7 @@ from samples import driven_duffing, linkage, pumped_cart_pole, pushed_pendulum
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.precision import mp
 from scvi_codegen.interfaces.models.problems import problem
-from scvi_codegen.methods import SCVI, SVI
 from scvi_codegen.methods.exact.discrete_lagrangian import exact_discrete_lagrangian, exact_map
-from scvi_codegen.runs.compiler import compile_stepper
 from scvi_codegen.systems.formulas.expressions import evaluate
 
 OSCILLATOR = problem("harmonic-oscillator").system
@@ -195,23 +193,3 @@ def test_initial_guess_selects_one_of_several_solutions():
 def test_errors_state_the_remedy(call, words):
     with pytest.raises(StateError, match=words):
         call()
-
-
-@pytest.mark.rotated
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize(
-    ("method", "order"),
-    [(SVI(2), 4), (SCVI(2), 4), (SCVI(3, "gauss-legendre:1"), 2), (SCVI(3), 6)],
-    ids=lambda value: getattr(value, "name", ""),
-)
-def test_order_of_discrete_lagrangians_legendre_transforms_and_maps(method, order):
-    """Theorem 4.1 of the paper: order min(2s, q); the Legendre transforms lose one order, the map does not."""
-    stepper, (q, p), errors = compile_stepper(KEPLER, method), ((-0.6, 0.5), (-0.7, -0.9)), []
-    for h in (0.1, 0.05):
-        exact = exact_map(KEPLER, q, p, h, digits=18)
-        q0, p0, q1, p1 = (np.array(x, dtype=float) for x in (exact.q0, exact.p0, exact.q1, exact.p1))
-        minus, plus = stepper.discrete_legendre_minus(q0, q1, h)[1], stepper.discrete_legendre_plus(q0, q1, h)[1]
-        transforms, of_map = np.subtract((minus, plus), (p0, p1)), np.subtract(stepper.step(q0, p0, h), (q1, p1))
-        action = stepper.discrete_lagrangian(q0, q1, h) - float(exact.action)
-        errors.append([abs(action), abs(transforms).max(), abs(of_map).max()])
-    assert np.log2(errors[0]) - np.log2(errors[1]) - 1 == pytest.approx([order, order - 1, order], abs=0.3)

@@ -41,32 +41,6 @@ def test_free_dumbbell_has_uniform_translation_and_rotation():
 
 
 @pytest.mark.rotated
-@pytest.mark.parametrize("bend", [np.pi / 2, 0.7, 2.5])
-def test_angle_between_two_rods_equals_a_rigid_hook(bend):
-    hook = JOINTS.bent_pendulum()
-    a, b = 0.6, 0.4
-    places = [np.sin(np.pi - bend), -np.cos(np.pi - bend)]
-    q = [0.0, -a, b * places[0], b * places[1] - a]
-    system = hook.system.with_parameters(bend=bend)
-    run = ran(JOINTS.Mechanism(system, q, [2.0 * a, 0.0, -2.0 * q[3], 2.0 * q[2]]))
-    far = a**2 + b**2 - 2 * a * b * np.cos(bend)
-    f = reduced(
-        "(a**2 + far)*u0_dot**2/2 + g*(2*a*cos(u0) - b*cos(u0 - bend))",
-        [0.0],
-        [2.0],
-        run.t,
-        a=a,
-        b=b,
-        far=far,
-        bend=bend,
-    )[:, 0]
-    outer = f + np.pi - bend
-    middle = a * np.column_stack([np.sin(f), -np.cos(f)])
-    assert_allclose(run.q[:, :2], middle, rtol=0, atol=1e-9)
-    assert_allclose(run.q[:, 2:], middle + b * np.column_stack([np.sin(outer), -np.cos(outer)]), rtol=0, atol=1e-9)
-
-
-@pytest.mark.rotated
 def test_a_point_slides_on_its_line():
     run = ran(JOINTS.pendulum_on_a_slide())
     s, f = reduced(

@@ -137,24 +137,6 @@ def test_symplecticity_momentum_and_reversibility(method: SVI, solver: str) -> N
     assert (np.abs(back - z).max() < 1e-14) == method.symmetric
 
 
-@pytest.mark.rotated
-@pytest.mark.parametrize("method", [SVI(3, "hermite:3"), SVI(4, "hermite-2:3")], ids=lambda method: method.name)
-def test_discrete_lagrangian_includes_derivatives(method: SVI) -> None:
-    """L_d generates the step, p0 = -D1 L_d and p1 = D2 L_d by differences, and approximates the action."""
-    system, h = problem("planar-pendulum").system, 0.4
-    own = stepper(system, method)
-    q1, p1 = own.step([0.7], [0.4], h)
-
-    def action(a: float, b: float) -> float:
-        return own.discrete_lagrangian([a], [b], h)
-
-    d = 1e-4
-    assert abs((action(0.7 + d, q1[0]) - action(0.7 - d, q1[0])) / (2 * d) + 0.4) < 1e-7
-    assert abs((action(0.7, q1[0] + d) - action(0.7, q1[0] - d)) / (2 * d) - p1[0]) < 1e-7
-    fine = stepper(system, SVI(10)).discrete_lagrangian([0.7], q1, h)
-    assert abs(action(0.7, q1[0]) - fine) < 1e-8
-
-
 # Hermite quadrature.
 
 

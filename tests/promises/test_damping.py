@@ -13,7 +13,6 @@ from notation import lagrange
 from samples import QUICK_FLAGS, damped_pair
 
 import scvi_codegen as sc
-from scvi_codegen.interfaces.models.model_files.model_file import parse_model
 
 GAMMA = 0.4 * 0.9
 """Rate of :func:`damped_pair`."""
@@ -49,28 +48,6 @@ def test_a_step_is_that_of_the_scaled_lagrangian(method, solver):
         assert np.abs(p - grown_p / np.exp(GAMMA * (t + h))).max() < 4e-15
 
 
-@pytest.mark.tiers(1, 2)
-@pytest.mark.parametrize(
-    "method", [sc.SVI(1), sc.SVI(3), sc.Gauss(2), sc.StoermerVerlet()], ids=lambda method: method.name
-)
-def test_linear_steps_contract_area_exactly(method):
-    system = lagrange("damped oscillator", "q", "q_dot**2/2 - k*q**2/2", c=0.3, k=2.0, damping="c")
-    stepper = sc.compile_stepper(system, method)
-    for t in (0.0, 1e6):
-        columns = [np.concatenate(stepper.step([q], [p], 0.2, t)) for q, p in ((1.0, 0.0), (0.0, 1.0))]
-        assert np.linalg.det(columns) == pytest.approx(np.exp(-0.3 * 0.2), rel=5e-16)
-
-
-@pytest.mark.rotated
-def test_certificate_reports_damping():
-    certificate = sc.verify(damped_pair(), sc.SVI(2), [0.3, -0.4], [0.5, 0.7], h=0.1)
-    assert certificate.passed, certificate.to_text()
-    assert not certificate.not_measured
-    names = {check.name for check in certificate.checks}
-    assert "conformal symplecticity" in names
-    assert "symplecticity" not in names
-
-
 @pytest.mark.parametrize(
     "given", [0.25, "0.25", np.float64(0.25), Fraction(1, 4), sympy.Rational(1, 4)], ids=lambda x: type(x).__name__
 )
@@ -89,20 +66,6 @@ def test_damping_rate_may_be_a_number(given):
     assert [system.damping for system in systems] == [sympy.Rational(1, 4)] * len(systems)
     with pytest.raises(sc.SystemDefinitionError, match=r"damping must be a formula as text, or a number, not \['c'\]"):
         sc.LagrangianSystem.from_text(name="a", coordinates=["x"], lagrangian="x_dot**2", damping=["c"])
-
-
-@pytest.mark.parametrize("written", ["0.25", '"0.25"', "'1/4'"])
-def test_damping_rate_may_be_a_number_in_a_model_file(written):
-    text = f"""
-        system = {{ name = "a", coordinates = ["x"], lagrangian = "x_dot**2/2", damping = {written} }}
-        initial = {{ q = [0.0], q_dot = [1.0] }}
-        run = {{ step = 0.1, steps = 10 }}
-        forces = {{ x = 0.5 }}
-    """
-    model = parse_model(text)
-    assert (model.system.damping, model.system.forces) == (sympy.Rational(1, 4), (sympy.Rational(1, 2),))
-    with pytest.raises(sc.ModelFileError, match="damping must be a formula between quotes or a number, not"):
-        parse_model(text.replace(f"damping = {written}", "damping = true"))
 
 
 def test_unsupported_functions_of_damping_are_rejected():

@@ -1,7 +1,5 @@
 """Runs of array systems: slices, events, inputs, and errors of adaptive steps."""
 
-import math
-
 import numpy as np
 import pytest
 from notation import lagrange
@@ -26,12 +24,6 @@ def ring():
 @pytest.fixture(scope="module")
 def steppers(ring):
     return sc.compile_stepper(ring, "svi:6"), written(ring)
-
-
-@pytest.fixture(scope="module")
-def driven():
-    text = "sum(i in N, q_dot[i]**2/2) - sum(i in 0..N-2, (q[i+1] - q[i])**2/2) - q[0]**2/2"
-    return lagrange("driven", "q[N]", text, inputs="F", forces={"q[i]": "-c*q_dot[i]", "q[N-1]": "F"}, c=0.1)
 
 
 @pytest.mark.rotated
@@ -70,32 +62,6 @@ class TestEvents:
         ):
             with pytest.raises(sc.EventError, match=message):
                 stepper.integrate(Q, h=0.1, steps=1, events=function)
-
-
-class TestInputs:
-    @pytest.mark.rotated
-    @pytest.mark.parametrize("method", ["svi:2", "svi:6"])
-    def test_equal_samples_do_not_reset_the_predictor(self, driven, method):
-        """Equal samples need no additional iteration; different ones need fewer than without a predictor."""
-        stepper = sc.compile_stepper(driven, method)
-        runs = [stepper.start(Q, velocity=V, h=0.05) for _ in range(4)]
-        for run in runs:
-            run.set_inputs(F=0.3)
-            run.advance(1)
-        free, same, others, none = runs
-        free.advance(100)
-        for _ in range(100):
-            same.set_inputs(F=0.3)
-            same.advance(1)
-            for run in (others, none):
-                run.set_inputs(F=math.cos(run.t))
-                if run is none:
-                    run._memory.guess = 0
-                run.advance(1)
-        assert same.iterations == free.iterations
-        assert np.abs(same.q["q"] - free.q["q"]).max() < 1e-15
-        assert others.iterations < none.iterations
-        assert np.abs(others.q["q"] - none.q["q"]).max() < 1e-13
 
 
 @pytest.mark.rotated

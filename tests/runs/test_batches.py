@@ -118,18 +118,6 @@ def test_python_costs_less_than_one_function_call_for_each_trajectory(
         one.integrate_ensemble(q, p, **arguments)
 
 
-@pytest.mark.parametrize("kind", ["p", "velocity"])
-@pytest.mark.parametrize("name", ["kepler", "rod"])
-def test_initial_states_cost_less_than_one_function_call_each(
-    name: str, kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(batches, "CHUNK_SECONDS", 1e3)
-    one, (q, p) = stepper(name), (np.repeat(x, 400, axis=0) for x in states(name))
-    one.integrate_ensemble(q, **{kind: p}, h=0.05, steps=2, threads=1)
-    with at_most(len(q)):
-        one.integrate_ensemble(q, **{kind: p}, h=0.05, steps=2, threads=1)
-
-
 def test_initial_states_of_two_kinds_equal_those_of_single_runs() -> None:
     """Of velocities with different masses, and projected where they are typed with few digits."""
     one, (q, v), m = stepper("rod"), states("rod"), np.linspace(0.5, 2.0, COUNT)

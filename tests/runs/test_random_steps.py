@@ -1,6 +1,5 @@
 """Random single steps: none that is accepted is wrong by more than 100 times its estimate; spurious solutions."""
 
-import dataclasses
 import warnings
 
 import numpy as np
@@ -167,29 +166,6 @@ def test_comparison_with_half_steps_does_not_change_a_run():
         last = run.record(518)
         assert np.array_equal(last.q[-1], whole.q[-1])
         assert whole.step_error < 1e-6
-
-
-@pytest.mark.covering
-@pytest.mark.parametrize("steps", [{"h": 0.1, "steps": 12}, {"t_end": 0.5, "tolerance": 1e-6}], ids=["h", "t_end"])
-@pytest.mark.parametrize("solver", ["fixed-point", "newton"])
-def test_comparison_with_half_steps_does_not_change_an_array_run(solver, steps):
-    """Every step is compared, for any number of threads, and the run is that of which few are."""
-    few = compiled("chain", "svi:4", solver)
-
-    def comparing(source):
-        headers = tuple((name, text.replace("COMPARED 512", "COMPARED 1")) for name, text in source.support)
-        assert headers != source.support
-        return dataclasses.replace(source, support=headers)
-
-    all_of_them = type(few)(comparing(few.source), few.interface, flags=few.flags)
-    start = np.random.default_rng(1).normal(size=1100)
-    wanted = few.integrate(start, **steps)
-    assert wanted.steps > 5
-    for threads in (1, 2):
-        found = all_of_them.integrate(start, threads=threads, **steps)
-        assert np.array_equal(found.q["x"], wanted.q["x"])
-        assert np.array_equal(found.p["x"], wanted.p["x"])
-        assert found.step_error >= wanted.step_error
 
 
 def test_spurious_solutions_are_recognised_in_every_unit_of_mass():

@@ -143,18 +143,6 @@ def test_steps_are_those_by_the_mass_matrix(tmp_path, always, method, solver, op
     np.testing.assert_allclose(ends[0], ends[1], rtol=3e-12, atol=3e-12)
 
 
-def test_derivatives_and_ensembles_of_the_recursion(tmp_path, always):
-    system = chain(tmp_path, 3)
-    q, v = np.array([0.5, -0.4, 0.1, 0.3]), np.array([0.1, 2.0, -1.0, 0.4])
-    stepper, plain = (sc.compile_stepper(each, "svi:2") for each in (system, replace(system, dual_energy=sympy.S.Zero)))
-    p = plain.momentum(q, v)
-    ours, theirs = (each.jacobian(q, p, 0.02) for each in (stepper, plain))
-    np.testing.assert_allclose(ours, theirs, rtol=1e-10, atol=1e-10)
-    starts = q + np.linspace(-0.1, 0.1, 5)[:, None]
-    crowds = [each.integrate_ensemble(starts, np.tile(p, (5, 1)), h=0.02, steps=20).q for each in (stepper, plain)]
-    np.testing.assert_allclose(crowds[0], crowds[1], rtol=1e-11, atol=1e-11)
-
-
 @pytest.mark.quick
 def test_turned_vectors_have_no_entries_of_rounding_errors():
     numbers = robots.chain(4).system.lagrangian.atoms(sympy.Rational)

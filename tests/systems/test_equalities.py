@@ -61,28 +61,6 @@ def test_massless_links_follow_the_crank_of_a_parallelogram(tmp_path):
 @pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize(
-    "equality",
-    [
-        '<weld body1="box" body2="rod" active="true"/>',
-        '<weld body1="rod" body2="box" relpose="0.1 0.2 -0.7 0.98383134 0.14869156 -0.01491892 0.09871239"/>',
-    ],
-)
-def test_welded_bodies_move_as_one(equality, tmp_path):
-    closed = model(tmp_path, rod() + box("<freejoint/>", "0.1 0.2 0.3"), equality)
-    assert len(closed.constraints) == 6
-    place = np.array([0.1, 0.2, 0.3])
-    speed = named(np.cross(OMEGA, place - [0, 0, 1]))
-    start = {"R_hang": np.eye(3), "R_box": TURNED} | named(place)
-    run = run_of(closed, start, {"omega_hang": OMEGA, "omega_box": TURNED.T @ OMEGA} | speed)
-    one = run_of(model(tmp_path, rod(box("", "0.1 0.2 -0.7"))), {"R_hang": np.eye(3)}, {"omega_hang": OMEGA})
-    atol = 1e-6 if "relpose" in equality else 1e-10  # the digits of relpose
-    np.testing.assert_allclose(run.rotation("R_hang")[-1], one.rotation()[-1], rtol=0, atol=atol)
-    np.testing.assert_allclose(run.rotation("R_box")[-1], one.rotation()[-1] @ TURNED, rtol=0, atol=atol)
-
-
-@pytest.mark.rotated
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize(
     "equality", ['<connect body1="box" body2="rod" anchor="0 0.2 0.1"/>', '<connect site1="end" site2="top"/>']
 )
 def test_a_connection_of_points_is_a_ball_joint(equality, tmp_path):

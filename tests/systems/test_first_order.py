@@ -254,44 +254,6 @@ def test_unsupported_uses_are_named() -> None:
 
 
 @pytest.mark.rotated
-def test_transformed_time() -> None:
-    particle = system("massless particle")
-    slow = sc.compile_stepper(sc.reparametrise(particle, "1 + x**2"), "svi:6").integrate([1.0, 0.2], h=0.05, t_end=2.0)
-    plain = sc.compile_stepper(particle, "svi:6").integrate([1.0, 0.2], h=0.05, steps=40)
-    assert slow.t[-1] == pytest.approx(2.0)
-    assert slow.variables[-1] == pytest.approx(plain.variables[-1], abs=1e-11)
-
-
-def differences(function, size: int, width: float = 1e-3) -> np.ndarray:
-    """Derivatives of a function by differences of fourth order, one column per argument."""
-    columns = []
-    for unit in width * np.eye(size):
-        near, far = (function(k * unit) - function(-k * unit) for k in (1, 2))
-        columns.append((8 * near - far) / (12 * width))
-    return np.array(columns).T
-
-
-@pytest.mark.rotated
-@pytest.mark.parametrize("method", ["svi:2", "stoermer-verlet", "radau-iia:2"])
-def test_derivatives_of_steps_against_differences(method: str) -> None:
-    """The one-form and H depend on parameters and time, so that every derivative of theta occurs."""
-    driven = lagrange("driven", "x y a b", COUPLED.replace("(b + b**3/5)", "(1 + t/3)*(b + c*b**3 + c*a*y)"), c=0.2)
-    stepper = sc.compile_stepper(driven, method)
-    z, h, t = np.concatenate(driven.halves(CASES["coupled"][3])), 0.1, 0.7
-
-    def end(state: np.ndarray, moment: float = t, step: float = h, c: float = 0.2) -> np.ndarray:
-        return np.concatenate(stepper.step(state[:2], state[2:], step, moment, [c]))
-
-    exact = stepper.sensitivity(z[:2], z[2:], h, t)
-    assert np.abs(exact.state - differences(lambda d: end(z + d), 4)).max() < 1e-11
-    assert np.abs(exact.parameters - differences(lambda d: end(z, c=0.2 + d[0]), 1)).max() < 1e-11
-    assert np.abs(exact.t - differences(lambda d: end(z, moment=t + d[0]), 1)[:, 0]).max() < 1e-11
-    assert np.abs(exact.h - differences(lambda d: end(z, step=h + d[0]), 1)[:, 0]).max() < 1e-11
-    seeds = np.array([1.0, -2.0, 0.5, 3.0])
-    assert np.abs(stepper.vjp(z[:2], z[2:], h, t, cotangents=seeds) - seeds @ exact.state).max() < 1e-13
-
-
-@pytest.mark.rotated
 def test_inputs(tmp_path) -> None:
     driven = lagrange("driven", "x y", "(x + x**3)*y_dot - x**2/2 - y**2/2 - f*x - f**2*y", inputs="f")
     times = np.linspace(0.0, 2.0, 3)

@@ -14,7 +14,6 @@ from sympy.physics.mechanics import (
     SphericalJoint,
     System,
     TorqueActuator,
-    dynamicsymbols,
     inertia,
 )
 
@@ -120,51 +119,3 @@ MJCF = """
   </worldbody>
 </mujoco>
 """
-
-
-@pytest.mark.rotated
-def test_a_body_without_joints_to_the_frame_is_free_as_in_mjcf(tmp_path):
-    ground, base, leg = RigidBody("ground"), body("base", 2, 0.5, 0.4, 0.3), body("leg", 0.7, 0.1, 0.12, 0.02)
-    parent, child = (3 * base.x - base.z) / 10, 2 * leg.z / 5
-    model = System.from_newtonian(ground)
-    model.add_bodies(leg, base)
-    model.add_joints(PinJoint("hip", base, leg, parent_point=parent, child_point=child, joint_axis=base.y))
-    model.apply_uniform_gravity(-sympy.Rational(981, 100) * ground.z)
-    (tmp_path / "leg.xml").write_text(MJCF)
-    ends = []
-    for system in (sc.LagrangianSystem.from_system(model), sc.LagrangianSystem.from_mjcf(tmp_path / "leg.xml")):
-        start = {"x_base": 0.1, "y_base": 0, "z_base": 0.5, "R_base": [0.9, 0.1, -0.3, 0.2], "q_hip": 0.4}
-        rates = {"x_base": 0.3, "y_base": -0.2, "z_base": 1.0, "omega_base": [0.5, -1, 2.0], "q_hip": -1.5}
-        run = sc.compile_stepper(system, "svi:4").integrate(start, velocity=rates, h=0.02, steps=100)
-        assert np.ptp(run.energy()) < 1e-9
-        names = [each.name for each in system.coordinates]
-        ends.append([*run.rotation()[-1].ravel(), *(run.q[-1, names.index(each)] for each in ("x_base", "q_hip"))])
-    np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=1e-10)
-
-
-@pytest.mark.full
-def test_rolling_built_into_velocities_and_a_ball_joint_have_the_forces_of_kanes_equations():
-    """A sledge whose velocity is along its heading, with a body on a ball joint."""
-    heading, path, turn, speed = dynamicsymbols("heading path turn speed")
-    ground, sledge, rider = RigidBody("ground"), body("sledge", 1, 0.2, 0.2, 0.3), body("rider", 0.5, 0.1, 0.05, 0.2)
-    sledge.frame.orient_axis(ground.frame, heading, ground.z)
-    sledge.masscenter.set_vel(ground.frame, path.diff() * sledge.x)
-    model = System.from_newtonian(ground)
-    ball = SphericalJoint("ball", sledge, rider, child_point=-rider.z / 2)
-    model.add_joints(ball)
-    model.add_coordinates(heading, path)
-    model.add_speeds(turn, speed)
-    model.add_kdes(heading.diff() - turn, path.diff() - speed)
-    model.form_eoms()
-    q, u = [*ANGLES, 0.3, 0.0], [*SPEEDS, 0.7, 1.2]
-    end = in_angles(model, q, u, 0.8)
-    velocity = rider.frame.ang_vel_in(sledge.frame).to_matrix(rider.frame)
-    omega = sympy.lambdify([[*ball.coordinates, *ball.speeds]], velocity)([*ANGLES, *SPEEDS]).ravel()
-    system = sc.LagrangianSystem.from_system(model)
-    assert any(name == "R_ball" for name, _ in system.reduced.forces)
-    start = {"heading": 0.3, "path": 0, "R_ball": {"euler": "XYZ", "angles": ANGLES}}
-    rates = {"heading": 0.7, "path": 1.2, "omega_ball": omega}
-    run = sc.compile_stepper(system, "svi:5").integrate(start, velocity=rates, h=0.01, steps=80)
-    expected = Rotation.from_euler("XYZ", end[:3]).as_matrix()
-    np.testing.assert_allclose(run.rotation("R_ball")[-1], expected, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(run.q[-1, :2], end[3:5], rtol=0, atol=1e-10)

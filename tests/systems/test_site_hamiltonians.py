@@ -71,24 +71,6 @@ def test_other_kinetic_energies_have_no_hamiltonian_by_elements(lagrangian):
     assert site_hamiltonian(sc.LagrangianSystem.from_text("other", ["q[N]"], lagrangian)) is None
 
 
-@pytest.mark.second
-def test_pendulums_in_spherical_angles():
-    """Sums of several loops, and blocks of several arrays."""
-    system = sc.LagrangianSystem.from_text(
-        name="pendulums",
-        coordinates=["a[N]", "b[N]"],
-        lagrangian="sum(j in N, a_dot[j]**2/2)"
-        "+ sum(i in N, sin(a[i])**2*b_dot[i]**2/2 + a_dot[i]*b_dot[i]/9 - cos(a[i]))"
-        "- sum(i in 0..N-2, (b[i+1] - b[i])**2/2)",
-    )
-    stepper = sc.compile_stepper(system, "svi:3", flags=QUICK_FLAGS)
-    q = {"a": 1 + RNG.random(4), "b": RNG.random(4)}
-    run = stepper.integrate(q, velocity=q, h=0.05, steps=10)
-    known = stepper.with_sizes(N=4).integrate(q, velocity=q, h=0.05, steps=10)
-    assert np.abs(run.q - known.q).max() < 1e-14
-    assert run.momentum_maps() == pytest.approx(known.momentum_maps()[:, :1], abs=1e-13)
-
-
 @pytest.mark.rotated
 def test_many_coupled_velocities_are_solved_by_newton():
     """Full mass matrices at all points, on the stack, are left to the banded ones of Newton's method."""

@@ -11,7 +11,6 @@ from scvi_codegen.interfaces.models.model_files.model_file import dump_model, pa
 from scvi_codegen.systems.formulas.expressions import Tape, gradient
 
 X = np.array([-2.0, -1.1, -0.4, 0.3, 0.7, 1.5, 2.0])
-SPAN = {"t_end": 3.0}
 
 
 def spline(x, y, degree, outside, u):
@@ -51,25 +50,6 @@ def test_values_of_two_arguments(degree):
         rows = [spline(y, row, degree, "constant", w)[0] for row in z]
         exact = spline(X, np.array(rows), degree, "constant", u)[0]
         assert abs(float(tape([*map(mp.mpf, (u, w, 0.0, 0.0))])[0]) + exact) < 1e-12
-
-
-@pytest.mark.second
-def test_arrays_have_the_motion_of_named_coordinates():
-    functions = {"F": sc.Table(X, np.abs(X), outside="linear"), "G": sc.Table(X, X**3, degree=2, outside="linear")}
-    terms = [f"q_{i}_dot**2/2 - F(q_{i})" for i in range(3)]
-    forces = {f"q_{i}": f"-G(q_{i}_dot)" for i in range(3)}
-    named = lagrange("named", "q_0 q_1 q_2", " + ".join(terms), functions=functions, forces=forces)
-    text = {"forces": {"q[i]": "-G(q_dot[i])"}, "functions": functions}
-    known = lagrange("known", "q[3]", "sum(i in 3, q_dot[i]**2/2 - F(q[i]))", **text)
-    sized = lagrange("sized", "q[N]", "sum(i in N, q_dot[i]**2/2 - F(q[i]))", **text)
-    q, p = np.array([0.3, -1.0, 0.9]), np.array([0.2, 0.5, -0.4])  # the first starts at a breakpoint
-    steppers = [sc.compile_stepper(system, "svi:4") for system in (named, known)]
-    ends = [stepper.integrate(q, p, **SPAN).q[-1] for stepper in steppers]
-    assert np.abs(ends[0] - ends[1]).max() < 1e-13
-    with pytest.warns(sc.MethodWarning, match="does not locate the kinks"):
-        by_formulas = sc.compile_stepper(sized, "svi:4")
-    fixed = [by_formulas.integrate({"q": q}, {"q": p}, h=1e-3, steps=3000).q["q"][-1]]
-    assert np.abs(fixed - ends[0]).max() < 1e-3  # formulas decide
 
 
 TABLED = """

@@ -34,32 +34,6 @@ def test_multipliers_of_an_orbit_are_those_of_its_variations():
     assert orbit.stable == bool(np.all(np.abs(expected) <= 1.0))
 
 
-@pytest.mark.parametrize(("metre", "second", "factor"), [(1000.0, 1.0, 1.0), (1e-3, 60.0, 1.0), (1.0, 1.0, 1e6)])
-def test_constraints_of_arrays_accept_any_units(metre, second, factor):
-    """Compare two rods in other units of length and time, and with scaled constraints."""
-
-    def states(metre, second, factor):
-        system = sc.LagrangianSystem.from_text(
-            name="rods",
-            coordinates=["r[N, 2]"],
-            parameters={"m[N]": 1.0, "l[B]": 1.0, "g": 1.0, "u": 1.0},
-            tables=["bonds[B, 2]"],
-            lagrangian="sum(i in N, m[i]*sum(a in 2, r_dot[i, a]**2)/2 - m[i]*g*r[i, 1])",
-            constraints=["sum(a in 2, u*(r[bonds[b, 0], a] - r[bonds[b, 1], a])**2) = u*l[b]**2 for b in B"],
-        )
-        stepper = sc.compile_stepper(system, sc.SVI(1, "gauss-lobatto:2"))
-        q = np.array([[0.0, 0.0], [0.6, 0.8], [1.4, 0.2]]) * metre
-        velocity = np.array([[0.5, 0.0], [0.5, 0.0], [0.5, 0.0]]) * metre / second
-        run = stepper.start(
-            q, velocity=velocity, h=0.03125 * second, tables={"bonds": [[0, 1], [1, 2]]},
-            parameters={"m": [1.75, 0.5, 1.25], "l": metre, "g": 9.75 * metre / second**2, "u": factor},
-        )  # fmt: skip
-        run.advance(64)
-        return np.array(run.q["r"]) / metre
-
-    np.testing.assert_allclose(states(metre, second, factor), states(1.0, 1.0, 1.0), rtol=1e-10, atol=1e-11)
-
-
 @pytest.mark.parametrize("method", ["stoermer-verlet", "composition:8"])
 def test_velocity_dependent_forces_are_not_treated_as_kicks(method):
     """Explicit solvers refuse them, and where a step is made it is that of the motion."""
