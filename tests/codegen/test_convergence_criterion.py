@@ -15,8 +15,6 @@ from programs import needs
 from samples import QUICK_FLAGS
 
 from scvi_codegen.codegen.native.options import SolverOptions
-from scvi_codegen.codegen.rendering.environment import support_text
-from scvi_codegen.common.cache import template_folder
 from scvi_codegen.common.errors import StepFailedError
 from scvi_codegen.interfaces.models.problems import problem
 from scvi_codegen.methods import SCVI, SVI, SpectralCollocation
@@ -279,117 +277,6 @@ def test_standing_waves_converge_up_to_the_largest_step(name, method):
             run.advance(20)
             counts.append(run.iterations / 20)
         assert counts[0] <= (1.1 * counts[1] + 0.2 if "array" in name else counts[1] + 5)
-
-
-DECISIONS = """
-#include <float.h>
-#include <math.h>
-#include <string.h>
-#if LANES > 1
-typedef double lanes __attribute__((vector_size(8 * LANES)));
-#else
-typedef double lanes;
-#endif
-typedef union {{ lanes all; double lane[LANES]; }} lane_view;
-typedef lanes number, coordinates[1];
-typedef int step_data;
-typedef double real;
-typedef struct {{ double tolerance; long long max_iterations; int absolute; }} solver_options;
-typedef struct {{ double change, noise, *active; int shared; long long iterations; }} solver_report;
-enum {{ M = 1, S = 1, FINAL_ITERATIONS = 0, OK = 0, NOT_CONVERGED = 1, NOT_FINITE = 2, LAST_ALONE, LAST, BEFORE }};
-#define SELDOM
-#define REAL_EPSILON DBL_EPSILON
-#define REAL_MIN DBL_MIN
-#define SUPPORT_NUMBERS_H
-#define SUPPORT_STATUS_CODES_H
-#define SUPPORT_STEP_H
-#define SUPPORT_TRAJECTORIES_H
-#define sum_of_stored(table, n, x, i) x[n][i]
-#define reaches(step, dq, dp) 1
-static inline double larger(double a, double b) {{ return a > b ? a : b; }}
-static inline lanes lanes_of(double x)
-{{
-  lane_view view;
-  for (int j = 0; j < LANES; j++)
-    view.lane[j] = x;
-  return view.all;
-}}
-#if LANES > 1
-typedef struct {{ lanes (*last)[M], (*before)[M]; }} history;
-#endif
-#define lanes_selected(which, x, y) (x)
-#define number_of(x) lanes_of(x)
-#define largest_number(x) (x)[0]
-#include "{folder}/{header}.h"
-/* Status, stagnation and amplification of each lane after each iteration: count rows. Returns the iterations. */
-int decide(const double *changes, int count, double *active, double *rows)
-{{
-  const solver_options options = {{0x1p-53, 40, 0}};
-  solver_report report = {{.active = active}};
-  progress now = before_iterations();
-  for (int k = 0; k < count && needs_iteration(&now); k++, changes += LANES, rows += 3 * LANES) {{
-    lane_view change, status, large = {{lanes_of(0.0)}}, factor = large;
-    memcpy(&change, changes, sizeof change);
-    take_change(&now, change.all, &options, k, &report);
-    if (is_stagnant(&now, &options, k))
-      large.all = stagnant(&now);
-    if (must_amplify(&now, &options, k))
-      factor.all = amplification(&now);
-    for (int j = 0; j < LANES; j++) {{
-      status.all = (lanes)now.status;
-      rows[3 * j] = status.lane[j] < 0.0 ? -1.0 : status.lane[j];
-      rows[3 * j + 1] = large.lane[j];
-      rows[3 * j + 2] = factor.lane[j];
-    }}
-  }}
-  outcome(&now, &report);
-  return (int)report.iterations;
-}}
-"""
-
-
-def test_lanes_decide_as_single_trajectories(tmp_path):
-    """About changes that converge, stagnate at any level, grow or are undefined, also beside inactive lanes."""
-    compiler, decide = needs("cc"), {}
-    for path in (template_folder() / "support").glob("*/*.h"):
-        written = tmp_path / "support" / path.parent.name / path.name
-        written.parent.mkdir(parents=True, exist_ok=True)
-        written.write_text(support_text(f"support/{path.parent.name}/{path.name}"))
-    for lanes, header in ((1, "core/progress"), (4, "iteration/many_trajectories")):
-        (tmp_path / f"{lanes}.c").write_text(DECISIONS.format(folder="support", header=header))
-        command = [
-            compiler,
-            f"-DLANES={lanes}",
-            "-Wno-psabi",
-            "-shared",
-            "-fPIC",
-            f"{lanes}.c",
-            "-o",
-            f"{lanes}.so",
-            "-lm",
-        ]
-        subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
-        decide[lanes] = ctypes.CDLL(str(tmp_path / f"{lanes}.so")).decide
-        decide[lanes].argtypes = [ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p]
-    generator, count, seen = np.random.default_rng(2), 45, set()
-    for _ in range(150):
-        rate, floor = 10.0 ** generator.uniform(-2, 0.1, 4), 10.0 ** generator.uniform(-34, -8, 4)
-        noise = 4.0 ** generator.normal(size=(count, 4))
-        changes = np.maximum(rate ** np.arange(count)[:, None], floor) * noise
-        changes[np.ix_(np.arange(count) % 8 > 3, generator.random(4) < 0.5)] *= 1e6  # amplified
-        changes[generator.integers(2, count), generator.random(4) < 0.1] = np.nan
-        active, rows = (generator.random(4) < 0.9).astype(float), np.zeros((count, 4, 3))
-        running, ends = active > 0.0, []
-        iterations = decide[4](changes.ctypes.data, count, active.ctypes.data, rows.ctypes.data)
-        for j in np.flatnonzero(running):
-            single, own = np.zeros((count, 3)), np.ascontiguousarray(changes[:, j])
-            ends.append(decide[1](own.ctypes.data, count, None, single.ctypes.data))
-            assert np.array_equal(rows[: ends[-1], j], single[: ends[-1]])
-            assert active[j] == (single[ends[-1] - 1, 0] == 1.0)
-            seen |= {(name, value) for name, values in zip("sla", single.T, strict=True) for value in values}
-        assert not active[~running].any()
-        assert iterations == max(ends, default=iterations)
-    assert seen == {("s", -1.0), ("s", 0.0), ("s", 1.0), ("l", 0.0), ("l", 1.0), ("a", 0.0), ("a", 1e3)}
 
 
 def test_bodies_of_known_number_are_measured_one_by_one():

@@ -23,6 +23,7 @@ import scvi_codegen as sc
 from benchmarks.cases.robots import chain
 from scvi_codegen.interfaces.models.model_files.ensemble_file import load_ensemble
 from scvi_codegen.methods import Method
+from scvi_codegen.runs.ensembles.lanes import LaneRuns
 
 KNOTS = np.array([0.0, 0.37, 0.9, 1.41, 2.05, 2.6])
 VALUES = np.array([0.0, 1.2, -0.7, 0.4, 1.9, -1.0])
@@ -551,3 +552,28 @@ def test_files_contain_individual_times(tmp_path: Path) -> None:
     dataset = runs.to_xarray()
     assert np.array_equal(dataset.time, runs.times, equal_nan=True)
     assert np.array_equal(np.isfinite(dataset.energy), np.isfinite(runs.times))
+
+
+@pytest.mark.rotated
+@pytest.mark.sampled(2)
+@pytest.mark.usefixtures("as_users_compile")
+@pytest.mark.parametrize("h", [6e-2, 1e-2, 1e-4, 2e-14])
+def test_lanes_converge_as_single_runs(h: float) -> None:
+    """Slowly, with steps repeated from another predictor, and at the level of rounding.
+
+    Changes below rounding are random, and relative to a velocity near 0 they exceed any fixed level.
+    """
+    count, steps = 32, 64
+    stepper = sc.compile_stepper(chain(4).system, "svi:2")
+    generator = np.random.default_rng(1)
+    q, v = generator.uniform(-1, 1, (count, 4)), generator.normal(size=(count, 4))
+    p = np.array([stepper.momentum(*each) for each in zip(q, v, strict=True)])
+    runs = ensemble_runs(stepper, q, p, h=h, steps=steps)
+    batch = runs.batch()
+    assert isinstance(batch, LaneRuns)
+    batch.run(progress=None, threads=1)
+    assert (batch.status == 0).all()
+    for j in range(0, count, 5):
+        single = stepper.integrate(q[j], p[j], h=h, steps=steps)
+        np.testing.assert_allclose(runs.q[-1, j], single.q[-1], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(runs.p[-1, j], single.p[-1], rtol=0, atol=1e-11)

@@ -425,13 +425,9 @@ FIXED = '<tendon><fixed {}><joint joint="1-a" coef=".5"/><joint joint="t" coef="
 SPATIAL = '<tendon><spatial {}><site site="w"/><site site="s"/><site site="e"/></spatial></tendon>'
 BALLS = '<joint name="a b" type="ball" stiffness="3 2 1" damping="1 2 3"/>', '<joint name="exp" type="ball"/>'
 MOTIONS = {
-    "fixed tendon": (*HINGES, FIXED.format('stiffness="3" damping=".2"')),
     "slack tendon": (*HINGES, FIXED.format('stiffness="3 2 1" springlength=".1 .2" damping="1 2 3"')),
-    "spatial tendon": (*HINGES, SPATIAL.format('stiffness="3 2" armature=".4" damping=".2"')),
     "tendon of balls": (*BALLS, SPATIAL.format('stiffness="3" springlength=".2" armature=".4" damping=".2"')),
-    "springs of balls": (*BALLS, ""),
     "free body": ('<joint name="α" type="free" stiffness="3 2 1" damping="1 2 3"/>', HINGES[1], ""),
-    "medium": (*HINGES, '<option density="1000" viscosity=".9"/>'),
     "free in a medium": ('<freejoint name="f"/><geom size=".2"/>', BALLS[1], '<option density="9" viscosity="1"/>'),
     "bounds of inertias": (*HINGES, '<compiler boundmass="30" boundinertia=".2"/>'),
     "balanced inertia": (
@@ -439,34 +435,8 @@ MOTIONS = {
         HINGES[1] + '<inertial pos=".1 0 0" mass="1" diaginertia=".1 .2 .9"/>',
         '<compiler balanceinertia="true"/>',
     ),
-    "polynomials": (
-        '<joint name="1-a" axis="1 2 3" stiffness="1 2 3" damping="3 2 1" springref="10"/>',
-        '<joint name="t" type="slide" stiffness="3 -2" damping="1 2"/>',
-        '<actuator><motor joint="t" gear="-2" damping="1 2 3"/></actuator>',
-    ),
-    "motors": (
-        *HINGES,
-        '<actuator><motor name="t" joint="t" gear="-2" ctrlrange="-.3 .2"/>'
-        '<motor name="lift" joint="1-a" gear="3" forcerange="-.2 .1" ctrlrange="0 2"/></actuator>',
-    ),
-    "servos": (
-        *HINGES,
-        '<default><default class="a"><position kp="9" kv="2" gear="2"/></default></default>'
-        '<actuator><position class="a" name="p" joint="t" kp="3"/><position class="a" joint="1-a" forcerange="-1 .1"/>'
-        '<velocity name="v" joint="t" kv="4"/><general name="g" gear="2" joint="1-a" gainprm="2 3 4" gaintype="affine"'
-        ' biastype="affine" biasprm="1 -9 -2"/></actuator>',
-    ),
-    "actuated tendon": (
-        *BALLS,
-        SPATIAL.format('name="s"') + '<actuator><position name="p" tendon="s" kp="3" kv="2"/><general name="g" '
-        'tendon="s" biastype="affine" biasprm="1 2" forcerange="-1 .1"/></actuator>',
-    ),
-    "limited torque": (
-        HINGES[0].replace("name", 'actuatorfrcrange="-.1 .2" name'),
-        HINGES[1],
-        '<actuator><motor name="m" joint="1-a" gear="-2"/><position joint="t"/></actuator>',
-    ),
 }
+"""What test_random_robots.py does not draw."""
 
 
 @pytest.mark.tiers(0, 1)
