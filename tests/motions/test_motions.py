@@ -16,8 +16,10 @@ CASES = [
     if applies(Case(problem, method, situation))
 ]
 
-DEAR = ("two_words", "packages", "work_and_impulses", "hessians", "flows")
-"""Properties that compile more than one integrator, or much code."""
+DEAR = ("two_words", "packages", "hessians")
+"""Properties that compile several integrators, or much code, for several seconds: always rotated."""
+LATER = ("work_and_impulses", "flows")
+"""Properties of the second tier."""
 
 pytestmark = pytest.mark.long
 
@@ -29,8 +31,8 @@ def identity(name: str, case: Case) -> str:
 
 
 def sample() -> list[object]:
-    """Cases with each property of each kind of run, each situation and each system, dear ones in the second tier, the
-    others in the quick one; those beyond rotate, the cases of a stepper, which is compiled once, together."""
+    """Cases with each property of each kind of run, each situation and each system; dear ones and those beyond rotate,
+    the cases of a stepper, which is compiled once, together."""
     kinds, names = [(name, problem.kind) for name in PROPERTIES for problem in PROBLEMS], [x.name for x in PROBLEMS]
     combinations = {
         (
@@ -44,9 +46,9 @@ def sample() -> list[object]:
     steppers = {x: i for i, x in enumerate(dict.fromkeys((case.problem, case.method) for _, case in CASES))}
 
     def tier(name: str, case: Case) -> pytest.MarkDecorator:
-        if (name, case) not in first:
+        if (name, case) not in first or name in DEAR:
             return pytest.mark.rotated(steppers[case.problem, case.method])
-        return pytest.mark.second if name in DEAR else pytest.mark.quick
+        return pytest.mark.second if name in LATER else pytest.mark.quick
 
     return [pytest.param(*case, id=identity(*case), marks=tier(*case)) for case in CASES]
 
