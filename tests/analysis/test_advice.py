@@ -292,18 +292,6 @@ class TestEnsembles:
             assert achieved(system, advice, *kepler_start(e), kepler_end(e, 100.0), 1.0) < 1e-8
 
     @pytest.mark.rotated
-    def test_short_pilot_of_many_trajectories_is_extrapolated_as_one_of_the_worst(self):
-        """Of 200 orbits, one has an error that seems to grow quadratically over a few revolutions."""
-        q, p = map(np.array, zip(*map(kepler_start, np.linspace(0.05, 0.5, 200)), strict=True))
-        system = problem("kepler").system
-        advice = advise(system, SVI(8), q, p, 5000.0, 1e-8)
-        assert not advice.warnings
-        assert advice.member is not None
-        assert advice.member > 190
-        alone = advise(system, SVI(8), q[advice.member], p[advice.member], 5000.0, 1e-8)
-        assert advice.steps == pytest.approx(alone.steps, rel=0.25)
-
-    @pytest.mark.rotated
     def test_parameters_of_each_trajectory_count(self):
         """Oscillators of frequencies 1 and 5: the step is that of the second."""
         system, states = lagrange("oscillator", "q", "q_dot**2/2 - k*q**2/2", k=1.0), ([[1.0], [1.0]], [[0.0], [0.0]])

@@ -115,35 +115,3 @@ def test_derivatives_through_impacts_at_the_ends_of_steps(billiard):
             s = run.sensitivity()
             by = np.concatenate([np.ravel(each[-1][0]) for each in (s.state, s.parameters, s.t, s.h)])
             assert abs(by - [-1, 0, -12 * h, 0, 2, 0, -12 * v]).max() < 1e-12
-
-
-def test_an_unstable_orbit_with_impacts_by_multiple_shooting(billiard):
-    """The triangle of three discs of radius 1 at distance 6: its multiplier is -11.77145519638 for each impact.
-
-    P. Cvitanovic et al., *Chaos: Classical and Quantum*, table of the 3-disk cycles (a : R = 1 : 6).
-    """
-    angles = np.pi / 2 + 2 * np.pi * np.arange(3) / 3
-    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    discs = [sc.impact(f"(x - ({x!r}))**2 + (y - ({y!r}))**2 - 1") for x, y in (np.sqrt(12) * directions).tolist()]
-    hits = (np.sqrt(12) - 1) * directions
-    q, p = (hits[0] + hits[1]) / 2, (hits[1] - hits[0]) / (3 * (2 - 3**-0.5))
-    for seed in (1, 2, 4):  # one segment does not converge from these
-        dq, dp = np.random.default_rng(seed).normal(size=(2, 2)) / 1000
-        orbit = sc.periodic_orbit(billiard.with_events(discs), q + dq, p + dp, period=12.8, steps=24, energy=0.5)
-        assert abs(orbit.period / 3 - 4.267949192431) < 1e-11
-        assert abs(abs(orbit.multipliers).max() / 11.77145519638**3 - 1) < 1e-11
-
-
-def test_fits_and_orbits_of_arrays():
-    """A chain that bounces on its end: a fit of array coordinates, and the orbit of one ball by its distance."""
-    text = "sum(i in N, y_dot[i]**2/2 - y[i] + 0*e*w) - k*sum(i in N-1, (y[i+1] - y[i])**2/2)"
-    chain = lagrange("chain", "y[N]", text, k=6.0, e=0.7, w=0.12)
-    stepper = sc.compile_stepper(chain, "svi:4", flags=FLAGS, events=sc.impact("y[0] - w", "e"))
-    q, t = np.array([1.0, 1.6]), np.linspace(0.1, 4.0, 40)
-    run = stepper.integrate(q, velocity=0 * q, h=0.1, steps=40, t_eval=t)
-    assert len(run.events[0]) == 2
-    given = {"p": 0 * q, "h": 0.1, "start": 0.0, "fit_initial_state": False}
-    fit = sc.fit(stepper, t, np.asarray(run.q), q=q, parameters={"k": 5.8, "e": 0.75, "w": 0.1}, **given)
-    assert abs(fit.values - [6.0, 0.7, 0.12]).max() < 1e-8
-    elastic = sc.periodic_orbit(stepper, [0.3], [0.1], period=1.3, steps=20, parameters={"e": 1.0})
-    assert abs(elastic.period**2 - 8 * (elastic.energy - 0.12)) < 1e-12

@@ -102,32 +102,6 @@ def test_what_is_no_symmetry_is_refused(pendulum, moon):
     assert "is no symmetry at another value of parameter=" in family.ended
 
 
-@pytest.mark.rotated
-def test_families_of_symmetric_orbits_are_those_of_whole_ones(moon, tmp_path):
-    """From L1 to the halo orbits; vertical orbits branch off too, with and without the symmetry."""
-    rest = sc.equilibrium(moon, [0.83, 0, 0])
-    at = {"amplitude": 0.01, "step": 0.2, "until": "energy > -1.585"}
-    family = sc.family(moon, rest, reversor="detect", **at)
-    (halo,) = family.bifurcations
-    assert -2 * halo.orbit.energy == pytest.approx(3.174351954, abs=1e-9)
-    assert halo.orbit.period == pytest.approx(2.742994069, abs=1e-8)
-    assert abs(np.array([orbit.q[1] for orbit in family])).max() < 1e-14
-    whole = sc.periodic_orbit(moon, family[-1].q, family[-1].p, period=family[-1].period, fixed=["x", "y"])
-    assert family[-1].period == pytest.approx(whole.period, rel=1e-12)
-    assert family[-1].stability_indices == pytest.approx(whole.stability_indices, rel=1e-9)
-    halos = halo.switch(step=0.1, count=4)
-    assert all(orbit.q[2] > 0 and abs(orbit.q[1]) < 1e-14 for orbit in halos[1:])
-    assert max(closing(orbit) for orbit in halos) < 1e-8
-    halos.save(tmp_path / "halo.npz")
-    longer = sc.Family.load(moon, tmp_path / "halo.npz").more(1)
-    assert longer[-1].period == pytest.approx(halos.more(1)[-1].period, rel=1e-12)
-    # A branch across the symmetry: axial orbits have whole ones.
-    lyapunov = sc.family(moon, family[-1], fixed=["y"], step=0.2, until="energy > -1.5", reversor=MIRROR)
-    axial = lyapunov.bifurcations[0].switch(step=0.1, count=3)
-    assert all(abs(orbit.q[2]) < 1e-6 < abs(orbit.p[2]) for orbit in axial[1:])
-    assert max(closing(orbit) for orbit in axial) < 1e-8
-
-
 JPL = {
     "Lyapunov": (
         (0.8090546332188572, 0.0, 0.2818915604471463, 3.11687584914084, 3.016484309141973, 669.48058884107),

@@ -13,7 +13,7 @@ import pytest
 from certified_cases import case
 from samples import QUICK_FLAGS, ensemble_runs
 
-from scvi_codegen import SolverOptions, Stepper, compile_stepper, problem
+from scvi_codegen import Stepper, compile_stepper, problem
 from scvi_codegen.runs.ensembles.lanes import LaneRuns
 
 STEPS = 100
@@ -30,9 +30,6 @@ EXPECTED = {
     ("chain/svi-4", "newton"): {16: 301, 64: 201},
 }
 """Of so many steps of the case's h, of an eighth of it, and so on."""
-ONE_ITERATION = SolverOptions(tolerance=1e300)
-CONTINUED = {"kepler/svi-3": 2, "cart/svi": 1 / 16, "field/gauss": 1 / 16, "double/sc": 1 / 16, "chain/svi-4": 1 / 2}
-"""Fractions of the case's h at which iterates are extrapolated from two steps and further iterations are needed."""
 
 
 @cache
@@ -75,25 +72,6 @@ def test_first_step_takes_few_trials(p, span):
     run.advance(1)
     assert run.t == pytest.approx(2.0**-1.5 if p[1] else 2.0**-2.25, rel=1e-9)  # on the grid
     assert run.iterations <= 17
-
-
-@pytest.mark.tiers(1, 1)
-@pytest.mark.parametrize("name", CONTINUED)
-def test_predictor_from_two_steps_is_better_than_from_one(name):
-    """Compare the residual of one iteration after the first and after the third step, which use different tables."""
-    given, left = case(name), []
-    for steps in (1, 3):
-        run = stepper(name, "fixed-point").start(given.q, given.p, h=CONTINUED[name] * given.h)
-        run.advance(steps)
-        ends = [
-            stepper(name, "fixed-point").from_checkpoint(run.checkpoint(), options=options)
-            for options in (None, ONE_ITERATION)
-        ]
-        for each in ends:
-            each.advance(1)
-        left.append(max(abs(ends[0].q - ends[1].q)))
-    assert left[0] > 2.0**-48
-    assert left[1] < left[0] / 4
 
 
 @pytest.mark.second

@@ -52,29 +52,6 @@ def test_the_order_of_the_coordinates_does_not_matter(seed):
 
 
 @pytest.mark.rotated
-@pytest.mark.parametrize("method", [sc.SVI(2), sc.SCVI(2), sc.SpectralCollocation(2)], ids=lambda method: method.name)
-def test_rows_are_pivoted_within_the_band(method):
-    """Masses x_dot y_dot have no diagonal: every diagonal pivot is zero. In u = x + y, w = x - y they have."""
-    pairs = range(8)
-    kinetic = " + ".join(f"x{i}_dot*y{i}_dot" for i in pairs)
-    springs = "".join(f" - x{i}*y{i} - (x{i} - y{i + 1})**2/3" for i in list(pairs)[:-1])
-    names = [f"{letter}{i}" for i in pairs for letter in "xy"]
-    tilted = sc.LagrangianSystem.from_text(name="tilted", coordinates=names, lagrangian=kinetic + springs)
-    change = {f"x{i}": f"(u{i} + w{i})" for i in pairs} | {f"y{i}": f"(u{i} - w{i})" for i in pairs}
-    text = kinetic + springs
-    for name, value in change.items():
-        text = text.replace(f"{name}_dot", value.replace(" ", "_dot ", 1).replace(")", "_dot)")).replace(name, value)
-    names = [f"{letter}{i}" for i in pairs for letter in "uw"]
-    straight = sc.LagrangianSystem.from_text(name="straight", coordinates=names, lagrangian=text)
-    one, other = (sc.compile_stepper(system, method, solver="newton") for system in (tilted, straight))
-    turn = np.kron(np.eye(8), [[1.0, 1.0], [1.0, -1.0]])
-    q, v = state(16)
-    first, second = one.step(turn @ q, one.momentum(turn @ q, turn @ v), 0.3), other.step(q, other.momentum(q, v), 0.3)
-    np.testing.assert_allclose(first[0], turn @ second[0], rtol=0, atol=1e-13)
-    np.testing.assert_allclose(turn.T @ first[1], second[1], rtol=0, atol=1e-13)
-
-
-@pytest.mark.rotated
 def test_memory_grows_linearly_with_the_length_of_a_chain():
     sizes = [workspace_size(lowered(fput_chain(n), sc.SVI(8))) for n in (32, 64, 128)]
     assert sizes[2] - sizes[1] == pytest.approx(2 * (sizes[1] - sizes[0]), rel=1e-3)

@@ -35,20 +35,6 @@ def test_coefficients_have_106_bits(method):
         assert abs(mp.fsum(line) - x * x / 2) < 1e-31
 
 
-@pytest.mark.parametrize("system", [KEPLER, sc.problem("double-pendulum").system])
-@pytest.mark.parametrize("degree", [2, 8])
-def test_predictor_without_step_size_change_is_that_of_fixed_steps(system, degree):
-    fixed_point = program_of(system, sc.SVI(degree)).fixed_point
-    predictor, same = predictor_of(fixed_point), predictor_of(fixed_point).reach
-    for found, wanted in (
-        (predictor.alone[same], fixed_point.guess.last_alone),
-        (predictor.last[same][same], fixed_point.guess.last),
-        (predictor.before[same][same], fixed_point.guess.before),
-    ):
-        expected = np.array(wanted, dtype=float)
-        assert np.allclose(found, expected, rtol=0.0, atol=1e-13 * np.abs(expected).max())
-
-
 @pytest.mark.tiers(2, 3)
 @pytest.mark.parametrize(
     ("method", "lanes"),

@@ -6,7 +6,6 @@ from numpy import cos, pi, sin
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.interfaces.pictures.animation import positions_of
 
 pytestmark = pytest.mark.second
 
@@ -49,22 +48,6 @@ def test_space_time_diagram_and_image_have_the_values_of_the_field(tmp_path):
     assert np.asarray(image.get_array()) == pytest.approx(run.q["u"][0].T)
     assert ax.get_title() == "t = 0"
     assert mesh.points["y"][0, 0] == 0
-
-
-@pytest.mark.rotated
-@pytest.mark.parametrize(("made", "lines", "dimension"), [(on_a_line, 1, 2), (in_the_plane, 7, 3)])
-def test_animation_shows_the_graph_over_the_points(made, lines, dimension):
-    mesh, run = made()
-    film = run.animate(seconds=0.1)
-    points = positions_of(film.shapes[0], film.shown[0])
-    assert points.shape == (21, mesh.weights.size, dimension)
-    curves = np.split(np.arange(mesh.weights.size), lines)
-    x, y = points[0, :, 0], points[0, :, 1]
-    wave = cos(2 * pi * x) if dimension == 2 else sin(pi * x) * sin(2 * pi * y)
-    assert points[0, :, -1] == pytest.approx(wave, abs=1e-12)
-    for curve in curves:
-        assert (np.diff(points[0, curve, -2]) > 0).all()
-    film.animation.to_jshtml()
 
 
 @pytest.mark.rotated

@@ -1,15 +1,12 @@
 """Model files of array systems: arrays by number, list, file and formula; sizes; errors."""
 
-import subprocess
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from commands import invoke
 
 import scvi_codegen as sc
-from scvi_codegen.codegen.native.compilers import find_compiler
 from scvi_codegen.interfaces.models.model_files.model_file import load_model
 from scvi_codegen.interfaces.models.model_files.values import read_array
 from scvi_codegen.systems.formulas.arrays import parse_array
@@ -218,24 +215,3 @@ def test_model_files_with_arrays_of_known_sizes(tmp_path: Path) -> None:
     path.write_text(RING.replace("[0, 1, 2]", "[0, 1]"))
     with pytest.raises(sc.ModelFileError, match="q"):
         sc.load_model(path)
-
-
-@pytest.mark.rotated
-def test_generated_example_frees_memory_and_rejects_indices_out_of_range(
-    net: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Tables are files next to the program: invalid edits give a message, and no access outside an array."""
-    monkeypatch.chdir(net.parent)
-    invoke("generate", net, "-o", "net_svi")
-    command = [*find_compiler(), "-O0", "-std=c99", "main.c", "net_svi.c", "-lm", "-o", "main"]
-    checked = subprocess.run(
-        [*command, "-fsanitize=address,undefined"], cwd="net_svi", capture_output=True, check=False
-    )
-    if checked.returncode:  # a compiler without sanitizers
-        subprocess.run(command, cwd="net_svi", check=True)
-    subprocess.run(["./main"], cwd="net_svi", check=True, capture_output=True)
-    for wrong in ("3", "-1", "1e9", "nan"):
-        Path("net_svi/table_bonds.txt").write_text(f"0 1 1 {wrong}")
-        ended = subprocess.run(["./main"], cwd="net_svi", capture_output=True, text=True, check=False)
-        assert ended.returncode == 1
-        assert "an index from 0 to 2" in ended.stderr

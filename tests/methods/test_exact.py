@@ -1,6 +1,5 @@
 """The exact discrete Lagrangian and flow against closed forms, their own derivatives and another integrator."""
 
-import numpy as np
 import oracle
 import pytest
 from notation import lagrange
@@ -10,7 +9,6 @@ from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.precision import mp
 from scvi_codegen.interfaces.models.problems import problem
 from scvi_codegen.methods.exact.discrete_lagrangian import exact_discrete_lagrangian, exact_map
-from scvi_codegen.systems.formulas.expressions import evaluate
 
 OSCILLATOR = problem("harmonic-oscillator").system
 PENDULUM = problem("planar-pendulum").system
@@ -96,29 +94,6 @@ TIME = 0.3
 def all_but(long):
     """The cases, one of them in the full tier."""
     return [pytest.param(name, marks=[pytest.mark.full] if name == long else []) for name in CASES]
-
-
-@pytest.mark.rotated
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize("name", all_but("double-pendulum"))
-def test_momenta_and_energy_are_the_derivatives_of_the_action(name):
-    """dL_d = -p0 . dq0 + p1 . dq1 + (L - p1 . v1) dh, the Hamilton-Jacobi equation, by central differences."""
-    system, q, v, h = CASES[name]
-    h, width, ways = mp.mpf(h) / 2, mp.mpf("1e-11"), np.arange(1, len(q) + 1)
-    q0 = np.array([mp.mpf(x) for x in q])
-    q1 = q0 + h * np.array([mp.mpf(x) for x in v])
-
-    def action(distance):
-        moved = (q0 + 2 * ways * distance, q1 - ways * distance, h + distance)
-        return exact_discrete_lagrangian(system, *moved, t=TIME, digits=35)
-
-    here, derivative = action(0), (action(width).action - action(-width).action) / (2 * width)
-    end = zip((*system.coordinates, *system.velocities), (*here.q1, *here.v1), strict=True)
-    constants = zip((*system.parameters, system.time), (*system.defaults, mp.mpf(TIME) + h), strict=True)
-    lagrangian = evaluate(system.lagrangian, {symbol: mp.mpf(value) for symbol, value in (*end, *constants)})
-    work = mp.fdot(here.p1, here.v1)
-    expected = -mp.fdot(here.p0, 2 * ways) - mp.fdot(here.p1, ways) + lagrangian - work
-    assert abs(derivative - expected) < mp.mpf("1e-18")
 
 
 @pytest.mark.rotated

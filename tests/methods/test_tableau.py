@@ -83,23 +83,6 @@ def test_user_defined_tableau_is_recognised_by_its_numbers() -> None:
     assert exact_tableau(Tableau(name="gauss:1", A=((mp.pi,),), b=(1,), c=(1,))) is None
 
 
-@pytest.mark.full
-@settings(max_examples=40, deadline=None)
-@given(st.lists(st.fractions(min_value=0, max_value=1, max_denominator=50), min_size=1, max_size=6, unique=True))
-def test_collocation_is_equation_23_in_rational_arithmetic(abscissae: list[Fraction]) -> None:
-    c = sorted(abscissae)
-    t = sp.Symbol("t")
-    tableau = collocation_tableau(c)
-    for j, here in enumerate(c):
-        factors = [(t - sp.Rational(x)) / (sp.Rational(here) - sp.Rational(x)) for x in c if x != here]
-        primitive = sp.integrate(sp.expand(sp.prod(factors)), t)
-        column = [*(row[j] for row in tableau.A), tableau.b[j]]
-        for ours, end in zip(column, [*c, 1], strict=True):
-            exact = primitive.subs(t, sp.Rational(end))
-            assert abs(ours - mp.mpf(exact.p) / exact.q) < mp.mpf("1e-45")
-    assert tableau.order >= len(c)
-
-
 @pytest.mark.parametrize("s", [1, 2, 3, 5, 8, 12])
 def test_the_stability_function_of_gauss_is_the_diagonal_pade_approximant(s: int) -> None:
     P, Q = gauss(s).stability_function()

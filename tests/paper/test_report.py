@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import base64
-import os
-import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -191,37 +187,3 @@ class TestCommand:
         assert list(found["failures"]) == ["broken"]
         assert "reproduced/table-8.txt" in found["written"]
         assert output_of(*COMMAND, "table-8", "--quiet") == output_of(*COMMAND, "--list", "--quiet") == ""
-
-
-INTERRUPTED = """
-from pathlib import Path
-from scvi_codegen.paper.command import reproduce_experiments
-done = reproduce_experiments(["table-9", "slow"], Path("made"), None, 2, module="toy_experiments")
-print("interrupted" if done.interrupted else "not interrupted", [path.name for path in done.files])
-"""
-
-
-@pytest.mark.rotated
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals for process groups")
-def test_interrupt_ends_all_processes_and_saves_results(tmp_path):
-    path = f"import sys; sys.path[:0] = {sys.path!r}\n"
-    child = subprocess.Popen(
-        [sys.executable, "-c", path + INTERRUPTED],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    assert child.stdout is not None
-    assert child.stdout.readline().startswith("table-9")
-    interrupt_group(child)
-    output, errors = child.communicate(timeout=300.0)  # by itself it would take twice as long
-    assert output == "interrupted ['table-9.txt']\n"
-    assert "Traceback" not in errors
-    assert (tmp_path / "made" / "table-9.txt").is_file()
-
-
-def interrupt_group(child: subprocess.Popen[str]) -> None:
-    """Send the signal of Ctrl-C to the process group, as a terminal does."""
-    os.killpg(child.pid, signal.SIGINT)

@@ -4,7 +4,6 @@ Each case changes one of the files of a valid document and reads it. It may open
 names, write nothing, start nothing, and needs a bounded number of function calls and a bounded memory.
 """
 
-import errno
 import os
 import re
 import warnings
@@ -28,7 +27,6 @@ import scvi_codegen as sc
 from scvi_codegen import BuildError, ModelFileError, generate_package, load_model
 from scvi_codegen.codegen.native import building
 from scvi_codegen.interfaces.models.model_files.ensemble_file import load_ensemble
-from scvi_codegen.runs.recording import writing
 
 ROBOTS = Path(__file__).parents[1] / "systems" / "robots"
 END = '[method]\nmethod = "svi:2"\n[run]\nstep = 0.1\nsteps = 10\n'
@@ -372,18 +370,6 @@ def test_only_regular_files_are_read(name: str, other: str, tmp_path: Path) -> N
         (tmp_path / name).mkdir()
     with limited_memory(), guarded(may_compile=True), pytest.raises(sc.ScviCodegenError, match=r"regular|directory"):
         kind.read(tmp_path)
-
-
-@pytest.mark.second
-def test_a_full_disk_before_the_manifest_leaves_nothing_to_resume(tmp_path: Path) -> None:
-    run = sc.compile_stepper(sc.problem("planar-pendulum").system, "svi:2", flags=QUICK_FLAGS).start(
-        [1.0], [0.0], h=0.1
-    )
-    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    with mock.patch.object(writing, "write_manifest", side_effect=full), pytest.raises(sc.RecordingError) as caught:
-        sc.record_run(run, tmp_path / "a.run", steps=20)
-    assert "Nothing was recorded" in str(caught.value)
-    assert "resume" not in str(caught.value)
 
 
 @pytest.mark.second

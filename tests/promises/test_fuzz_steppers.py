@@ -215,21 +215,6 @@ def test_oscillator_of_any_size_with_any_step_is_correct_or_rejected(kind, solve
     assert done > 100
 
 
-@pytest.mark.rotated
-def test_ensemble_with_any_sizes_is_correct_or_reports_failures():
-    stepper = prepared(sc.compile_stepper(oscillator("lagrangian"), sc.SVI(2), flags=QUICK_FLAGS))
-    random = Random(3)
-    q, p = (np.array([[random.choice((-1, 1)) * random.choice(SIZES)] for _ in range(200)]) for _ in "qp")
-    for h in (1e-310, 1e-3, 0.7, -1.0, 40.0, 1e8):
-        runs = stepper.integrate_ensemble(q, p, h=h, steps=3, threads=1)
-        assert runs.ok.sum() > 20
-        for j in np.flatnonzero(runs.ok):
-            found = complex(runs.q[-1, j, 0], runs.p[-1, j, 0])
-            expected = exact_step(q[j, 0], p[j, 0], h, 3)
-            assert abs(found - expected) <= 3 * rounding(q[j, 0], p[j, 0], h)
-        assert np.isnan(runs.q[-1, ~runs.ok]).all()
-
-
 NONLINEAR = [
     ("kepler", sc.SVI(3)),
     ("double-pendulum", sc.SCVI(2)),

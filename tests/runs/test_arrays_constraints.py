@@ -49,12 +49,6 @@ def stepper():
     return sc.compile_stepper(net(), RATTLE)
 
 
-def with_fields(data, count):
-    """Arrays of parameters in full."""
-    parameters = data["parameters"]
-    return {"tables": data["tables"], "parameters": {"l": np.full(count, parameters["l"]), "m": parameters["m"]}}
-
-
 @pytest.mark.parametrize("count", [30, 2000])
 def test_every_state_of_a_chain_satisfies_its_constraints(stepper, count):
     q, data = chain(count)
@@ -197,42 +191,3 @@ def test_discontinuous_constraint_parameters_are_rejected(stepper):
 def test_methods_without_constraint_support_are_rejected(method):
     with pytest.raises(sc.MethodError, match="RATTLE"):
         sc.compile_stepper(net(), method)
-
-
-@pytest.fixture(scope="module")
-def windy():
-    """A net in air: quadratic drag against a wind that varies in time, and dissipation in the rods."""
-    still = net()
-    return sc.LagrangianSystem.from_text(
-        name="net in wind",
-        coordinates=["r[N, 2]"],
-        parameters={**dict.fromkeys(["m[N]", "l[B]"], 1), "g": 9.81, "x[P, 2]": 0, "c": 0.3, "w": 2},
-        tables=["bonds[B, 2]", "pins[P]"],
-        lagrangian=still.definition["lagrangian"],
-        constraints=still.definition["constraints"],
-        forces={"r[i, 0]": "-c*m[i]*(r_dot[i, 0] - w*cos(t))*((r_dot[i, 0] - w*cos(t))**2 + 1)"},
-        dissipation="sum(b in B, c/5*(r_dot[bonds[b, 0], 1] - r_dot[bonds[b, 1], 1])**2/2)",
-    )
-
-
-@pytest.mark.rotated
-def test_velocity_dependent_forces(windy):
-    q, data = chain(3)
-    unrolled = sc.unroll_sums(windy, {"N": 4, "B": 3, "P": 1}, **with_fields(data, 3))
-    fine = sc.compile_stepper(unrolled, "svi:4")
-    expected = fine.integrate(*fine.project(q.ravel()), h=0.01, steps=40)
-    for method, order, counts in ((RATTLE, 2, (160, 320)), ("composition:8", 8, (16, 32))):
-        compiled = sc.compile_stepper(windy, method)
-        ends = []
-        for steps in counts:
-            run = compiled.start(q, h=0.4 / steps, **data)
-            run.advance(steps)
-            ends.append(run.q["r"].ravel())
-            assert max(residuals(run)) < 1e-12
-        errors = [np.abs(end - expected.q[-1]).max() for end in ends]
-        assert np.log2(errors[0] / errors[1]) > order - 0.7
-        known = fine.multipliers(run.q["r"].ravel(), run.p["r"].ravel(), run.t)
-        np.testing.assert_allclose(np.concatenate([each.ravel() for each in run.multipliers]), known, rtol=1e-9)
-        back = compiled.start(run.q, run.p, h=-run.h, t=run.t, **data)
-        back.advance(counts[1])
-        assert np.abs(back.q["r"] - q).max() < 1e-12

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
 import scvi_codegen as sc
 
@@ -33,42 +33,6 @@ def test_motion_is_that_of_named_coordinates(method):
     assert_allclose(run.p["q"], np.asarray(exact.p), atol=1e-9)
     assert run.heat() == pytest.approx(exact.heat(), abs=1e-9)
     assert not run.momentum_maps().size
-
-
-@pytest.mark.rotated
-def test_temperatures_of_a_mixture_of_atoms_and_bits():
-    """Friction on one of two species heats both to kT, within four standard errors; total momentum is not conserved."""
-    square = "sum(a in 3, wrap(r[i, a] - r[j, a], box)**2)"
-    mixture = sc.LagrangianSystem.from_text(
-        name="warm_mixture",
-        coordinates=["r[N, 3]"],
-        parameters={"box": 5.0, "cut": 2.0, "m[N]": 1.0, "c[N]": 1.0, "kT": 1.3},
-        neighbours={"near": {"of": "r", "cutoff": "cut", "box": "box", "skin": 0.4}},
-        lagrangian=f"sum(i in N, sum(a in 3, m[i]*r_dot[i, a]**2)/2)"
-        f"- sum(i < j in near, 20*positive_part(1 - {square}/cut**2)**4)",
-        dissipation="sum(i in N, sum(a in 3, c[i]*r_dot[i, a]**2))/2",
-        temperature="kT",
-    )
-    stepper, count = sc.compile_stepper(mixture, "stoermer-verlet"), 64
-    heavy = np.arange(count) % 2
-    values = {"m": 1.0 + 3.0 * heavy, "c": 2.0 * heavy}
-    r = np.stack(np.meshgrid(*[np.arange(4)] * 3), -1).reshape(-1, 3) * 1.25
-    settings = {"h": 0.02, "save_every": 20, "parameters": values, "seed": 5}
-    run = stepper.integrate(r, np.zeros((count, 3)), steps=20_000, **settings)
-    kinetic = (run.p["r"] ** 2).sum(axis=2) / values["m"]
-    temperatures = np.stack([kinetic[:, heavy == k].mean(axis=1) / 3 for k in (0, 1)], axis=-1)
-    mean, error, _ = sc.average(run, temperatures)
-    assert (error < 0.02).all()
-    assert (abs(mean - 1.3) < 4 * error).all()
-    assert_allclose(sc.temperature(run), kinetic.sum(axis=1) / (3 * count), rtol=1e-12)
-    shared = stepper.integrate(r, np.zeros((count, 3)), steps=400, threads=2, **settings)
-    assert_array_equal(shared.p["r"], run.p["r"][:21])
-    resumed = stepper.start(r, np.zeros((count, 3)), h=0.02, parameters=values, seed=5)
-    resumed.advance(150)
-    resumed = stepper.from_checkpoint(resumed.checkpoint())
-    resumed.advance(250)
-    assert_array_equal(resumed.p["r"], run.p["r"][20])
-    assert resumed.bath.heat == shared.heat()
 
 
 @pytest.mark.rotated

@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from notation import hamilton, lagrange
+from notation import hamilton
 from samples import QUICK_FLAGS
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
-from scvi_codegen.runs.states.rotations import state_by_name
 
 RNG = np.random.default_rng(3)
 QUATERNIONS, OMEGA, UNIT = RNG.normal(size=(3, 4)), RNG.normal(size=(3, 3)), RNG.normal(size=(2, 3))
@@ -96,19 +95,3 @@ def test_spin_chain_against_scipy(size):
     product = run.spin("s")[:, 5, 2] * run.spin("s")[:, 0, 1]
     assert len(run.events[0]) == (np.diff(np.sign(product)) != 0).sum() > 0
     assert run.spin("s_3").shape == (101, 3)
-
-
-def test_batches_of_arrays_with_two_axes_are_states_one_by_one():
-    """The axes of a batch precede those of an array."""
-    text = "sum(i in 2, j in 3, x_dot[i, j]**2) + sum(i in 2, omega_1[i]**2 + omega_2[i]**2 + omega_3[i]**2)"
-    system = lagrange("plates", ["x[2, 3]"], text, rotations={"R[2]": "omega"})
-    q = {"x": RNG.normal(size=(5, 2, 3)), "R": RNG.normal(size=(5, 2, 4))}
-    velocity = {"x": RNG.normal(size=(5, 2, 3)), "omega": RNG.normal(size=(5, 2, 3))}
-    many = state_by_name(system, q, None, velocity)
-    assert np.array_equal(many[0][:, :6], q["x"].reshape(5, 6))
-    for k in range(5):
-        one = state_by_name(
-            system, *({name: x[k] for name, x in each.items()} if each else None for each in (q, None, velocity))
-        )
-        assert np.array_equal(one[0], many[0][k])
-        assert np.array_equal(one[2], many[2][k])

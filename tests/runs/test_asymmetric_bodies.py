@@ -8,10 +8,6 @@ from mpmath import mp, mpf
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.methods.discretise import discretised_form
-from scvi_codegen.systems.formulas.expressions import Tape
-from scvi_codegen.systems.formulas.symbols import symbol
-from scvi_codegen.systems.splittings.kinetic import kinetic_splitting
 
 DIGITS = 50
 BITS = 180
@@ -144,23 +140,6 @@ def test_rest_and_rotation_about_the_middle_axis_are_exact(stepper):
         q, p = stepper.step([1, 0, 0, 0], [0, 0, 6, 0], h, parameters=moments)
         np.testing.assert_allclose(q, [np.cos(0.75 * h), 0, np.sin(0.75 * h), 0], rtol=0, atol=1e-15 * (1 + h))
         np.testing.assert_allclose(product([q[0], *-q[1:]], p), [0, 0, 6, 0], rtol=0, atol=2e-15)
-
-
-@pytest.mark.second
-def test_the_expressions_of_which_derivatives_are_taken_are_the_same_flow():
-    split = kinetic_splitting(discretised_form(BODY, sc.Composition(8)))
-    u = tuple(symbol(f"u_{i}") for i in range(4))
-    moved, turned = split.flow(u)
-    flow = Tape([*moved, *turned], (*split.system.coordinates, *u, *split.system.parameters))
-    for moments, omega, h in (CASES["doubling"], CASES["on the separatrix"]):
-        Pi = [mpf(i) * mpf(w) for i, w in zip(moments, omega, strict=True)]
-        with mp.workdps(DIGITS):
-            start = momenta([mpf(x) for x in ATTITUDE], Pi)
-            begin = [*map(mpf, ATTITUDE), *(h * x for x in start)]
-            values = [x + y for x, y in zip(begin, flow([*begin, *map(mpf, moments)]), strict=True)]
-            q, last = exact(moments, Pi, ATTITUDE, h)
-            end = [*q, *(h * x for x in momenta(q, last))]
-            assert max(abs(x - y) for x, y in zip(values, end, strict=True)) < mpf(10) ** -26
 
 
 @pytest.mark.full

@@ -195,22 +195,6 @@ def test_zero_temperature_is_plain_damping_and_heat_balances_the_energy():
     assert abs(energy[-1] - energy[0] - warm.heat()) < 1e-7 < abs(warm.heat())
 
 
-@pytest.mark.second
-def test_metropolised_and_plain_averages_in_a_double_well():
-    x = np.linspace(-5, 5, 4001)
-    weight = np.exp(-((x**2 - 1) ** 2) - x / 2)
-    exact = np.array([(weight * f).sum() / weight.sum() for f in (x, x**2)])
-
-    def observe(q):
-        return np.stack([q[..., 0], q[..., 0] ** 2], axis=-1)
-
-    well = compiled("stoermer-verlet", "well", **WELL)
-    assert agrees(*averages(well, [1.0], 0.4, 10000, observe, metropolis=True), exact, 0.01)
-    smooth = compiled("composition:4", "well", **WELL)
-    assert agrees(*averages(smooth, [1.0], 0.3, 10000, observe), exact, 0.02)
-    assert 0.8 < well.integrate([1.0], [0.0], h=0.4, steps=2000, metropolis=True).acceptance < 0.95
-
-
 @pytest.mark.rotated
 def test_metropolis_with_a_magnetic_field_has_a_direction_variable():
     # a charge in B = 2 and an asymmetric potential; flipped momenta would bias <x> by -.155 and <y^2> by .67

@@ -1,7 +1,5 @@
 """Step density of a time transformation: the reversible controller of Hairer and Soederlind."""
 
-import pickle
-
 import numpy as np
 import pytest
 from notation import hamilton, lagrange
@@ -13,7 +11,6 @@ from scvi_codegen.runs.stepping.step_plan import InTau
 KEPLER = sc.problem("kepler").system
 E = 0.8
 START = np.array([1.0 - E, 0.0]), np.array([0.0, np.sqrt((1.0 + E) / (1.0 - E))])
-PERIOD = 2.0 * np.pi
 RADIUS = "(q1**2 + q2**2)**(3/4)"
 
 DRIVEN = lagrange("driven and damped", "x", "x_dot**2/2 - x**4/4 + x*cos(2*t)/2", forces={"x": "-x_dot/10"})
@@ -134,22 +131,6 @@ def test_time_transformations_of_runs_with_inputs():
     assert np.abs([back.q[-1], back.p[-1]]).max() < 1e-14
     with pytest.raises(sc.StateError, match=r"give h .constant step in tau. and t_end"):
         stepper.integrate([0.0], [0.0], **given, steps=10)
-
-
-@pytest.mark.rotated
-def test_dense_output_events_and_continuation_with_step_density():
-    stepper = kepler(sc.SVI(8), events="q1*q1_dot + q2*q2_dot")
-    run = stepper.integrate(*START, h=0.2, t_end=3 * PERIOD)
-    assert run.events[0].t == pytest.approx(PERIOD / 2 * np.arange(1, 6), abs=1e-11)
-    exact = sc.compile_stepper(KEPLER, sc.SVI(8), flags=QUICK_FLAGS).integrate(*START, t_end=2.5)
-    assert run.at(2.5)[0] == pytest.approx(exact.q[-1], abs=1e-11)
-    pieces = stepper.start(*START, h=0.2, t_end=3 * PERIOD)
-    for _ in range(3):
-        pieces.record(11)
-    again = pickle.loads(pickle.dumps(pieces))
-    restored = stepper.from_checkpoint(pieces.checkpoint(), h=0.2, t_end=3 * PERIOD)
-    for each in (pieces, again, restored):
-        assert np.array_equal(each.record().q[-1], run.q[-1])
 
 
 def test_checkpoints_require_the_step_size():

@@ -1,7 +1,6 @@
 """Double-double steps whose stage equations Newton's method solves, against 60 digits and other coordinates."""
 
 from fractions import Fraction
-from operator import mul
 
 import numpy as np
 import pytest
@@ -219,33 +218,3 @@ def test_iterations_of_mixed_precision(degree: int) -> None:
                 assert abs(runs[0].mp(name) - runs[1].mp(name)).max() < 1e-30
             if moving.constraints:
                 assert max(abs(each).max() for each in runs[0].constraint_values()) < 5e-31
-
-
-def test_light_axis_of_a_body_costs_few_steps():
-    """Newton's method in one word has few digits of the velocities: those of two words decide the size of the steps.
-
-    The body with moments a, 1, 1 turns about its momentum and about its axis (Landau & Lifshitz, Mechanics, 33).
-    """
-    text, light, end = "(a*omega_1**2 + b*omega_2**2 + c*omega_3**2)/2", 2.0**-13, 10
-    system = lagrange("body", (), text, rotations={"R": "omega"}, a=1.0, b=1.0, c=1.0)
-    stepper = sc.compile_stepper(system, "svi:8", precision="double-double")
-    arguments = {"velocity": {"omega": [0.3, 0.8, 0.5]}, "parameters": {"a": light}, "t_end": float(end)}
-    run = stepper.integrate({"R": np.eye(3)}, **arguments)
-    assert run.steps + run.rejected_steps < 100  # 55 of a = 1/100, thousands without
-    assert run.step_error < 1e-27
-
-    def product(a, b):
-        (s, *x), (t, *y) = a, b
-        cross = x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]
-        return [s * t - sum(map(mul, x, y)), *(s * v + t * u + w for u, v, w in zip(x, y, cross, strict=True))]
-
-    def turn(vector):
-        angle = mp.sqrt(sum(x * x for x in vector))
-        return [mp.cos(angle / 2), *(mp.sin(angle / 2) / angle * x for x in vector)]
-
-    with mp.workdps(40):
-        q, p = run.mp("q"), run.mp("p")
-        momentum = product([q[0][0], *-q[0][1:]], p[0])[1:]
-        about_axis = [momentum[0] / 2 / mp.mpf(light) - momentum[0] / 2, 0, 0]
-        exact = product(q[0], product(turn([x / 2 * end for x in momentum]), turn([x * end for x in about_axis])))
-        assert max(abs(x - y) for x, y in zip(exact, q[-1], strict=True)) < 1e-24

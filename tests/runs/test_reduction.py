@@ -3,17 +3,12 @@
 Expected values: linearised Euler equations about steady rotations, periods of pendulums by elliptic integrals.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from notation import hamilton, lagrange
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.analysis.verification.structure import structure_checks
-from scvi_codegen.analysis.verification.system_under_test import State, SystemUnderTest
-from scvi_codegen.codegen.pipeline import Sources
 from scvi_codegen.runs.states.reduction import Reduction
 
 pytestmark = pytest.mark.rotated
@@ -116,33 +111,3 @@ def test_unstable_orbits_are_found_by_segments_with_their_multipliers():
     rate = np.log(np.abs(orbit.multipliers[0])) / orbit.period
     assert rate / orbit.run().angular_velocity()[0, 1] == pytest.approx(np.sqrt(0.5 / 2.5), rel=1e-8)
     assert not orbit.stable
-
-
-def checks_of(system, start, method="svi:2", step=None):
-    stepper = compiled(system, method)
-    run = stepper.integrate(start[0], velocity=start[1], h=0.1, steps=1)
-    tested = SystemUnderTest(system, sc.as_method(method, system), stepper, None, State(run.q[0], run.p[0], 0.0, 0.1))
-    if step:
-        tested = replace(tested, stepper=step(stepper))
-    return {check.name: check for check in structure_checks(tested) if check.name in REDUCED}
-
-
-REDUCED = ("gauge invariance", "reduced symplecticity")
-
-
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize(("system", "start"), [(MIXED, (START, MOVING)), (SPINS, (DIRECTIONS, None))])
-def test_certificates_contain_gauge_invariance_and_reduced_symplecticity(system, start):
-    checks = checks_of(system, start)
-    assert [checks[name].outcome.name for name in REDUCED] == ["SATISFIED"] * 2
-    assert ("T*SO(3) and T*S^2" if system is MIXED else "(S^2)") in checks["reduced symplecticity"].statement
-
-
-@pytest.mark.parametrize("system", [MIXED, SPINS], ids=lambda system: system.name)
-def test_derivatives_of_the_gauge_are_those_of_differences(system):
-    reduction = Reduction(Sources(system, sc.as_method("svi:1")).integrator()[1])
-    state, like = np.random.default_rng(3).normal(size=(2, 2 * system.dimension))
-    _, rows = reduction.gauge(state, like)
-    for k, unit in enumerate(np.eye(len(state))):
-        ahead, behind = (reduction.gauge(state + sign * unit, like)[0] for sign in (1, -1))
-        np.testing.assert_allclose(rows[:, k], (ahead - behind) / 2, rtol=0, atol=1e-14)

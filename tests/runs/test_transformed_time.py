@@ -8,10 +8,7 @@ import pytest
 from notation import lagrange
 
 import scvi_codegen as sc
-from scvi_codegen.common.precision import mp
-from scvi_codegen.methods.exact.solution import ExactMotion
 from scvi_codegen.runs.results.time_transformation import part_of_step
-from scvi_codegen.systems.formulas.symbols import symbol
 
 KEPLER = lagrange("Kepler", "x y", "(x_dot**2 + y_dot**2)/2 + mu/sqrt(x**2 + y**2)", mu=1.0)
 ECCENTRICITY = 0.9
@@ -56,38 +53,6 @@ def test_time_satisfies_keplers_equation(form: str, solver: str) -> None:
     assert np.ptp(run.energy()) < 1e-13
     assert run.tau is not None
     assert np.array_equal(run.tau, 0.1 * np.arange(301)) or np.abs(run.tau - 0.1 * np.arange(301)).max() < 1e-14
-
-
-@pytest.mark.rotated
-@pytest.mark.parametrize(("form", "method"), [("L", "three points"), ("K", "radau"), ("K, momenta", "lobatto")])
-def test_order_of_the_time_is_that_of_the_method(form: str, method: str) -> None:
-    """Compare one step with the exact solution of (q, p) and t = integral of the rate, in 45 digits."""
-    made, order = stepper(form, "auto", method), METHODS[method].order
-    errors = []
-    for h in (0.4, 0.2):
-        run = made.integrate(*START, h=h, steps=1)
-        errors.append(abs(run.t[-1] - _exact_time(form, h)))
-    assert errors[0] > 1e-13
-    assert np.log2(errors[0] / errors[1]) > order + 0.5
-
-
-def _exact_time(form: str, h: float) -> float:
-    """Return the physical duration of tau = h: K = g (H + p_t) advances t."""
-    system = system_of(form)
-    if isinstance(system, sc.LagrangianSystem):
-        system = sc.hamiltonian_of(system)
-    assert system.clock is not None
-    extended = sc.HamiltonianSystem.from_sympy(
-        name="extended",
-        coordinates=[*system.coordinates, symbol("s")],
-        momenta=[*system.momenta, symbol("p_s")],
-        hamiltonian=system.hamiltonian + system.clock.rate * symbol("p_s"),
-        parameters={name.name: value for name, value in system.constants.items()},
-    )
-    q, p = START
-    level = float(stepper(form).energy(q, p))
-    motion = ExactMotion(extended, [mp.mpf(1), mp.mpf(level)])
-    return float(motion.flow([*q, 0], [*p, 0], mp.mpf(h))[0][-1])
 
 
 @pytest.mark.second

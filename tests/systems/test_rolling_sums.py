@@ -91,27 +91,6 @@ def test_unsupported_systems_are_rejected(system, message):
         sc.roll_sums(system)
 
 
-@pytest.mark.second
-def test_inputs_retain_their_names():
-    q = [f"q{i}" for i in range(4)]
-    springs = "".join(f" - ({b} - {a})**2/2" for a, b in pairwise(q))
-    text = " + ".join(f"{a}_dot**2/2" for a in q) + springs + " + q0*u"
-    system = lagrange("driven", q, text, inputs="u", forces={"q3": "-u*q3_dot"})
-    found = sc.roll_sums(system)
-    assert found.system.inputs == ("u",)
-    assert (
-        found.system.parameters == lagrange("u", "q[N]", "sum(i in N, q_dot[i]**2/2 + u*q[i])", inputs="u").parameters
-    )
-    data = {"u": (np.linspace(0, 1, 11), np.sin(np.linspace(0, 1, 11)))}
-    run = sc.compile_stepper(found.system, "svi:3").integrate(
-        np.zeros(4), inputs=data, h=0.1, steps=5, tables=found.tables, parameters=found.parameters
-    )
-    other = sc.compile_stepper(system, "svi:3").integrate(
-        np.zeros(4), velocity=np.zeros(4), inputs=data, h=0.1, steps=5
-    )
-    assert run.q["q"][-1] == pytest.approx(other.q[-1], abs=1e-14)
-
-
 @pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", ["b", "q", "N", "at0", "B0", "q_dot", "c0_1", "p_q"])
