@@ -57,6 +57,7 @@ def compiled_functions(folder: Path) -> ctypes.CDLL:
         return headers.get(f"support/{name}") or (support / name).read_text()
 
     names = [
+        "core/numbers.h",
         "core/vector_width.h",
         "core/vectors.h",
         *(f"double_double/{name}.h" for name in ("words", "number_pairs", "vector_words")),
