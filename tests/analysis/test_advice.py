@@ -231,7 +231,7 @@ class TestHonesty:
         ends = [stepper.integrate(entry.q, p, h=advice.h / n, steps=n * advice.steps).q[-1] for n in (1, 3)]
         assert 1e-7 < np.linalg.norm(ends[0] - ends[1]) / np.linalg.norm(ends[1]) < 2e-5
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_quadratic_error_growth_is_extrapolated_quadratically(self):
         system, (q, p) = problem("kepler").system, kepler_start(0.5)
         message = advise(system, RadauIIA(3), q, p, 50_000.0, 1e-6).message

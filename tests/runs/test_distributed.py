@@ -72,6 +72,7 @@ class TestCluster:
         assert np.flatnonzero(~result.ok).tolist() == [5]
         assert result.steps[5] < 50
 
+    @pytest.mark.rotated
     def test_streams_of_noise_are_those_of_the_trajectories(self, distributed: Any, cluster: Any):
         """In SIMD lanes, with an odd start of a slice, and as inputs of a bath."""
         warm = sc.LagrangianSystem.from_text(

@@ -34,7 +34,7 @@ from scipy.integrate import solve_ivp
 
 import scvi_codegen as sc
 
-pytestmark = pytest.mark.second
+pytestmark = pytest.mark.tiers(0, 1)
 STEPS = pytest.mark.parametrize("steps", [{"h": 0.3}, {}], ids=["fixed", "adaptive"])
 
 
