@@ -30,8 +30,6 @@ from scvi_codegen.systems.formulas.symbols import symbol
 from scvi_codegen.systems.legendre.transform import equivalent_lagrangian
 from scvi_codegen.systems.system import MechanicalSystem
 
-SMALLEST = S(VANISHING)
-"""Added to the square of an angle, so that sin(x)/x and its derivatives have values at 0."""
 DOUBLINGS = 20
 """Doublings of the argument of elliptic functions: series of 4 terms at 2^-20 are correct to 45 digits."""
 
@@ -75,7 +73,7 @@ class KineticSplitting:
                 offsets = {j: outer, k: inner}
                 g = _elliptic_turn(j, [intermediate(common + offsets.get(n, S.Zero)) for n in range(3)], momentum)
             vector = [intermediate(component) for component in axes * Matrix(g.args[1:])]
-            real, size = intermediate(g.a), intermediate(sqrt(SMALLEST + g.a**2))
+            real, size = intermediate(g.a), intermediate(sqrt(VANISHING + g.a**2))
             less = intermediate(real - size - Add(*(x**2 for x in vector)) / (1 + size))
             moved[quaternion], turned[quaternion] = (list((x * Quaternion(less, *vector)).args) for x in pair)
         return moved, turned
@@ -83,7 +81,7 @@ class KineticSplitting:
 
 def exponential(half: Sequence[Expr]) -> Quaternion:
     """Return exp(v) for a vector v, half of a rotation vector."""
-    angle = intermediate(sqrt(Add(SMALLEST, *(x**2 for x in half))))
+    angle = intermediate(sqrt(Add(VANISHING, *(x**2 for x in half))))
     return Quaternion(cos(angle), *(sin(angle) / angle * x for x in half))
 
 
@@ -95,7 +93,7 @@ def _elliptic_turn(m: int, a: Sequence[Expr], momentum: Sequence[Expr]) -> Quate
     left, right = (m + 2) % 3, (m + 1) % 3
     x, y, z = (momentum[axis] for axis in (left, m, right))
     ls, ms, lm = (intermediate(a[i] - a[j]) for i, j in ((left, right), (m, right), (left, m)))
-    norm = intermediate(sqrt(Add(SMALLEST, x**2, y**2, z**2)))
+    norm = intermediate(sqrt(Add(VANISHING, x**2, y**2, z**2)))
     U = intermediate(ls * x**2 + ms * y**2)
     A, B, N = (intermediate(invariant) for invariant in (lm * U, ms * (ls * z**2 + lm * y**2), ms * U))
     Q, step = intermediate(N * ls * norm), S.One / 2 ** (DOUBLINGS + 1)
