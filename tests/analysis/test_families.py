@@ -102,30 +102,6 @@ def test_isola_is_followed_once():
     assert 0.9 < abs(angles[-1] - angles[0]) / (2 * np.pi) < 1.05
 
 
-@pytest.mark.rotated
-@pytest.mark.parametrize("apart", [1e-3, 0.0])
-def test_two_branches_between_two_orbits(apart):
-    """The indices of y and z pass 1 at stiffnesses of y that differ by ``apart``, which leaves the orbit unchanged."""
-    system = sc.LagrangianSystem.from_text(
-        name="two across one",
-        coordinates=["x", "y", "z"],
-        lagrangian="(x_dot**2 + y_dot**2 + z_dot**2)/2 - x**2/2 - x**4/4 - k*y**2/2 - (k + d)*z**2/2"
-        " + x**2*(y**2 + z**2)/5",
-        parameters={"k": 1.5, "d": apart},
-    )
-    stepper = sc.compile_stepper(system, "svi:6")
-    orbit = sc.periodic_orbit(stepper, [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], period=4.77, fixed=["x"])
-    family = sc.family(stepper, orbit, parameter="k", fixed=["x"], until="k > 2.2")
-    assert family.periods == pytest.approx(np.full(len(family), orbit.period), rel=1e-12)
-    assert [found.kind for found in family.bifurcations] == ["branch"] * 4
-    numbers = [found.after for found in family.bifurcations]
-    assert numbers[0] == numbers[1] < numbers[2] == numbers[3]
-    k = np.sort([found.orbit.parameters[0] for found in family.bifurcations])
-    assert np.diff(k)[[0, 2]] == pytest.approx([apart, apart], abs=1e-9)
-    for found in family.bifurcations:
-        assert np.sort(abs(found.orbit.stability_indices - 1))[1] < 1e-8
-
-
 @pytest.mark.second
 def test_units_of_a_parameter_without_effect_on_the_orbit():
     """A stiffness k across the plane, from 0, in units of 1 and 1e10, and one that changes nothing."""

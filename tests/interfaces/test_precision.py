@@ -1,5 +1,6 @@
 """Option --precision of ``run`` and key of model files: digits of the final state, both words, refusals."""
 
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -138,3 +139,28 @@ def test_precision_is_read_and_replaced(spring: Path) -> None:
         run = sc.load_model(spring, {"run": choices}).integrate()
         with mp.workdps(40):
             assert abs(run.mp("q")[-1, 0] - mp.cos(1.3) / 2 - mp.sin(1.3) / 4) < 1e-30
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize(
+    ("file", "text", "starts"),
+    [
+        ("grid.toml", '[grid]\nq = ["1/3", 0.1]\nw = {from = 0.1, to = 0.4, count = 4}\n', "1/3 0.1"),
+        ("table.csv", "q,p_q,w\n0.1,0.2,0.3\n0.7,0.2,0.1\n", "0.1 0.7"),
+    ],
+)
+def test_ensembles_are_exact(spring: Path, file: str, text: str, starts: str) -> None:
+    """Numbers of grids and tables are exact decimals and fractions, and all final states have 30 digits."""
+    spring.write_text(TEXT.replace("- q**2/2", "- w*q**2/2").replace("[initial]", "[parameters]\nw = 0.3\n[initial]"))
+    Path(file).write_text(text)
+    invoke("run", spring, "--ensemble", file, "-o", "ends.npz")
+    with mp.workdps(40), np.load("ends.npz") as saved:
+        tenths = [1, 2, 3, 4] if file == "grid.toml" else [3, 1]
+        q0 = [mp.mpf(Fraction(each).numerator) / Fraction(each).denominator for each in starts.split()]
+        states = [(q, w) for q in q0 for w in tenths] if file == "grid.toml" else list(zip(q0, tenths, strict=True))
+        v = mp.mpf(1) / (4 if file == "grid.toml" else 5)
+        assert len(states) == len(saved["status"])
+        for j, (q, w) in enumerate(states):
+            rate = mp.sqrt(mp.mpf(w) / 10)
+            exact = q * mp.cos(2 * rate) + v * mp.sin(2 * rate) / rate
+            assert abs(mp.mpf(saved["q"][-1, j, 0]) + saved["q_low"][-1, j, 0] - exact) < 1e-30

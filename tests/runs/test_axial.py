@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from samples import QUICK_FLAGS
-from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
 from scvi_codegen.systems.legendre.of_rotations import hamiltonian_of_rotations
@@ -84,18 +83,6 @@ def test_a_reversed_run_of_20_000_steps_returns_to_its_start(top):
     back = top.integrate(there.q[-1], there.p[-1], h=-0.2, steps=20_000, save_every=20_000)
     np.testing.assert_allclose(back.rotation()[-1], there.rotation()[0], rtol=0, atol=1e-8)
     np.testing.assert_allclose(back.body_momentum()[-1], there.body_momentum()[0], rtol=0, atol=1e-8)
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("h", [0.01, 3.0, pytest.param(400.0, marks=pytest.mark.quick)])
-def test_steps_without_a_potential_are_exact(top, h):
-    """The attitude is that after rotations about the angular momentum and about the axis (Routh)."""
-    run = top.integrate(START, velocity=OMEGA, h=h, steps=2, parameters={"w": 0.0})
-    momentum = np.array(OMEGA["omega"]) * [1.0, 1.0, 0.5]
-    turns = [Rotation.from_rotvec(2 * h * momentum), Rotation.from_rotvec([0, 0, 2 * h * momentum[2]])]
-    expected = run.rotation()[0] @ (turns[0] * turns[1]).as_matrix()
-    np.testing.assert_allclose(run.rotation()[-1], expected, rtol=0, atol=1e-15 * (10 + 10 * h))
-    assert run.iterations[1:].tolist() == [1, 1]  # none by Newton's method
 
 
 def test_a_top_at_rest_begins_to_fall(top):

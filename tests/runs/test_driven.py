@@ -240,3 +240,20 @@ def test_events_and_time_transformations_use_inputs_by_name(pendulum):
     assert np.median(np.abs(ratio - 1)) < 0.05
     with pytest.raises(sc.ExpressionError, match=r"Known here: .* u, w"):
         stepper.with_events("v - 1")
+
+
+@pytest.mark.rotated
+def test_failed_run_with_inputs_ends_with_the_last_state():
+    edge = sc.LagrangianSystem.from_text("edge", ["q"], "q_dot**2/2 + sqrt(1 - q)", forces={"q": "u"}, inputs=["u"])
+    stepper = sc.compile_stepper(edge, sc.SVI(2))
+    runs = []
+    for save_every in (1, 1000):
+        with pytest.raises(sc.StepFailedError) as caught:
+            stepper.integrate(
+                [0.0], [1.0], inputs={"u": ([0.0, 0.3, 9.0], [2.0, 2.0, 2.0])}, h=0.01, t_end=9.0, save_every=save_every
+            )
+        runs.append(caught.value.trajectory)
+    every, few = runs
+    assert len(every) > 60
+    assert len(few) == 3  # the start, the breakpoint, the end
+    assert (every.t[-1], every.q[-1], every.p[-1]) == (few.t[-1], few.q[-1], few.p[-1])

@@ -558,22 +558,6 @@ def test_lyapunov_exponent_of_the_stadium_billiard(point):
     assert abs(exponents[0] + exponents[3]) < 1e-10
 
 
-@pytest.mark.second
-@pytest.mark.parametrize("turns", [0, 10_000])
-def test_derivatives_through_impacts_do_not_depend_on_the_turns_of_an_angle(turns):
-    """Differences of states over a step of 61 rad, about 10,000 turns times 2^-10, were no derivatives."""
-    text = "a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)"
-    stepper = sc.compile_stepper(
-        lagrange("arms", "a b", text), "svi:8", events=[sc.impact("cos(b) - 0.2", restitution=0.8)]
-    )
-    start, p = np.array([0.3 + 2 * np.pi * turns, 0.2]), stepper.momentum([0.3, 0.2], [0.0, 1.5])
-    run = stepper.integrate(start, p, h=0.02, steps=80)
-    ends = [stepper.integrate(start + np.array([d, 0.0]), p, h=0.02, steps=80) for d in (1e-5, -1e-5)]
-    differences = [(getattr(ends[0], each)[-1] - getattr(ends[1], each)[-1]) / 2e-5 for each in "qp"]
-    assert len(run.events[0].t) == 1
-    assert run.sensitivity().state[-1][:, 0] == pytest.approx(np.concatenate(differences), rel=1e-4, abs=1e-4)
-
-
 def test_derivatives_are_refused_where_they_do_not_exist(point, ball):
     grazing = point.integrate(
         [-3.0, 1.0 - 1e-14], velocity=[1.0, 0.0], h=0.37, t_end=6.0, events=sc.impact("x**2 + y**2 - 1")

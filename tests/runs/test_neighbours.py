@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import cache, partial
@@ -11,8 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 from notation import lagrange
+from programs import needs
 
 import scvi_codegen as sc
+from scvi_codegen.codegen.native.compilers import find_compiler
 from scvi_codegen.interfaces.models.packages.package import generate_package
 
 SQUARE = "sum(a in 3, wrap(r[i, a] - r[j, a], box)**2)"
@@ -236,3 +239,25 @@ steps = 3
         (tmp_path / "model.toml").write_text(text.replace("3.9", length))
         with pytest.raises(sc.StateError, match=message) if message else nullcontext():
             generate_package(sc.load_model(tmp_path / "model.toml"), tmp_path / "generated_gas")
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize("sanitizer", ["address,undefined", pytest.param("thread", marks=pytest.mark.full)])
+def test_programs_of_packages_make_their_lists(sanitizer: str, tmp_path: Path) -> None:
+    """With three threads and the compiler's sanitizers, from the same start to the same bits."""
+    needs("setarch")
+    r, v = start(3.0, side=7)
+    model = sc.Model(system=liquid(0.1, SOFT), q={"r": r}, velocity={"r": v}, h=0.02, method=sc.SVI(2), span=0.1)
+    folder = sc.generate_package(model, tmp_path / "soft")
+    flags = ["-std=c99", "-O1", "-ffp-contract=off", f"-fsanitize={sanitizer}", "-DSCVI_THREADS", "-pthread"]
+    command = [*find_compiler(), *flags, "-Wno-psabi", "main.c", "soft.c", "-lm", "-o", "main"]
+    built = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    if built.returncode:
+        pytest.skip(f"no sanitizer: {built.stderr[-200:]}")
+    for threads in ("1", "3"):
+        done = subprocess.run(
+            ["setarch", "-R", "./main", threads], cwd=folder, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        end = np.loadtxt(folder / "end.txt")
+        assert end[: r.size] == pytest.approx(model.integrate().q["r"][-1].reshape(-1), abs=1e-12)

@@ -42,13 +42,3 @@ def test_missing_newton_iteration_is_an_error_message(thrown):
     run = stepper.integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=2)
     with pytest.raises(sc.MethodError, match="requires Newton's method"):
         run.work()
-
-
-def test_work_is_computed_to_the_tolerance_of_the_solver():
-    damped = sc.LagrangianSystem.from_text("damped", ["q"], "q_dot**2/2 + cos(q)", forces={"q": "-q_dot**3"})
-    stepper = sc.compile_stepper(damped, "svi:3")
-    exact, rough = (
-        np.concatenate(list(map(np.atleast_1d, stepper.work_and_impulses([1.0], [1.5], 0.3, options=options))))
-        for options in (None, sc.SolverOptions(tolerance=0.1))
-    )
-    assert 1e-13 < np.abs(exact - rough).max() < 0.1
