@@ -140,15 +140,15 @@ class _Graph:
         terms = [term.as_coeff_Mul() for term in primitive]
         terms.sort(key=lambda term: self._rank(term[1]))
         in_sums = self.paired and any(isinstance(factor, sympy.Add) for _, rest in terms for factor in rest.args)
-        if in_sums or max(abs(coefficient) for coefficient, _ in terms) > LARGEST_COEFFICIENT:
+        if in_sums or any(abs(c.p) > LARGEST_COEFFICIENT * c.q for c, _ in terms):
             content, terms = sympy.S.One, [(content * coefficient, rest) for coefficient, rest in terms]
-        if terms[0][0] < 0:
+        if terms[0][0].p < 0:
             content, terms = -content, [(-coefficient, rest) for coefficient, rest in terms]
         if self.paired:
-            return self._times(content, self._in_pairs([(c < 0, self._scaled(abs(c), rest)) for c, rest in terms])[1])
+            return self._times(content, self._in_pairs([(c.p < 0, self._scaled(abs(c), rest)) for c, rest in terms])[1])
         total = self._scaled(*terms[0])
         for coefficient, rest in terms[1:]:
-            operator = "-" if coefficient < 0 else "+"
+            operator = "-" if coefficient.p < 0 else "+"
             total = self.node((operator, (total, self._scaled(abs(coefficient), rest))))
         return self._times(content, total)
 
@@ -167,19 +167,19 @@ class _Graph:
         return left_negative, self.node((operation, (left, right)))
 
     def _scaled(self, coefficient: sympy.Rational, rest: sympy.Expr) -> int:
-        if rest == 1:
+        if rest is sympy.S.One:
             return self.node(Constant(exact_number(coefficient)))
         factors = sympy.Mul.make_args(rest)
-        if coefficient == 1:
+        if coefficient is sympy.S.One:
             return self.read(rest)
         if any(map(self.is_constant, factors)):  # roots of numbers, which may combine with the coefficient
             return self.read(sympy.Mul(coefficient, rest))
         return self._multiplied(coefficient, factors)
 
     def _times(self, coefficient: sympy.Rational, node: int) -> int:
-        if coefficient == 1:
+        if coefficient is sympy.S.One:
             return node
-        if coefficient == -1:
+        if coefficient is sympy.S.NegativeOne:
             return self.node(("neg", (node,)))
         return self.node(("*", (self.node(Constant(exact_number(coefficient))), node)))
 
@@ -189,9 +189,8 @@ class _Graph:
 
     def _multiplied(self, coefficient: sympy.Rational, factors: Sequence[sympy.Expr]) -> int:
         ordered = sorted(factors, key=self._rank)
-        negative = coefficient < 0
-        magnitude = abs(coefficient)
-        nodes = [] if magnitude == 1 else [self.node(Constant(exact_number(magnitude)))]
+        negative, magnitude = coefficient.p < 0, abs(coefficient)
+        nodes = [] if magnitude is sympy.S.One else [self.node(Constant(exact_number(magnitude)))]
         for factor in ordered:
             node = self.read(factor)
             content = self.nodes[node]
@@ -307,7 +306,9 @@ def _primitive(total: sympy.Add) -> tuple[sympy.Rational, Sequence[sympy.Expr]]:
         return content, primitive.args
     scaled = [(sympy.Integer(c.p // divisor * (multiple // c.q)), rest) for c, rest in pairs]
     factors = [(c, *(() if rest is sympy.S.One else sympy.Mul.make_args(rest))) for c, rest in scaled]
-    terms = [rest if c == 1 else sympy.Mul._from_args(of) for (c, rest), of in zip(scaled, factors, strict=True)]
+    terms = [
+        rest if c is sympy.S.One else sympy.Mul._from_args(of) for (c, rest), of in zip(scaled, factors, strict=True)
+    ]
     return sympy.Rational(divisor, multiple), sorted(terms, key=cmp_to_key(sympy.Basic.compare))
 
 

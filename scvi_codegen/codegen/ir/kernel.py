@@ -120,6 +120,10 @@ class Kernel:
     purpose: str = field(default="", repr=False, compare=False)
     sums: tuple[RolledKernel, ...] = ()
 
+    def __hash__(self) -> int:
+        """Return a hash of the name and the sizes: that of all expressions takes long."""
+        return hash((self.name, self.arguments, len(self.temporaries), self.values))
+
     def with_sums(self, sums: tuple[RolledKernel, ...]) -> Kernel:
         """Return the kernel with further loops, whose kernels are called after it."""
         names = (f"{self.name}_{rolled.kernel.name}" for rolled in sums)

@@ -378,7 +378,7 @@ def hessian(expression: Expr, variables: Sequence[Symbol]) -> dict[tuple[int, in
     return dict(sorted((upper | lower).items()))
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def _accumulation(variables: tuple[Symbol, ...]) -> _Accumulation:
     """Return the shared cache for these variables, since the derivatives of a system are requested repeatedly."""
     return _Accumulation(variables)
@@ -390,11 +390,14 @@ class _Accumulation:
     def __init__(self, variables: Sequence[Symbol]) -> None:
         self.variables = frozenset(variables)
         self.gradients: dict[Expr, Gradient] = {variable: {index: S.One} for index, variable in enumerate(variables)}
+        self.totals: dict[Expr, dict[int, Expr]] = {}
         self.jacobians: dict[tuple[tuple[Expr, ...], bool], dict[tuple[int, int], Expr]] = {}
 
     def total(self, expression: Expr) -> dict[int, Expr]:
         """Return the derivatives with respect to variables, also by way of intermediate quantities."""
-        return gradient_by_adjoints(self.of(expression), self.of)
+        if expression not in self.totals:
+            self.totals[expression] = gradient_by_adjoints(self.of(expression), self.of)
+        return self.totals[expression]
 
     def rows(self, expressions: Mapping[int, Expr], *, symmetric: bool) -> dict[tuple[int, int], Expr]:
         """Return the derivatives of several expressions, by (row, column)."""

@@ -12,8 +12,8 @@ symbols and replacements of an intermediate quantity are therefore computed once
 
 from __future__ import annotations
 
-from collections.abc import Collection, Container, Iterable, Sequence
-from functools import cmp_to_key
+from collections.abc import Collection, Container, Iterable, Mapping, Sequence
+from functools import cmp_to_key, lru_cache
 from itertools import count
 from typing import Any
 from weakref import WeakValueDictionary
@@ -51,9 +51,10 @@ class Intermediate(Expr):  # type: ignore[misc]  # SymPy is untyped
         if quantity is None:
             quantity = Expr.__new__(cls, definition)
             quantity.number = next(_NUMBERS)
-            quantity.inner = inner_of(definition)
-            quantity._free = _symbols_in(definition, "_free")
-            quantity.varies_with = _symbols_in(definition, "varies_with", unit_step, rint)
+            quantity.inner, symbols, has_steps = _contents(definition)
+            quantity._free = symbols.union(*(inner._free for inner in quantity.inner))
+            varying, symbols, _ = _contents(definition, *STEPS) if has_steps else (quantity.inner, symbols, False)
+            quantity.varies_with = symbols.union(*(inner.varies_with for inner in varying))
             _KNOWN[definition] = quantity
         return quantity
 
@@ -102,23 +103,29 @@ class Intermediate(Expr):  # type: ignore[misc]  # SymPy is untyped
         return replaced[self]
 
 
-def _symbols_in(definition: Expr, of_quantity: str, *without: type) -> frozenset[Symbol]:
-    """Return the symbols of an expression and of the quantities in it, without those in some functions alone.
+STEPS = (unit_step, rint)
+"""Functions that are constant but for jumps."""
+
+
+def _contents(definition: Expr, *without: type) -> tuple[tuple[Intermediate, ...], frozenset[Symbol], bool]:
+    """Return quantities and symbols in an expression, outside of some functions, and whether it has ``STEPS``.
 
     Each subexpression is visited once, unlike by SymPy's ``free_symbols``.
     """
-    seen, symbols, pending = {definition}, set[Symbol](), [definition]
+    seen, pending, has_steps = {definition}, [definition], False
+    quantities, symbols = list[Intermediate](), list[Symbol]()
     while pending:
         node = pending.pop()
         if isinstance(node, Intermediate):
-            symbols |= getattr(node, of_quantity)
-        elif node.is_Symbol:
-            symbols.add(node)
+            quantities.append(node)
+        elif isinstance(node, Symbol):
+            symbols.append(node)
         elif not isinstance(node, without):
+            has_steps = has_steps or isinstance(node, STEPS)
             new = [argument for argument in node.args if argument not in seen]
             seen.update(new)
             pending += new
-    return frozenset(symbols)
+    return tuple(quantities), frozenset(symbols), has_steps
 
 
 _LAST: list[Any] = [{}, {}]
@@ -158,9 +165,9 @@ def product(a: Expr, b: Expr) -> Expr:
     factors += others
     if not all(isinstance(factor, _FACTORS) for factor in factors) or len({*factors}) < len(factors):
         return Mul(a, b)
-    if S.Zero in (number, other):
+    if number is S.Zero or other is S.Zero:
         return S.Zero
-    number = number * other
+    number = number if other is S.One else number * other
     return _node(Mul, () if number is S.One else (number,), factors)
 
 
@@ -234,7 +241,8 @@ def written_out(expression: Expr) -> Expr:
     return without_abs(expression.xreplace(rules)) if rules else expression
 
 
-def parts(*expressions: Basic) -> dict[Any, None]:
+@lru_cache(maxsize=4)
+def parts(*expressions: Basic) -> Mapping[Any, None]:
     """Return all distinct subexpressions, beginning with the expressions themselves, and definitions of quantities."""
     result = dict.fromkeys(expressions)
     waiting = list(expressions)
@@ -270,16 +278,7 @@ def written_size(expression: Expr) -> int:
 
 def inner_of(expression: Expr) -> tuple[Intermediate, ...]:
     """Return the quantities in an expression, without those in their definitions."""
-    seen, quantities, pending = {expression}, [], [expression]
-    while pending:
-        node = pending.pop()
-        if isinstance(node, Intermediate):
-            quantities.append(node)
-            continue
-        new = [argument for argument in node.args if argument.args and argument not in seen]
-        seen.update(new)
-        pending += new
-    return tuple(quantities)
+    return _contents(expression)[0]
 
 
 def intermediates(*expressions: Expr, without: Container[Intermediate] = ()) -> list[Intermediate]:

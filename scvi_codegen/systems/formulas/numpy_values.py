@@ -62,7 +62,8 @@ def _value_in(expression: Expr, values: dict[Expr, Any]) -> Any:
 def _node_value(expression: Any, values: dict[Expr, Any]) -> Any:
     """Return the value of a node from those of its arguments."""
     if not expression.args:
-        return float(expression) if not expression.is_Rational or abs(expression) < LARGEST else np.nan
+        within = not expression.is_Rational or abs(expression.p) <= int(LARGEST) * expression.q
+        return float(expression) if within else np.nan
     arguments = [_value_in(argument, values) for argument in expression.args]
     if isinstance(expression, Intermediate):
         return arguments[0]

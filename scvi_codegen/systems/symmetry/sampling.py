@@ -13,6 +13,7 @@ import random
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -290,5 +291,5 @@ def rates_of(system: MechanicalSystem, term_groups: tuple[TermGroup, ...] = ()) 
 
 def _long_numbers(expressions: Sequence[Expr]) -> dict[Symbol, sympy.Rational]:
     rationals = (part for part in parts(*expressions) if part.is_Rational)
-    sizes = {abs(x) for x in rationals if max(abs(x.p), x.q) > LONGEST_NUMBER and abs(x) < LARGEST}
-    return {sympy.Dummy(real=True): number for number in sorted(sizes)}
+    sizes = {abs(x) for x in rationals if max(abs(x.p), x.q) > LONGEST_NUMBER and abs(x.p) <= int(LARGEST) * x.q}
+    return {sympy.Dummy(real=True): number for number in sorted(sizes, key=lambda x: Fraction(x.p, x.q))}

@@ -329,6 +329,11 @@ def times(a: Matrix, b: Matrix) -> Matrix:
     return Matrix([[total(map(product, row, column)) for column in columns] for row in a.tolist()])
 
 
+def plus(*matrices: Matrix) -> Matrix:
+    """Return the sum of matrices, faster than SymPy, too."""
+    return Matrix(*matrices[0].shape, [*map(total, zip(*(each.flat() for each in matrices), strict=True))])
+
+
 def as_quantities(vector: Matrix) -> Matrix:
     """Return a vector of intermediate quantities."""
     return vector.applyfunc(intermediate)
@@ -434,14 +439,14 @@ def dual_energy(tree: Tree) -> Expr:
             innovation = intermediate(momentum - bias[axis])
             gain = as_quantities(inertia[:, axis] / pivot)
             terms.append(innovation**2 / (2 * pivot))
-            inertia = as_quantities(_symmetric(inertia - times(gain, inertia[:, axis].T)))
+            inertia = as_quantities(_symmetric(plus(inertia, times(gain, -inertia[:, axis].T))))
             bias = as_quantities(bias + gain * innovation)
             if gain[axis] == 1:
                 bias[axis] = momentum
         if parent >= 0:
             moved, pushed = _in_parent(tree, joint, inertia, bias)
-            inertias[parent] = as_quantities(_symmetric(inertias[parent] + moved))
-            biases[parent] = as_quantities(biases[parent] + pushed)
+            inertias[parent] = as_quantities(_symmetric(plus(inertias[parent], moved)))
+            biases[parent] = as_quantities(plus(biases[parent], pushed))
     return Add(*terms)
 
 
@@ -461,10 +466,10 @@ def _in_parent(tree: Tree, joint: Joint, inertia: Matrix, bias: Matrix) -> tuple
     angular, mixed, linear = (
         _turned_twice(tree, joint, block) for block in (inertia[:3, :3], inertia[:3, 3:], inertia[3:, 3:])
     )
-    moved = as_quantities(mixed + times(arm, linear))
-    angular += times(mixed, arm.T) + times(arm, moved.T)
+    moved = as_quantities(plus(mixed, times(arm, linear)))
+    angular = plus(angular, times(mixed, arm.T), times(arm, moved.T))
     torque, force = (tree.turned(joint, part) for part in (bias[:3, :], bias[3:, :]))
-    return Matrix([[angular, moved], [moved.T, linear]]), Matrix([torque + times(arm, force), force])
+    return Matrix([[angular, moved], [moved.T, linear]]), Matrix([plus(torque, times(arm, force)), force])
 
 
 def _turned_twice(tree: Tree, joint: Joint, block: Matrix) -> Matrix:
