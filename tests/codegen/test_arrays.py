@@ -37,6 +37,11 @@ FORMULAS = {
         ["u[NX, NY]", "q[N]"],
         "sum(i in NX periodic, j in NY, p_u[i+1, j]*u[i, j]**2 + p_u[i, j]**2) - sum(i in N, m[i]*p_q[i]**4*q[i])",
     ),
+    "calls": (
+        ["u[NX, NY]"],
+        "sum(i in NX periodic, j in NY periodic, u_dot[i, j]**2/2 + cos(u[i, j+1] - u[i, j])*exp(u[i, j+1] - u[i, j])"
+        "- cos(g*t)*u[i, j] + g*sin(u[i+1, j]))",
+    ),
     "free": (["q[N]"], "sum(i in N, q_dot[i]**2/2)"),
     "damped": (["q[N]"], "sum(i in N, q_dot[i]**2/2) - sum(i < j in N, q[i]*q[j])"),
 }
@@ -115,6 +120,13 @@ def test_terms_of_the_first_index_are_computed_once_per_pair() -> None:
     assert code[outer:inner].count("] = X[") == 3
     assert code[inner:end].count("] = X[") == 3
     assert code[inner:end].count("F[start_") == 6
+
+
+def test_explicit_steps_on_lattices_call_functions_of_elements_in_loops_of_their_own() -> None:
+    """Not those of time alone, or of longer arguments than sums and products."""
+    called = re.compile(r"called\[\d\]\[at\] = (\w+)\(called")
+    assert sorted(called.findall(rendered("calls", "stoermer-verlet").code)) == ["cos", "cos", "exp", "sin"]
+    assert not called.findall(rendered("calls", "svi:4").code + rendered("all forms", "stoermer-verlet").code)
 
 
 @pytest.mark.parametrize(("mass", "is_equal"), [("g", 1), ("m[i]", 0)])

@@ -17,11 +17,11 @@ Numbers of a program are exact or have 50 digits; they are rounded once, when pr
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property, lru_cache
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import sympy
 
@@ -264,6 +264,50 @@ def loads(expression: Expression) -> Iterator[Load]:
     return (part for part in subexpressions(expression) if isinstance(part, Load))
 
 
+def replaced(expression: Expression, by: Mapping[Any, Expression]) -> Expression:
+    """Return an expression with subexpressions replaced."""
+    if expression in by or not isinstance(expression, Operation):
+        return by.get(expression, expression)
+    return Operation(expression.operator, tuple(replaced(operand, by) for operand in expression.operands))
+
+
+class CallsApart(NamedTuple):
+    """Functions that a kernel calls, the kernel of their arguments, and the rest, whose last arguments are values."""
+
+    functions: tuple[str, ...]
+    arguments: Kernel
+    rest: Kernel
+
+
+def calls_apart(kernel: Kernel, functions: Collection[str]) -> CallsApart | None:
+    """Return a kernel with the calls of functions apart whose arguments are sums and products of u; else ``None``."""
+    expressions, moving = (*kernel.temporaries, *kernel.results), set[Load]()
+    for k, expression in enumerate(kernel.temporaries):
+        moving |= {Load("w", k)} if any(load.source == "u" or load in moving for load in loads(expression)) else set()
+    calls = [x for x in subexpressions(*expressions) if isinstance(x, Operation) and x.operator in functions]
+    calls = [*dict.fromkeys(x for x in calls if any(load.source == "u" or load in moving for load in loads(x)))]
+    values = {call: Load("u", kernel.arguments + k) for k, call in enumerate(calls)}
+    found = tuple(call.operands[0] for call in calls)
+    named = replace(kernel, name=f"{kernel.name}_arguments", purpose="Arguments of its functions.")
+    arguments = _with_results(named, kernel.temporaries, found)
+    if not calls or not {*arguments.operation_counts()} <= {"+", "-", "*", "neg"}:
+        return None
+    temporaries, results = (tuple(replaced(x, values) for x in of) for of in (kernel.temporaries, kernel.results))
+    rest = _with_results(replace(kernel, arguments=kernel.arguments + len(calls)), temporaries, results)
+    return CallsApart(tuple(call.operator for call in calls), arguments, rest)
+
+
+def _with_results(kernel: Kernel, temporaries: Sequence[Expression], results: Sequence[Expression]) -> Kernel:
+    """Return a kernel with other results, and those of the temporaries that they need."""
+    needed = {load for result in results for load in loads(result)}
+    for k in reversed(range(len(temporaries))):
+        needed |= {*loads(temporaries[k])} if Load("w", k) in needed else set()
+    left = [k for k in range(len(temporaries)) if Load("w", k) in needed]
+    by = {Load("w", k): Load("w", n) for n, k in enumerate(left)}
+    kept, shown = tuple(replaced(temporaries[k], by) for k in left), tuple(replaced(result, by) for result in results)
+    return replace(kernel, temporaries=kept, results=shown, values=len(shown))
+
+
 LARGEST_PART = 1000
 """Largest number of operations of one C function."""
 
@@ -310,10 +354,10 @@ def parts(kernel: Kernel) -> tuple[Part, ...]:
     places: dict[int, int] = {}
     cut = []
     for n, piece in enumerate(pieces):
-        arrived = dict(places)
+        arrived = {Load("w", index): Load("kept", place) for index, place in places.items()}
         statements: list[Statement] = []
         for kind, index, expression in piece:
-            statements.append((kind, index, _with_kept(expression, arrived)))
+            statements.append((kind, index, replaced(expression, arrived)))
             if kind == "w" and last_use.get(index, n) > n:
                 places[index] = free.pop() if free else len(places)
                 statements.append(("kept", places[index], Load("w", index)))
@@ -340,13 +384,3 @@ def _parts_of_equal_size(statements: Sequence[Statement]) -> Iterator[tuple[Stat
             yield tuple(statements[begin:end])
             n, begin = n + 1, end
     yield tuple(statements[begin:])
-
-
-def _with_kept(expression: Expression, places: dict[int, int]) -> Expression:
-    """Return the expression with temporaries of earlier parts loaded from ``kept``."""
-    if isinstance(expression, Load):
-        kept = expression.source == "w" and expression.index in places
-        return Load("kept", places[expression.index]) if kept else expression
-    if isinstance(expression, Operation):
-        return Operation(expression.operator, tuple(_with_kept(operand, places) for operand in expression.operands))
-    return expression

@@ -17,7 +17,7 @@ from dataclasses import replace
 from enum import Enum, auto
 from typing import TypeAlias
 
-from scvi_codegen.codegen.ir.kernel import Expression, Operation, RolledKernel
+from scvi_codegen.codegen.ir.kernel import CallsApart, Expression, Operation, RolledKernel, loads
 from scvi_codegen.codegen.ir.program import Layout
 from scvi_codegen.codegen.rendering.text import wrapped, wrapped_comment
 from scvi_codegen.systems.formulas.indices import Access, Array, Loop, Place, Size
@@ -163,6 +163,7 @@ class Nest:
             compiler vectorises.
         fused: whether coordinates are continued where the last values are added (complete_sums).
         sharing: how threads share it; without sharing, one task covers all.
+        apart: functions called in loops of their own, over all values of a part, where no other registers are in use.
     """
 
     def __init__(
@@ -175,9 +176,10 @@ class Nest:
         chunked: bool = False,
         fused: bool = False,
         sharing: Sharing = Sharing.ALONE,
+        apart: CallsApart | None = None,
     ) -> None:
         self.layout, self.rolled, self.scalar, self.source = layout, rolled, scalar, source
-        self.chunked, self.fused, self.sharing = chunked, fused, sharing
+        self.chunked, self.fused, self.sharing, self.apart = chunked, fused, sharing, apart
         self.levels = {loop.index: depth for depth, loop in enumerate(rolled.loops, 1)}
         self.loops = {loop.index: loop for loop in rolled.loops}
         self.scalars = len(layout.parameters)
@@ -240,20 +242,10 @@ class Nest:
 
     def _parts(self, loop: Loop, inner: Sequence[str], behind: Sequence[Sequence[str]]) -> list[str]:
         """Return the innermost loop, divided into parts if necessary."""
-        first, end = self._span(loop)
-        accesses = (*self.rolled.reads, *self.rolled.writes, *self.rolled.constants)
-        places = [place for access in accesses for place in access.places]
-        moved = {place.base.number for place in places if place.index == loop.index and not place.table}
-        offsets = sorted(moved - {0}) if loop.periodic else []
-        if not offsets and not self.chunked:
-            return _loop(loop, first, end, inner)
-        lines = [f"end = {end} - begin > CHUNK ? begin + CHUNK : {end};" if self.chunked else f"end = {end};"]
-        lines += [
-            f"const long long {_shift(loop.index, offset)} = around(begin, {offset}, {size_text(loop.end)}, &end);"
-            for offset in offsets
-        ]
-        if self.chunked:
-            lines += [*self._part_passed_over(loop), f"lanes values[{len(self.stored)}][CHUNK];"]
+        span = self._span(loop)
+        if not self.chunked and not self._offsets(loop):
+            return _loop(loop, *span, inner)
+        lines = [*self._part_passed_over(loop), f"lanes values[{len(self.stored)}][CHUNK];"] if self.chunked else []
         lines += _loop(loop, "begin", "end", inner)
         if loop.near:
             lines += _loop(loop, "begin", "end", [line for of_target in behind for line in of_target])
@@ -263,11 +255,52 @@ class Nest:
                 lines += (
                     self._sums_of_row(loop, targets) if together else _loop(loop, "begin", "end", behind[targets[0]])
                 )
-        return [
-            f"for (long long begin = {first}, end; begin < {end}; begin = end) {{",
-            *(f"  {line}" for line in lines),
-            "}",
+        if self.apart:
+            lines = [*self._calls(loop, self.apart), *self._divided(loop, ("chunk", "past"), lines)]
+            return self._divided(loop, span, lines, ("chunk", "past"), chunked=True)
+        return self._divided(loop, span, lines, chunked=self.chunked)
+
+    def _offsets(self, loop: Loop) -> list[int]:
+        """Return the distances of neighbours across a periodic boundary."""
+        accesses = (*self.rolled.reads, *self.rolled.writes, *self.rolled.constants)
+        places = [place for access in accesses for place in access.places]
+        moved = {place.base.number for place in places if place.index == loop.index and not place.table}
+        return sorted(moved - {0}) if loop.periodic else []
+
+    def _divided(
+        self,
+        loop: Loop,
+        span: tuple[str, str],
+        lines: Sequence[str],
+        names: tuple[str, str] = ("begin", "end"),
+        *,
+        chunked: bool = False,
+    ) -> list[str]:
+        """Return a loop over parts of a span, of at most CHUNK elements, with constant distances in these lines."""
+        (first, last), (begin, end), text = span, names, "\n".join(lines)
+        body = [f"{end} = {last} - {begin} > CHUNK ? {begin} + CHUNK : {last};" if chunked else f"{end} = {last};"]
+        shifts = [(offset, _shift(loop.index, offset)) for offset in self._offsets(loop) if names[0] == "begin"]
+        body += [
+            f"const long long {shift} = around(begin, {offset}, {size_text(loop.end)}, &end);"
+            for offset, shift in shifts
+            if re.search(rf"\b{shift}\b", text)
         ]
+        head = f"for (long long {begin} = {first}, {end}; {begin} < {last}; {begin} = {end}) {{"
+        return [head, *(f"  {line}" for line in (*body, *lines)), "}"]
+
+    def _calls(self, loop: Loop, apart: CallsApart) -> list[str]:
+        """Return the lines that compute the values of the functions of a part."""
+        expressions = (*apart.arguments.temporaries, *apart.arguments.results)
+        used = {load.index for x in expressions for load in loads(x) if load.source == "u"}
+        lines = [self.read(k, slot) for k, slot in enumerate(self.rolled.reads) if k in used]
+        lines += [self.constant(k, each) for k, each in enumerate(self.rolled.constants) if self.is_innermost(each)]
+        lines.append(f"{apart.arguments.name}(u, t, parameters, value);")
+        lines += [f"called[{k}][{counter(loop)} - chunk] = value[{k}];" for k in range(len(apart.functions))]
+        lines = self._divided(loop, ("chunk", "past"), _loop(loop, "begin", "end", lines))
+        for k, name in enumerate(apart.functions):
+            head = f"for (long long at = 0, all = whole_registers(called[{k}], past - chunk); at < all; at++)"
+            lines += [head, f"  called[{k}][at] = {name}(called[{k}][at]);"]
+        return [f"lanes called[{len(apart.functions)}][CHUNK];", *lines]
 
     def _targets_by_rows(self, loop: Loop) -> list[list[int]]:
         """Return the targets in turn; together those that differ in the innermost index alone, if tasks add to all."""
@@ -414,7 +447,7 @@ class Nest:
         """Return the loops as a function; without values no kernel is evaluated."""
         declared = [*self._arrays("\n".join(lines))]
         if self.source and self.rolled.reads:
-            declared.append(f"{self.scalar} u[{len(self.rolled.reads)}];")
+            declared.append(f"{self.scalar} u[{self.rolled.kernel.arguments}];")
         elif self.source:
             declared += [f"const {self.scalar} u[1] = {{0}};", f"(void){self.source};"]
         if values:

@@ -7,7 +7,7 @@ from math import prod
 from typing import Any
 
 from scvi_codegen.codegen.ir.equations import ConstrainedSteps
-from scvi_codegen.codegen.ir.kernel import Kernel, RolledKernel, is_divided
+from scvi_codegen.codegen.ir.kernel import CallsApart, Kernel, RolledKernel, calls_apart, is_divided
 from scvi_codegen.codegen.ir.program import ArrayProgram, Layout
 from scvi_codegen.codegen.rendering.kernels.functions import kernel_text
 from scvi_codegen.codegen.rendering.kernels.loop_nests import (
@@ -24,7 +24,7 @@ from scvi_codegen.codegen.rendering.kernels.loop_nests import (
     size_text,
 )
 from scvi_codegen.codegen.rendering.kernels.printer import DOUBLE, inverse_roots
-from scvi_codegen.codegen.rendering.kernels.simd import POINTS, iteration_source, loop_functions
+from scvi_codegen.codegen.rendering.kernels.simd import LIBRARY, OF_TWO, POINTS, iteration_source, loop_functions
 from scvi_codegen.systems.formulas.indices import MOST_THREADS, Array, Convolution, couples_elements
 
 
@@ -65,10 +65,10 @@ def rows_text(layout: Layout, forces: Sequence[RolledKernel]) -> tuple[str, str,
     fused &= 1 < len(writes) <= MOST_ADDENDS and all(len(target.places) == 1 for target in writes)
     constants = {"REACH": reaches[lead], "CHUNKED_ROWS": int(chunked), "FUSED": int(fused), "FRESH": int(not before)}
     rows = function_of_sizes(layout, "static long long rows_of(const problem *arrays)", [f"return {size_text(axis)};"])
-    constants_text = f"enum {{ {', '.join(f'{name} = {number}' for name, number in constants.items())} }};"
+    listed = ",\n  ".join(f"{name} = {number}" for name, number in constants.items())
     parts = (("prepare", before), ("add", (coupling,)), ("complete", behind))
     return (
-        f"{constants_text}\n#define share_rows share_{coupling.kernel.name}\n\n{rows}",
+        f"enum {{\n  {listed}\n}};\n#define share_rows share_{coupling.kernel.name}\n\n{rows}",
         "\n\n".join(_part(*part, fused=fused and name == "add") for part in parts for name in part[:1]),
         coupling.kernel.name if fused else "",
     )
@@ -111,8 +111,9 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
     terms += [(rolled, rolled.kernel) for rolled in loops.constants]
     constants = (*loops.masses, *loops.frictions, *loops.heats)
     scalars = [rolled.kernel for rolled in constants] + [scalar for _, scalar in terms]
-    if fixed_point is None:
-        scalars += [rolled.kernel for rolled in loops.forces]
+    for rolled in loops.forces if fixed_point is None else ():
+        apart = _apart(rolled)
+        scalars += apart[1:] if apart else [rolled.kernel]
     if constrained:
         scalars += [rolled.kernel for rolled in (*constrained.conditions, *constrained.curvatures)]
     scalars += [rolled.kernel for rolled in (*loops.velocities, *loops.momenta)]
@@ -262,21 +263,30 @@ def _step_work(program: ArrayProgram) -> int:
     return (iteration + linear) * program.fixed_point.lanes + waves + STEP_VECTORS
 
 
+def _apart(rolled: RolledKernel) -> CallsApart | None:
+    """Return the kernel of an explicit method's forces on a lattice with calls of the vector library apart."""
+    return calls_apart(rolled.kernel, {*LIBRARY} - {*OF_TWO}) if sharing_of(rolled) is Sharing.IN_TURN else None
+
+
 def _force_text(program: ArrayProgram, rolled: RolledKernel, fused_group: str) -> str:
     """Return a function that adds to the forces; for an explicit method, with a factor."""
     explicit, fused = program.fixed_point is None, rolled.kernel.name == fused_group
     chunked, sharing = explicit and bool(rolled.loops), sharing_of(rolled)
-    nest = Nest(program.layout, rolled, "lanes", "X", chunked=chunked, fused=fused, sharing=sharing)
+    apart = _apart(rolled) if explicit else None
+    rolled = replace(rolled, kernel=apart.rest) if apart else rolled
+    nest = Nest(program.layout, rolled, "lanes", "X", chunked=chunked, fused=fused, sharing=sharing, apart=apart)
     slots = range(len(rolled.writes))
     inner = [nest.is_innermost(target) for target in rolled.writes]
 
     def added(k: int, value: str) -> list[str]:
         return nest.adding(k, value) if inner[k] else [f"sum_{k} += {value};"]
 
-    call = f"{rolled.kernel.name}(u, t, parameters, value);"
+    call, functions = f"{rolled.kernel.name}(u, t, parameters, value);", apart.functions if apart else ()
     if nest.chunked:
-        here = f"[{counter(rolled.loops[-1])} - begin]"
-        innermost = [call, *(f"values[{n}]{here} = by * value[{k}];" for n, k in enumerate(nest.stored))]
+        at = counter(rolled.loops[-1])
+        here, first = f"[{at} - begin]", len(rolled.reads)
+        called = [f"u[{first + k}] = called[{k}][{at} - chunk];" for k in range(len(functions))]
+        innermost = [*called, call, *(f"values[{n}]{here} = by * value[{k}];" for n, k in enumerate(nest.stored))]
         behind = [added(k, f"{sign.strip('+')}values[{n}]{here}") for k, (sign, n) in enumerate(nest.signed)]
     else:
         innermost = [call, *(line for k in slots for line in added(k, f"{'by * ' * explicit}value[{k}]"))]
@@ -297,7 +307,7 @@ def _force_text(program: ArrayProgram, rolled: RolledKernel, fused_group: str) -
     if sharing is Sharing.BY_PLACES:
         zero.append("const int whole = here->whole;")
     body = ["(void)arrays, (void)here;", *zero, *lines]
-    head, values = f"static void add_{rolled.kernel.name}", f"lanes value[{len(rolled.writes)}]"
+    head, values = f"static void add_{rolled.kernel.name}", f"lanes value[{max(len(rolled.writes), len(functions))}]"
     text = nest.function(head, arguments, body, values=values)
     return f"{text}\n\n{_sharing_text(program, rolled)}"
 
