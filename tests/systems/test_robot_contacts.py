@@ -211,6 +211,17 @@ def test_a_stool_on_three_feet_falls_bounces_and_rests(e, spin, tmp_path):
         assert ends[0][:2] == pytest.approx([0.3 * np.sqrt(0.04 / 9.81), 0], abs=1e-12)
 
 
+@pytest.mark.filterwarnings("ignore:a transition has several motions")
+@pytest.mark.rotated
+def test_feet_that_meet_beside_one_at_its_limit_stick(tmp_path):
+    """The last impulses of least norm exceed the friction of a foot, others in the cones do not."""
+    start = {"x_seat": 0, "y_seat": 0, "z_seat": 0.15, "R_seat": [1, 0, 0, 0]}
+    velocity = {"x_seat": 0.1 * np.cos(0.4), "y_seat": 0.1 * np.sin(0.4), "z_seat": 0, "omega_seat": [0, 0, 0]}
+    (run,) = fallen(GROUND, THREE, tmp_path, start, velocity, e=0.3, steps=({"h": 0.005},))
+    assert run.contact_modes[-1][1] == ("stick",) * 3
+    assert np.abs(run.velocity[-1]).max() < 1e-10
+
+
 LEGS = "".join(f"""<body pos="{x} 0 0"><joint name="h{i}" axis="0 1 0" damping=".5" stiffness="60"/><geom type="capsule"
 fromto="0 0 0 0 0 -.2" size=".02" mass=".4" contype="0" conaffinity="0"/><body pos="0 0 -.2"><joint name="k{i}"
 axis="0 1 0" damping=".5" stiffness="60"/><geom type="capsule" fromto="0 0 0 0 0 -.2" size=".015" mass=".2" contype="0"
@@ -237,6 +248,17 @@ def test_a_robot_lands_on_straight_legs(speed, changes, tmp_path):
     if changes:  # at rest
         assert ends[0] == pytest.approx([0, -0.01, *[0] * 7], abs=1e-12)
         assert normal[-1].sum() == pytest.approx(7.95 * 9.81)
+
+
+@pytest.mark.filterwarnings("ignore:a transition has several motions")
+@pytest.mark.filterwarnings("ignore:the contacts depend")
+@pytest.mark.rotated
+def test_a_robot_lands_on_a_bent_leg(tmp_path):
+    """Where a slip of one foot stops another one has left the ground by less than the rounding of its gap."""
+    names = ["x", "z", "p", "h0", "k0", "h1", "k1", "h2", "k2"]
+    start, velocity = dict.fromkeys(names, 0.0) | {"h0": 0.02, "k0": -0.04}, dict.fromkeys(names, 0.0)
+    coarse, fine = fallen(GROUND, WALKER, tmp_path, start, velocity, steps=({"h": 0.005}, {"h": 0.002}))
+    assert coarse.q[-1] == pytest.approx(fine.q[-1], abs=2e-6)
 
 
 @pytest.mark.filterwarnings("ignore:a transition has several motions")

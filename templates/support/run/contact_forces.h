@@ -5,6 +5,7 @@
 /* The same for modes that a run keeps, whose slips have turned since: directions of those as slow as CONTACT_SLOW, from
  * which on they are kept, have rounding errors of DBL_EPSILON / CONTACT_SLOW (measured: .6 of that). */
 #define CONTACT_OUTSIDE (4.0 * DBL_EPSILON / CONTACT_SLOW)
+#define CONTACT_HEAVIER 1e3 /* weight of friction beyond its limit: what remains of the excess is the square of 1/1e3 */
 #define CONTACT_DEPENDENT 1e-12 /* part of a column below which a pivot counts as 0 */
 
 /* Reduces the rows (A, b) by elimination with the pivots on the diagonal that are independent of those before but for
@@ -136,11 +137,11 @@ static real discord_of(const contact_terms *of, const real *rates, const real *m
 }
 
 /* Solves for the forces of the rows in given modes with after = right + W f = 0 in imposed rows, those of least norm,
- * friction relative to its limit, if these are dependent; returns by how much they contradict each other, or such
- * forces differ in the rates, relative to these. If `imposed` is not NULL, it becomes 1 for rows to impose, which are
- * independent. */
-static real solve_contacts(const contact_terms *of, const contact_mode *mode, const real *right, real *force,
-    real *after, int *imposed)
+ * friction relative to its limit, if these are dependent; after two passes friction beyond its limit weighs more.
+ * Returns by how much they contradict each other, or such forces differ in the rates, relative to these. If `imposed`
+ * is not NULL, it becomes 1 for rows to impose, which are independent. */
+static real solve_in_passes(const contact_terms *of, const contact_mode *mode, const real *right, int passes,
+    real *force, real *after, int *imposed)
 {
   contact_unknowns in;
   real matrix[CONTACT_ROWS][CONTACT_ROWS + 1];
@@ -153,15 +154,19 @@ static real solve_contacts(const contact_terms *of, const contact_mode *mode, co
     least[i] = x[i] = independent[i] ? matrix[i][count] / matrix[i][i] : 0.0;
     weight[i] = 1.0;
   }
-  for (int pass = 0; pass < 2 && dependent; pass++) {
+  for (int pass = 0; pass < passes && dependent; pass++) {
     reduce_norm(matrix, count, independent, weight, least);
     for (int i = 0; i < count; i++) {
       moved[in.row[i]] = least[i];
       load = fmax(load, fabs(least[i]));
     }
     for (int i = 0; i < count; i++) {
-      const real limit = in.owner[i] < 0 ? load : friction_limit(of, in.owner[i], 1, moved);
-      weight[i] = load / fmax(limit, CONTACT_SLOW * load); /* forces may all be 0 */
+      const int k = in.owner[i];
+      const real limit = k < 0 ? load : friction_limit(of, k, 1, moved);
+      if (pass == 0)
+        weight[i] = load / fmax(limit, CONTACT_SLOW * load); /* forces may all be 0 */
+      else if (k >= 0 && length_of(moved + CONTACTS[k].tangential, CONTACTS[k].slips) > limit)
+        weight[i] *= CONTACT_HEAVIER;
     }
   }
   memset(moved, 0, sizeof moved);
@@ -177,6 +182,12 @@ static real solve_contacts(const contact_terms *of, const contact_mode *mode, co
   for (int i = 0; i < count; i++)
     left[in.row[i]] = after[in.row[i]];
   return dependent ? discord_of(of, left, moved, right, force) : 0.0;
+}
+
+static real solve_contacts(const contact_terms *of, const contact_mode *mode, const real *right, real *force,
+    real *after, int *imposed)
+{
+  return solve_in_passes(of, mode, right, 2, force, after, imposed);
 }
 
 /* Present modes, with the directions of slips at a state, in space of (ahead.w) w + start. */

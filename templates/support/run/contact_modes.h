@@ -57,11 +57,12 @@ static real rounding_at_row(const contact_problem *in, const real *after, int ro
   return CONTACT_ROUNDING * size;
 }
 
-/* Whether modes satisfy the conditions; their forces, and the rates with them. */
+/* Whether modes satisfy the conditions; their forces, and the rates with them: of impulses, which only act at once, any
+ * in the friction cones. */
 static int is_consistent(const contact_problem *in, const contact_mode *mode, real *force, real *after)
 {
   const contact_terms *const of = in->of;
-  if (solve_contacts(of, mode, in->right, force, after, NULL) > CONTACT_ROUNDING)
+  if (solve_in_passes(of, mode, in->right, in->scale ? 4 : 2, force, after, NULL) > CONTACT_ROUNDING)
     return 0;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;

@@ -42,13 +42,15 @@ static int find_outside(const event_step *step, const contact_terms *of, real pa
   return first;
 }
 
-/* Notes that the gaps of contacts which were closed and open are at a zero of their functions within rounding. */
+/* Notes that the gaps of open contacts which were closed, or are within rounding, are at a zero of their functions. */
 static void note_opening(const event_step *step, const contact_terms *of, const int *closed)
 {
   for (int i = 0; i < TRANSITIONS; i++) {
     const int k = TRANSITION[i][0], row = CONTACTS[k].normal;
-    if (TRANSITION[i][1] == CONTACT_CLOSES && closed[k] && !mode_of(step->watch->mode, k).closed)
-      step->watch->history[EVENT_FIRST[FIRST_TRANSITION + i]] = (NAME(event_history)){
+    const int e = EVENT_FIRST[FIRST_TRANSITION + i];
+    if (TRANSITION[i][1] == CONTACT_CLOSES && !mode_of(step->watch->mode, k).closed &&
+        (closed[k] || (fabs(of->value[row]) <= of->rounding[row] && !JUST_CHANGED(step->watch, e))))
+      step->watch->history[e] = (NAME(event_history)){
           .last = step->watch->time, .slack = fabs(of->value[row]) + of->rounding[row], .hits = 1};
   }
 }
