@@ -5,6 +5,10 @@ enum { LONGEST_MESSAGE = 240 };
 
 typedef NAME(run) run_memory;
 typedef NAME(report) run_report;
+#ifdef EVENT_SETTINGS
+typedef NAME(watch) event_watch;
+typedef NAME(crossing) event_crossing;
+#endif
 
 /* Value references: t, positions, velocities, momenta, energy, parameters. */
 enum {
@@ -33,13 +37,11 @@ typedef struct {
   bool behind; /* 1 if dependent values are out of date */
   double values[REFERENCES];
 #ifdef EVENT_SETTINGS
-  NAME(watch)
-  watch;
+  event_watch watch;
   bool pending; /* 1 if the values are those before a change of the run's state */
   double whole; /* end of the step that the last event cut */
 #endif
-  NAME(run)
-  run;
+  run_memory run;
 } fmu_state;
 
 #ifdef EVENT_SETTINGS
@@ -51,8 +53,7 @@ typedef struct {
   int iterations[MOST_CHANGES];
   long long number[MOST_CHANGES];
   long long filled;
-  NAME(crossing)
-  found[MOST_CHANGES];
+  event_crossing found[MOST_CHANGES];
 } event_memory;
 #endif
 
@@ -106,7 +107,7 @@ static void set_start(fmu_state *now)
   memset(now, 0, sizeof *now);
   memcpy(now->token, TOKEN, sizeof TOKEN);
 #ifdef EVENT_SETTINGS
-  now->watch = (NAME(watch))EVENT_SETTINGS;
+  now->watch = (event_watch)EVENT_SETTINGS;
 #endif
   now->mode = INSTANTIATED;
   now->behind = true;
@@ -361,7 +362,7 @@ static double slack_at(double t)
 
 /* Number of steps to the next communication point, and their size: STEP if it fits, else that of the previous steps if
  * it fits, else an equal part of the interval. */
-static long long plan(NAME(run) * run, double end)
+static long long plan(run_memory *run, double end)
 {
   const double left = end - run->t, slack = slack_at(end), count = fmax(1, ceil((left - slack) / STEP));
   double length = left / count;
@@ -379,9 +380,9 @@ static long long plan(NAME(run) * run, double end)
  * become those before the change, which the run contains already. */
 static void stop_at_event(fmu *one, int *remaining, double end, const run_report *report)
 {
-  NAME(watch) *const watch = &one->now.watch;
+  event_watch *const watch = &one->now.watch;
   const event_memory *to = &one->memory;
-  const NAME(crossing) *const last = to->found + to->filled - 1;
+  const event_crossing *const last = to->found + to->filled - 1;
   bool finished = watch->accumulated > 0;
   for (long long i = 0; i < to->filled; i++) {
     int *const left = remaining + to->found[i].function;
@@ -398,8 +399,8 @@ static void stop_at_event(fmu *one, int *remaining, double end, const run_report
  * to the next one that changes the state. The step that an event cut is completed first. */
 static int advance(fmu *one, double end, run_report *report)
 {
-  NAME(run) *const run = &one->now.run;
-  NAME(watch) *const watch = &one->now.watch;
+  run_memory *const run = &one->now.run;
+  event_watch *const watch = &one->now.watch;
   event_memory *const to = &one->memory;
   const double whole = one->now.whole;
   const bool cut = whole - run->t > slack_at(whole) && end - whole > slack_at(end);
@@ -429,7 +430,7 @@ static int advance(fmu *one, double end, run_report *report)
 /* Advances to the next communication point. */
 static int advance(fmu *one, double end, run_report *report)
 {
-  NAME(run) *const run = &one->now.run;
+  run_memory *const run = &one->now.run;
   double t, q[M], p[M];
   int iterations;
   const int status = NAME(advance)(run, plan(run, end), LLONG_MAX, one->now.values + FIRST_PARAMETER, NULL, &t, q, p,
@@ -444,8 +445,7 @@ FMI_EXPORT fmi3Status FMI(DoStep)(fmi3Instance instance, fmi3Float64 point, fmi3
 {
   fmu *one = instance;
   run_memory *run = &one->now.run;
-  NAME(report)
-  report;
+  run_report report;
   int status;
   (void)no_return;
   if (one->now.mode != STEP_MODE)
