@@ -131,29 +131,19 @@ static __attribute__((flatten)) void evaluate_points(const step_data *step, ratt
       store(now->at[i], g, former(now->u[i], step->q0[i], g));
   for (int n = 0; n < GROUP_LANES; n++) {
     number u[2 * M], value[2 * M], mass[LOWER_MASSES];
-    for (int i = 0; i < M; i++) {
-      u[i] = now->at[i][n];
-      u[M + i] = now->v[i][n];
-    }
+    TAKE_LANE(u, M, now->at, n);
+    TAKE_LANE(u + M, M, now->v, n);
     constrained_point(u, step->t + RATTLE_ABSCISSA[n] * step->h, step->parameters, value, mass);
-    for (int i = 0; i < M; i++) {
-      now->force[i][n] = value[i];
-      now->p[i][n] = value[M + i];
-    }
-#pragma GCC unroll 64
-    for (int e = 0; e < LOWER_MASSES; e++)
-      now->mass[e][n] = mass[e];
+    PUT_LANE(now->force, M, n, value);
+    PUT_LANE(now->p, M, n, value + M);
+    PUT_LANE(now->mass, LOWER_MASSES, n, mass);
   }
   for (int n = 0; n < GROUP_LANES; n++) {
     number u[M], g[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES];
-    for (int i = 0; i < M; i++)
-      u[i] = now->u[i][n];
+    TAKE_LANE(u, M, now->u, n);
     constraints(u, step->t + RATTLE_ABSCISSA[n + 1] * step->h, step->parameters, g, derivative);
-    for (int k = 0; k < CONSTRAINTS; k++)
-      now->g[k][n] = g[k];
-#pragma GCC unroll 64
-    for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-      now->derivative[e][n] = derivative[e];
+    PUT_LANE(now->g, CONSTRAINTS, n, g);
+    PUT_LANE(now->derivative, CONSTRAINT_ENTRIES, n, derivative);
   }
   evaluate_last(step, now);
 #ifdef DAMPED
@@ -171,8 +161,7 @@ static __attribute__((flatten)) void evaluate_points(const step_data *step, ratt
 static inline void term_sizes(const step_data *step, rattle_step *now, int reactions, number *size)
 {
   number force[M], inverse_mass[INVERSE_MASSES];
-  for (int i = 0; i < M; i++)
-    force[i] = now->force[i][0];
+  TAKE_LANE(force, M, now->force, 0);
 #pragma GCC unroll 64
   for (int e = 0; e < INVERSE_MASSES; e++)
     inverse_mass[e] = FIRST_LANE(now->inverse_mass[0][e]);

@@ -34,6 +34,32 @@ typedef lanes inverse_masses[INVERSE_MASSES];
 typedef number inverse_masses[INVERSE_MASSES];
 #endif
 
+/* to = from of a lane, and the other way. */
+#define TAKE_LANE(to, count, from, lane)                              \
+  _Pragma("GCC unroll 64") for (int each = 0; each < (count); each++) \
+  {                                                                   \
+    (to)[each] = (from)[each][lane];                                  \
+  }
+
+#define PUT_LANE(to, count, lane, from)                               \
+  _Pragma("GCC unroll 64") for (int each = 0; each < (count); each++) \
+  {                                                                   \
+    (to)[each][lane] = (from)[each];                                  \
+  }
+
+/* Group g of sum_n table_n x_n, of numbers in memory, from which vector instructions broadcast. */
+LANE_FUNCTION lanes times(const real (*table)[POINT_LANES], int count, const number *x, int g)
+{
+  lanes sum = weights(table[0], g) * x[0], other = lanes_of(0);
+#pragma GCC unroll 16
+  for (int n = 1; n < count; n += 2)
+    other += weights(table[n], g) * x[n];
+#pragma GCC unroll 16
+  for (int n = 2; n < count; n += 2)
+    sum += weights(table[n], g) * x[n];
+  return sum + other;
+}
+
 /* a = M^-1 f. */
 LANE_FUNCTION void find_accelerations(const inverse_masses inverse_mass, const lanes *f, lanes *a)
 {

@@ -59,8 +59,7 @@ static void finish_step(const step_data *step, rattle_step *now, number *z, numb
   lanes derivative[CONSTRAINT_ENTRIES], x[CONSTRAINTS];
   number u[2 * M], value[M + 2 * CONSTRAINTS];
   finish_curve(step, now, z, dp);
-  for (int i = 0; i < M; i++)
-    u[i] = now->u[i][DEGREE - 1];
+  TAKE_LANE(u, M, now->u, DEGREE - 1);
   end_velocity(step, now, dp, u + M);
   constrained_motion(u, step->t + step->h, step->parameters, value);
   for (int e = 0; e < CONSTRAINT_ENTRIES; e++)

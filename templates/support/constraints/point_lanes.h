@@ -95,19 +95,6 @@ LANE_FUNCTION lanes former(const real *x, real first, int g)
   return FORMER(load(x, g), g > 0 ? load(x, g - 1) : lanes_of(first));
 }
 
-/* Group g of sum_n table_n x_n, of numbers in memory, from which vector instructions broadcast. */
-LANE_FUNCTION lanes times(const real (*table)[POINT_LANES], int count, const real *x, int g)
-{
-  lanes sum = load(table[0], g) * x[0], other = lanes_of(0);
-#pragma GCC unroll 16
-  for (int n = 1; n < count; n += 2)
-    other += load(table[n], g) * x[n];
-#pragma GCC unroll 16
-  for (int n = 2; n < count; n += 2)
-    sum += load(table[n], g) * x[n];
-  return sum + other;
-}
-
 static inline number magnitude(number x)
 {
   return MATH(fabs)(x);

@@ -89,11 +89,9 @@ static void prepare_rattle(const step_data *step, rattle_data *data)
 #ifdef TRAJECTORIES_AS_LANES
   real mass[SCRATCH], inverse[INVERSE_MASSES], parameters[P + 1];
   for (int j = 0; j < LANES; j++) {
-    for (int i = 0; i < P; i++)
-      parameters[i] = step->parameters[i][j];
+    TAKE_LANE(parameters, P, step->parameters, j);
     invert_constant_masses(step->t, parameters, mass, inverse);
-    for (int e = 0; e < INVERSE_MASSES; e++)
-      data->inverse_mass[e][j] = inverse[e];
+    PUT_LANE(data->inverse_mass, INVERSE_MASSES, j, inverse);
   }
 #else
   invert_constant_masses(step->t, step->parameters, step->scratch, data->inverse_mass);
@@ -107,12 +105,8 @@ static void prepare_rattle(const step_data *step, rattle_data *data)
 LANE_FUNCTION void force_of_lane(const step_data *step, const rattle_step *now, int n, number *force)
 {
   number u[2 * M];
-#pragma GCC unroll 64
-  for (int i = 0; i < M; i++)
-    u[i] = now->at[i][n];
-#pragma GCC unroll 64
-  for (int i = 0; i < M; i++)
-    u[M + i] = now->v[i][n];
+  TAKE_LANE(u, M, now->at, n);
+  TAKE_LANE(u + M, M, now->v, n);
   constrained_force(u, step->t + RATTLE_ABSCISSA[n] * step->h, step->parameters, force);
 }
 #else
@@ -125,8 +119,7 @@ static inline __attribute__((flatten)) void evaluate_momenta(const step_data *st
 {
   for (int n = 0; n < GROUP_LANES; n++) {
     number u[M], A[M];
-    for (int i = 0; i < M; i++)
-      u[i] = now->u[i][n];
+    TAKE_LANE(u, M, now->u, n);
     constrained_momentum(u, step->t + RATTLE_ABSCISSA[n + 1] * step->h, step->parameters, A);
     for (int i = 0; i < M; i++)
       now->A[i][n] = A[i] - now->first_A[i];
@@ -147,24 +140,16 @@ static __attribute__((flatten)) void evaluate_points(const step_data *step, ratt
   for (int n = 0; n < GROUP_LANES; n++) {
     number u[M], force[M], g[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES];
     const real t = step->t + RATTLE_ABSCISSA[n + 1] * step->h;
-#pragma GCC unroll 64
-    for (int i = 0; i < M; i++)
-      u[i] = now->u[i][n];
+    TAKE_LANE(u, M, now->u, n);
 #ifdef VELOCITY_FORCES
     force_of_lane(step, now, n, force);
 #else
     constrained_force(u, t, step->parameters, force);
 #endif
     constraints(u, t, step->parameters, g, derivative);
-#pragma GCC unroll 64
-    for (int i = 0; i < M; i++)
-      now->force[i][n] = force[i];
-#pragma GCC unroll 64
-    for (int k = 0; k < CONSTRAINTS; k++)
-      now->g[k][n] = g[k];
-#pragma GCC unroll 64
-    for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-      now->derivative[e][n] = derivative[e];
+    PUT_LANE(now->force, M, n, force);
+    PUT_LANE(now->g, CONSTRAINTS, n, g);
+    PUT_LANE(now->derivative, CONSTRAINT_ENTRIES, n, derivative);
   }
 }
 
@@ -180,8 +165,7 @@ static inline void term_sizes(const step_data *step, rattle_step *now, int react
 {
 #ifdef VELOCITY_FORCES
   number force[M];
-  for (int i = 0; i < M; i++)
-    force[i] = now->force[i][0];
+  TAKE_LANE(force, M, now->force, 0);
 #else
   const number *force = now->first_force;
 #endif
@@ -246,8 +230,7 @@ static inline void last_force(const step_data *step, const rattle_step *now, con
   constrained_force(u, step->t + RATTLE_ABSCISSA[DEGREE] * step->h, step->parameters, force);
 #else
   (void)step, (void)z;
-  for (int i = 0; i < M; i++)
-    force[i] = now->force[i][DEGREE - 1];
+  TAKE_LANE(force, M, now->force, DEGREE - 1);
 #endif
 }
 

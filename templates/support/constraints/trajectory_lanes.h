@@ -42,18 +42,6 @@ LANE_FUNCTION lanes former(const lanes *x, lanes first, int g)
   return g > 0 ? x[g - 1] : first;
 }
 
-LANE_FUNCTION lanes times(const real (*table)[POINT_LANES], int count, const lanes *x, int g)
-{
-  lanes sum = table[0][g] * x[0], other = lanes_of(0);
-#pragma GCC unroll 16
-  for (int n = 1; n < count; n += 2)
-    other += table[n][g] * x[n];
-#pragma GCC unroll 16
-  for (int n = 2; n < count; n += 2)
-    sum += table[n][g] * x[n];
-  return sum + other;
-}
-
 /* x in the lanes where the condition holds, y in others. */
 LANE_FUNCTION lanes where(condition holds, lanes x, lanes y)
 {

@@ -95,16 +95,12 @@ static inline __attribute__((flatten)) void evaluate_pairs_of_points(const doubl
     const ddl abscissa = {load(RATTLE_ABSCISSA + 1, g), load(RATTLE_ABSCISSA_LOW + 1, g)};
     const ddl t = ddl_add(ddl_of(at->t), ddl_multiply(abscissa, ddl_of(at->h)));
     ddl u[M], force[M], value[CONSTRAINTS + CONSTRAINT_ENTRIES];
-    for (int i = 0; i < M; i++)
-      u[i] = at->u[i][g];
+    TAKE_LANE(u, M, at->u, g);
     constrained_force_of_points_pairs(u, t, parameters, force);
     constraints_of_points_pairs(u, t, parameters, value);
-    for (int i = 0; i < M; i++)
-      at->force[i][g] = force[i];
-    for (int k = 0; k < CONSTRAINTS; k++)
-      at->g[k][g] = value[k];
-    for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-      at->derivative[e][g] = value[CONSTRAINTS + e];
+    PUT_LANE(at->force, M, g, force);
+    PUT_LANE(at->g, CONSTRAINTS, g, value);
+    PUT_LANE(at->derivative, CONSTRAINT_ENTRIES, g, value + CONSTRAINTS);
   }
 }
 
