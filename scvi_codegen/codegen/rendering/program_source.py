@@ -44,6 +44,7 @@ from scvi_codegen.codegen.rendering.text import (
     MAX_ITERATIONS,
     ROUNDING_UNITS,
     HeaderRecord,
+    wrapped_functions,
 )
 from scvi_codegen.codegen.statements.printing import Layout
 from scvi_codegen.codegen.statements.steps import half_step, pair_rattle_functions, rattle_functions, splitting_header
@@ -474,8 +475,8 @@ def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") 
         headers["support/run/exchange_heat.h"] = half_step(program.bath)
     if isinstance(program, Program) and program.rattle:
         features = [name.lower() for name in program.rattle.macros]
-        headers["support/constraints/iterate.h"] = rattle_functions(program.rattle.part, features)
-        headers["support/double_double/correct_points.h"] = pair_rattle_functions()
+        headers["support/constraints/iterate.h"] = wrapped_functions(rattle_functions(program.rattle.part, features))
+        headers["support/double_double/correct_points.h"] = wrapped_functions(pair_rattle_functions())
     return Source(
         prefix=prefix,
         header=environment.get_template(f"{entry}.h.jinja").render(context | {"declarations": declarations}),

@@ -75,6 +75,16 @@ def wrapped_prototype(prototype: str) -> str:
     return "\n".join(_lines(arguments, "", " " * CONTINUATION)).replace("\0", " ")
 
 
+def wrapped_functions(text: str) -> str:
+    """Return functions with the heads and statements that are too long broken."""
+
+    def broken(line: str) -> str:
+        indent = len(line) - len(line.lstrip())
+        return wrapped(line.lstrip(), indent) if indent else wrapped_prototype(line)
+
+    return "\n".join(broken(line) if len(line) > WIDTH else line for line in text.split("\n"))
+
+
 def _lines(text: str, first: str, following: str) -> list[str]:
     return textwrap.wrap(
         text,
