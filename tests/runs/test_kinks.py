@@ -72,7 +72,7 @@ def test_two_thousand_cases_across_kinks(family, method):
     assert not wrong(family, range(first, first + 84), [method])
 
 
-@pytest.mark.tiers(3, 3)
+@pytest.mark.tiers(0, 1)
 @families
 def test_restored_runs_have_the_same_bits_at_kinks(family):
     """After each of the first steps, some of which end at kinks."""
@@ -186,6 +186,7 @@ def test_members_of_ensembles_have_dense_output_across_kinks():
     assert member.at(times)[1] == pytest.approx(stepper.integrate([1.0], [0.0], **settings).at(times)[1], abs=1e-12)
 
 
+@pytest.mark.second
 def test_sliding_is_an_error_that_names_it():
     """By points that are not those of constraints, and where the force is not along the slip."""
     rough = lagrange("rough", "x", "x_dot**2/2 - x**2/2", forces={"x": "-0.15*sign(x_dot)"})
@@ -259,6 +260,7 @@ def test_adaptive_steps_keep_the_tolerance_at_powers_that_are_not_whole(method, 
     assert abs(start.q[-1, 0] - 0.25) < bound
 
 
+@pytest.mark.second
 def test_a_ball_that_returns_to_a_kink_in_its_first_step_does_not_rest_there():
     """It falls with x'' = -3/2 from x = 0, v to -v at t = 4v/3, and then moves by x'' = 1/2 - x."""
     ball = lagrange("ball", "x", "x_dot**2/2 - abs(x) - x/2 - x**2*unit_step(-x)/2")
@@ -283,6 +285,7 @@ def test_the_last_output_time_may_be_that_of_a_crossing():
         assert stepper.integrate([1.0], [0.1], t_end=end, t_eval=[1.0, end]).t.tolist() == [1.0, end]
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("constraint", ["y = x**2/4", "y = positive_part(x)**2 + x**2/4"])
 def test_derivatives_of_rest_on_a_constraint(constraint):
     """At rest momenta are rounding of constraint forces; at a kink the derivatives are undefined, by name."""
