@@ -7,6 +7,7 @@ method on the three-term recurrence with twenty guard digits: no eigenvalue prob
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
@@ -122,7 +123,7 @@ def jacobi_value_and_derivative(count: int, alpha: int, beta: int, x: Number) ->
     Three-term recurrence and derivative formula: Abramowitz & Stegun 22.7.1 and 22.8.1.
     """
     both = alpha + beta
-    before, value = mp.one, alpha + 1 + (both + 2) * (x - 1) / 2
+    before, value = 1, alpha + 1 + (both + 2) * (x - 1) / 2
     for k in range(2, count + 1):
         twice = 2 * k + both
         middle = (twice - 1) * (twice * (twice - 2) * x + alpha**2 - beta**2) * value
@@ -133,14 +134,21 @@ def jacobi_value_and_derivative(count: int, alpha: int, beta: int, x: Number) ->
     return value, derivative / (twice * (1 - x * x))
 
 
+BINARY64_ITERATIONS = 3
+"""Iterations of a root in binary64, from the two digits of the guess to about 15."""
+
+
 def jacobi_root(count: int, alpha: int, beta: int, index: int) -> Number:
-    """Return root ``index`` (0 is the smallest) by Newton's method from an asymptotic guess.
+    """Return root ``index`` (0 is the smallest) by Newton's method from an asymptotic guess, first in binary64.
 
     The guess is cos((2k + alpha - 1/2) pi / (2 count + alpha + beta + 1)), k counted from the largest root: the leading
     term of Darboux's asymptotic formula, close enough for quadratic convergence at every degree.
     """
-    x = mp.cospi(mp.mpf(4 * (count - index) + 2 * alpha - 1) / (4 * count + 2 * (alpha + beta + 1)))
-    converged = mp.mpf(10) ** (-mp.dps // 2 - 5)
+    guess = math.cos(math.pi * (4 * (count - index) + 2 * alpha - 1) / (4 * count + 2 * (alpha + beta + 1)))
+    for _ in range(BINARY64_ITERATIONS):
+        value, derivative = jacobi_value_and_derivative(count, alpha, beta, guess)
+        guess -= value / derivative
+    x, converged = mp.mpf(guess), mp.mpf(10) ** (-mp.dps // 2 - 5)
     while True:
         value, derivative = jacobi_value_and_derivative(count, alpha, beta, x)
         x -= value / derivative
@@ -155,9 +163,9 @@ def jacobi_roots(count: int, alpha: int, beta: int) -> Vector:
     They include guard digits, since ``Nodes`` and ``Quadrature`` round them.
     """
     with mp.workdps(DIGITS + GUARD):
-        roots = [jacobi_root(count, alpha, beta, index) for index in range(count)]
+        roots = [jacobi_root(count, alpha, beta, index) for index in range(count // 2 if alpha == beta else count)]
         if alpha == beta:
-            roots = [(root - mirror) / 2 for root, mirror in zip(roots, reversed(roots), strict=True)]
+            roots += [mp.zero] * (count % 2) + [-root for root in reversed(roots)]
     return tuple(roots)
 
 
