@@ -159,7 +159,8 @@ static int sides_at_jump(const event_step *step, const event_sample *at, real le
         continue;
       set_side(step, k, -1);
       step->watch->sliding = pass ? FIRST_KINK + k + 1 : 0;
-      TRY(pass ? NOT_CONVERGED : OK);
+      if (pass)
+        return NOT_CONVERGED;
     }
   }
   return OK;
