@@ -11,7 +11,9 @@ import sympy
 import scvi_codegen as sc
 from benchmarks.cases import robots
 from scvi_codegen.codegen.ir.arithmetic import lower_kernel
+from scvi_codegen.codegen.pipeline import Sources
 from scvi_codegen.common.precision import mp
+from scvi_codegen.methods import as_method
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.formulas.expressions import Tape, gradient
 from scvi_codegen.systems.formulas.intermediates import intermediate, intermediates, separated, written_out
@@ -141,6 +143,19 @@ def test_steps_are_those_by_the_mass_matrix(tmp_path, always, method, solver, op
         run = stepper.integrate(start, velocity=speed, **options)
         ends.append(np.concatenate([run.q[-1], run.p[-1], run.velocity[-1], run.energy()[-1:]]))
     np.testing.assert_allclose(ends[0], ends[1], rtol=3e-12, atol=3e-12)
+
+
+@pytest.mark.quick
+def test_momenta_and_velocities_are_by_kernels_of_the_iteration(tmp_path, always):
+    system = chain(tmp_path, 3)
+    sources = Sources(system, as_method("svi:2", system))
+    alone, beside = ({kernel.name for kernel in sources.program(fallback=each).kernels} for each in (False, True))
+    assert {"legendre", "inverse_legendre", "lagrangian"} <= beside
+    assert alone == {"lagrangian_at_rest"}
+    stepper, start = sc.compile_stepper(system, "svi:2"), np.array([0.5, -0.4, 0.1, 0.3])
+    speed = np.array([0.1, 2.0, -1.0, 0.4])
+    p = stepper.momentum(start, speed)
+    np.testing.assert_allclose(stepper.velocity(start, p), speed, rtol=1e-13)
 
 
 @pytest.mark.quick
