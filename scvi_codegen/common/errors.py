@@ -121,7 +121,7 @@ class EventWarning(UserWarning):
 
 
 class ContactError(ScviCodegenError, ValueError):
-    """Contacts without a consistent mode (Painleve's paradox), with a negative gap at the start, or too many."""
+    """Contacts without consistent forces or impulses, with a negative gap at the start, or too many."""
 
 
 class PlotError(ScviCodegenError):

@@ -93,7 +93,9 @@ def test_runs_have_one_of_all_consistent_modes_and_say_whether_there_are_several
         outcomes.append(min(len(states), 2))
         start: dict[str, Any] = {"velocity": velocity, "h": 1e-6, "steps": 1, "parameters": values}
         if not states:
-            with pytest.raises(sc.ContactError, match="no mode of the contacts is consistent"):
+            ends = "no mode of the contacts is consistent|impact without collision"
+            with warnings.catch_warnings(), pytest.raises((sc.ContactError, sc.EventWarning), match=ends):
+                warnings.filterwarnings("ignore", ".*several motions")  # after the impact
                 stepper.integrate(np.zeros(M), **start)
             continue
         with warnings.catch_warnings(record=True) as issued:

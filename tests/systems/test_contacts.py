@@ -281,16 +281,38 @@ def test_a_plastic_ball_leaves_a_shaken_floor_with_the_jerk(steps: dict[str, flo
 
 
 @pytest.mark.parametrize(("tangent", "consistent"), [(0.30, True), (0.31, False), (0.81, False), (0.83, True)])
-def test_painleve_is_named_where_rigid_bodies_have_no_motion(tangent: float, consistent: bool) -> None:
+@pytest.mark.parametrize("e", [0, 0.4])
+def test_painleves_paradox_is_an_impact_without_collision(tangent: float, consistent: bool, e: float) -> None:
+    """The limit of a stiff floor: the normal rate is negative while the rod slips, and returns to 0 once it sticks."""
+    floor = sc.contact("y - cos(a)", slip="x_dot - cos(a)*a_dot", friction=1.5, restitution=e)
+    stepper = of(f"{PLANE} + a_dot**2/6 - g*y", "x y a", [floor], "svi:2", g=1)
+    a, v = np.arctan(tangent), np.array([-3.0, 0.0, 0.0])
+    start = {"velocity": v, "h": 1e-3, "steps": 1}
+    if consistent:
+        assert np.array_equal(stepper.integrate([0, np.cos(a), a], **start).velocity[0], v)
+        return
+    rows = np.array([[0.0, 1.0, np.sin(a)], [1.0, 0.0, -np.cos(a)]])
+    inverse = rows @ np.diag(1 / MASS) @ rows.T
+    slides = np.array([1.0, 1.5])
+    slides *= 3.0 / (inverse @ slides)[1]
+    sticks = np.linalg.solve(inverse, [-(inverse @ slides)[0], 0.0])
+    assert (inverse @ slides)[0] < 0
+    assert sticks[0] > abs(sticks[1]) / 1.5
+    with pytest.warns(sc.EventWarning, match="impact without collision at t = 0, contact 1 .*Painleve's paradox"):
+        run = stepper.integrate([0, np.cos(a), a], **start)
+    assert run.velocity[0] == pytest.approx(v + rows.T @ (slides + sticks) / MASS, abs=1e-13)
+    assert run.contact_modes == [(0.0, ("open",))]
+
+
+def test_derivatives_through_an_impact_without_collision_are_refused() -> None:
     floor = sc.contact("y - cos(a)", slip="x_dot - cos(a)*a_dot", friction=1.5)
     stepper = of(f"{PLANE} + a_dot**2/6 - g*y", "x y a", [floor], "svi:2", g=1)
-    a = np.arctan(tangent)
-    start = {"velocity": [-3, 0, 0], "h": 1e-3, "steps": 1}
-    if consistent:
-        stepper.integrate([0, np.cos(a), a], **start)
-    else:
-        with pytest.raises(sc.ContactError, match=r"Painleve's paradox.*\(G - mu d T\)\^T = -0\.\d+ of contact 1"):
-            stepper.integrate([0, np.cos(a), a], **start)
+    a, brake = np.arctan(0.5), sc.Event("x + 0.01", then={"p_y": "0", "p_a": "0"})
+    with pytest.warns(sc.EventWarning, match="several motions"), pytest.warns(sc.EventWarning, match="t = 0.003"):
+        run = stepper.integrate([0, np.cos(a), a], velocity=[-3, 1.2 * np.sin(a), -1.2], h=1e-3, steps=9, events=brake)
+    assert np.diff(run.energy()).max() < 1e-14
+    with pytest.raises(sc.StateError, match="one without collision: derivatives"):
+        run.sensitivity()
 
 
 SHAKEN = "0.2*t*cos(5*t)", "0.3*t*sin(5*t)"

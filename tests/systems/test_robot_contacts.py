@@ -272,3 +272,30 @@ def test_modes_with_forces_outside_of_their_cones_are_refused(tmp_path):
     start = {"x_seat": 0, "y_seat": 0, "z_seat": 0.3, "R_seat": [1, 0, 0, 0]}
     with pytest.raises(sc.ContactError, match=r"contact \d .* pulls, or exceeds its friction, at t = 0\.\d+ "):
         stepper.integrate(start, velocity=velocity, t_end=0.4, h=0.005)
+
+
+LEGGED = """<mujoco><compiler angle="degree"/>
+<default> <joint axis="0 -1 0" damping="3"/> <geom type="sphere" size=".03" mass="1" friction=".9"/>
+<default class="bone"> <geom type="capsule" size=".06" contype="0" conaffinity="0"/> </default> </default>
+<worldbody> <geom name="floor" type="plane" size="5 5 .1"/>
+<body pos="0 0 .93"> <joint name="x" type="slide" axis="1 0 0" damping="0"/>
+<joint name="z" type="slide" axis="0 0 1" damping="0"/> <joint name="pitch" damping="0"/>
+<geom class="bone" fromto="0 0 0 0 0 .5" mass="30"/> <geom size=".09"/> <geom pos="0 0 .65" size=".1" mass="4"/>
+<body> <joint name="hip" range="-30 110"/> <geom class="bone" fromto="0 0 0 0 0 -.45" mass="14"/>
+<body pos="0 0 -.45"> <joint name="knee" range="-150 -1"/> <geom class="bone" fromto="0 0 0 0 0 -.4" mass="7"/>
+<geom name="toe" pos=".15 0 -.42"/> <geom name="heel" pos="-.06 0 -.42"/> </body> </body> </body>
+</worldbody></mujoco>"""
+
+
+@pytest.mark.second
+def test_a_body_on_a_leg_passes_painleves_paradox_bounces_and_rests(tmp_path):
+    (tmp_path / "leg.xml").write_text(LEGGED)
+    leg = sc.LagrangianSystem.from_mjcf(tmp_path / "leg.xml", limits="contact", contacts="planes", restitution=0.3)
+    stepper, jump = sc.compile_stepper(leg, "svi:2"), "impact without collision .*geom 'toe'"
+    with pytest.warns(sc.EventWarning, match=jump):
+        run = stepper.integrate(
+            [0, 0.136, -0.004, -0.25, -0.16], velocity=[0.108, 0, 0.273, -0.982, 0], h=0.005, t_end=2.0
+        )
+    assert np.abs(run.velocity[-1]).max() < 1e-12
+    assert np.diff(run.energy()).max() < 1e-12
+    assert 10 < len(run.contact_modes) < len(run)

@@ -148,9 +148,8 @@ def change_at(
 
         return changed
 
-    changes = [with_restitution(elastic) for elastic in (1.0, 0.0)]  # 0 where it would create energy
-    if event.kind != "closes":
-        return changes[0]
+    closes = event.kind == "closes"
+    changes = [with_restitution(elastic) for elastic in ((1.0, 0.0) if closes else (0.0,))]  # 0 where it creates energy
     roots = roots_of_masses(stepper, q, t, modes[0])
     differences = (
         *(change(q, p, t, modes[0])[len(q) :] - after[len(q) :] for change in changes),
@@ -158,10 +157,10 @@ def change_at(
         p,
     )
     *errors, impulse, momentum = (float(np.abs(difference / roots).max()) for difference in differences)
-    if not min(errors) <= SAME_IMPULSE * impulse + SAME_MOMENTUM * momentum:
+    if not min(errors) <= SAME_IMPULSE * (impulse if closes else momentum) + SAME_MOMENTUM * momentum:
         raise StateError(
-            f"{event.title} at t = {t:.17g} with several impacts, at once or one after another, or by "
-            "Poisson's law: derivatives through them are not available"
+            f"{event.title} at t = {t:.17g} with several impacts, at once or one after another, by Poisson's law, or "
+            "without collision: derivatives through them are not available"
         )
     return changes[int(np.argmin(errors))]
 

@@ -19,6 +19,8 @@ REFUSALS = {
     3: "no impulses satisfy the law of impact with friction at t = {t:.17g}, contact {k}: reduce its friction",
     5: "contact {k} has an impossible coefficient at t = {t:.17g}, {value:.6g}: friction must not be negative, nor "
     "static friction at rest less than that of sliding; restitution must be 0 to 1",
+    2: "neither forces nor impulses of the contacts are consistent at t = {t:.17g}: the contacts contradict each "
+    "other, or none were found. Reduce friction, or use fewer contacts",
     6: "contact {k} pulls, or exceeds its friction, at t = {t:.17g} in each mode that was tried: limit the steps by "
     "max_step= (or h=), or reduce its friction",
     7: "simultaneous impacts with friction would create kinetic energy by Newton's law at t = {t:.17g}, contact {k}: "
@@ -26,15 +28,6 @@ REFUSALS = {
     4: "the impacts at t = {t:.17g} do not end: contacts close a corner; set a restitution to 0",
 }
 """Messages by the reasons of contacts.h."""
-PARADOX = (
-    "no mode of the contacts is consistent at t = {t:.17g}: Painleve's paradox, rigid bodies with this friction have "
-    "no motion. G M^-1 (G - mu d T)^T = {value:.3g} of contact {k} must be positive: reduce its friction, or change "
-    "the geometry"
-)
-REDUNDANT = (
-    "no mode of the contacts is consistent at t = {t:.17g}: the contacts contradict each other, or none was found. "
-    "Reduce friction, or use fewer contacts"
-)
 
 
 def refusal_of(stepper: Integrator, watch: Any, t: float) -> ContactError | None:
@@ -42,9 +35,8 @@ def refusal_of(stepper: Integrator, watch: Any, t: float) -> ContactError | None
     reason, contact = getattr(watch, "refusal", 0), getattr(watch, "refused", 0)
     if not reason:
         return None
-    message = REFUSALS.get(reason, PARADOX if contact else REDUNDANT)
     named = contact and f"{contact} ({stepper.interface.contacts[contact - 1].title})"
-    return ContactError(message.format(t=t, k=named, value=watch.behind))
+    return ContactError(REFUSALS[reason].format(t=t, k=named, value=watch.behind))
 
 
 def modes_in_failure(stepper: Integrator, watch: Any) -> str:
@@ -63,12 +55,19 @@ def check_forward(run: Any) -> None:
         raise ContactError("runs with contacts go forward in time: give h > 0, or a final time after the start")
 
 
-def warn_of_choices(watch: Any) -> None:
-    """Warn if several motions were possible at a transition, and if the restitution of an impact was replaced."""
+def warn_of_choices(stepper: Integrator, watch: Any) -> None:
+    """Warn of several possible motions, of impacts without collision, and of a restitution that was replaced."""
     if getattr(watch, "ambiguous", 0):
         warn(
             "a transition has several motions, with contacts open, sticking or sliding, as in Painleve's paradox; the "
             "run has one of them: reduce friction, or change the geometry",
+            EventWarning,
+        )
+    if contact := getattr(watch, "jumps", 0):
+        warn(
+            f"impact without collision at t = {watch.jumped:.17g}, contact {contact} "
+            f"({stepper.interface.contacts[contact - 1].title}): no forces are consistent with its friction "
+            "(Painleve's paradox), and impulses, the limit of stiff contact, change the slip",
             EventWarning,
         )
     if law := getattr(watch, "law", 0):
@@ -93,7 +92,7 @@ def in_first_modes(stepper: Integrator, q: States, p: States, t: float, paramete
     if status:
         reason = f"the contacts are undefined at t = {t:.17g}, q = {q!r}: {REASONS[status]}"
         raise refusal_of(stepper, watch, t) or ContactError(reason)
-    warn_of_choices(watch)
+    warn_of_choices(stepper, watch)
     return q1, p1
 
 

@@ -185,7 +185,7 @@ class CrossingSearch:
 
     def warn_of_accumulation(self) -> None:
         """Issue a :class:`EventWarning` if the run ended where crossings accumulate, and for choices of contacts."""
-        warn_of_choices(self.watch)
+        warn_of_choices(self.stepper, self.watch)
         if self.changes and self.watch.accumulated:
             title, t = self.stepper.searched[self.watch.accumulated - 1].title, self.last[0]
             warn(

@@ -59,6 +59,8 @@ OF_STEP = 0.25
 """Increments of the time and of positions relative to their mean change in a step; of positions at least DIFFERENCE."""
 ADMISSIBLE = 0.5
 """Singular values of the derivative of a projection are at least 1, or 0 for inadmissible directions."""
+SAME_STATE = 1e-6
+"""Relative difference up to which the state after an event is that of its formulas, without impacts of contacts."""
 CONTINUOUS = 1e-9
 """Largest difference of the rates of both sides of a kink that is rounding: the flow has no jump there."""
 AT_KINK = 1e-9
@@ -334,7 +336,12 @@ def _jump(
     elif isinstance(event, Transition):
         change = values.map
     else:
-        by = _projection(later, values.value)[1]
+        projected_state, by = _projection(later, values.value)
+        if np.linalg.norm(projected_state - after) > SAME_STATE * np.linalg.norm(after):
+            raise StateError(
+                f"{event.title} at t = {t:.17g} with impacts of contacts, or one without collision: derivatives "
+                "through them are not available"
+            )
         change = by[:, : 2 * m] @ values.map
         change[:, 2 * m :] += by[:, 2 * m :]
     crossing_time = -gradient / rate  # dtau = crossing_time (dx, dh)

@@ -17,10 +17,11 @@ enum {
 #define CONTACT_SLIGHT 1e-4 /* part of the rates of bodies of which those of an impact are at least */
 #define CONTACT_LOWEST 16.0 /* roundings of a gap below which a rebound ends */
 #define CONTACT_RESIDUALS 16.0 /* residuals of its located zero below which a rebound ends */
+#define CONTACT_AHEAD 1e-5 /* time step of an impact without collision, relative to that in which a slip would stop */
 #define CONTACT_GAIN 1e-9 /* part of the work of an impact by which energy may grow */
 
 /* Impulses of contacts that meet with the given rates, by Newton's law or without restitution, and of those that are
- * closed, in consistent modes; 0 if there are none. */
+ * closed, in consistent modes, found from the impulses given; 0 if there are none. */
 static int impulses_of(const contact_terms *of, const int *meets, const int *closed, int law, const real *rate,
     real *impulse)
 {
@@ -40,7 +41,6 @@ static int impulses_of(const contact_terms *of, const int *meets, const int *clo
     in.role[k] = in.is_free[k] ? CONTACT_IS_OPEN : in.rests[k] ? CONTACT_STICKS
                                                                : CONTACT_SLIPS;
   }
-  memset(impulse, 0, BYTES(CONTACT_ROWS));
   return relax_modes(&in, impulse, mode) && is_consistent(&in, mode, impulse, after);
 }
 
@@ -62,6 +62,7 @@ static int restitute(const contact_terms *of, int contact, const int *meets, con
   }
   for (int k = 0; exists && differs && k < CONTACT_SECANTS; k++) {
     after[normal] = -high;
+    memset(added, 0, sizeof added);
     exists = impulses_of(of, meets, closed, CONTACT_PLASTIC, after, added);
     const real slope = (added[normal] - of_low) / (high - low);
     low = high;
@@ -74,15 +75,15 @@ static int restitute(const contact_terms *of, int contact, const int *meets, con
   return exists && !differs;
 }
 
-/* Impulses of the rows of contacts that approach, one after another, until none does, by a law of restitution, in the
- * friction cone; simultaneous ones with those that touch and do not separate, by Newton's law, which creates no energy
- * without friction: T+ - T- = sum of (1 - e) Lambda v_n- / 2. Closed contacts take part with e = 0. */
+/* Adds to impulses those of the rows of contacts that approach, one after another, until none does, by a law of
+ * restitution, in the friction cone; simultaneous ones with those that touch and do not separate, by Newton's law,
+ * which creates no energy without friction: T+ - T- = sum of (1 - e) Lambda v_n- / 2. Closed contacts take part with
+ * e = 0. */
 static int find_impulses(const event_step *step, const contact_terms *of, const int *approaches, const int *closed,
     int law, real *total)
 {
-  memset(total, 0, BYTES(CONTACT_ROWS));
   for (int round = 0; round < CONTACT_IMPACTS * EVENT_CONTACTS; round++) {
-    real rate[CONTACT_ROWS], impulse[CONTACT_ROWS];
+    real rate[CONTACT_ROWS], impulse[CONTACT_ROWS] = {0.0};
     int meets[EVENT_CONTACTS], shut[EVENT_CONTACTS], first = -1, several = 0;
     for (int r = 0; r < CONTACT_ROWS; r++)
       rate[r] = rate_after(of, of->rate, total, r);
@@ -165,9 +166,10 @@ static int is_met(const contact_terms *of, const contact_change *now, const int 
       (now->closes[k] || (!closed[k] && fabs(of->value[normal]) <= CONTACT_ROUNDING * of->size[normal]));
 }
 
-/* Impulses of all contacts that meet at a state, by the first law that creates no kinetic energy, and which contacts
- * touch and rest afterwards. */
-static int collide(const event_step *step, event_sample *at, contact_terms *of, const int *closed, contact_change *now)
+/* Impulses of all contacts that meet at a state after those of others, by the first law that creates no kinetic
+ * energy, and which contacts touch and rest afterwards. */
+static int collide(const event_step *step, event_sample *at, contact_terms *of, const int *closed, const real *others,
+    contact_change *now)
 {
   const contact_terms before = *of;
   real impulse[CONTACT_ROWS], residual = 0.0;
@@ -177,9 +179,11 @@ static int collide(const event_step *step, event_sample *at, contact_terms *of, 
     approaches[k] = is_met(of, now, closed, k);
     residual = fmax(residual, approaches[k] ? fabs(of->value[normal]) : 0.0);
   }
+  memcpy(impulse, others, sizeof impulse);
   status = find_impulses(step, of, approaches, closed, law, impulse);
   while (status == OK ? law < CONTACT_PLASTIC && gain_of(of, impulse) > CONTACT_GAIN : law == CONTACT_POISSON) {
     step->watch->refusal = 0;
+    memcpy(impulse, others, sizeof impulse);
     status = find_impulses(step, of, approaches, closed, ++law, impulse);
   }
   step->watch->law = law > step->watch->law ? law : step->watch->law;
@@ -200,4 +204,64 @@ static int collide(const event_step *step, event_sample *at, contact_terms *of, 
     step->watch->accumulates[k] = 0;
   }
   return status == OK ? settle(step, at, of, now) : status;
+}
+
+/* Impact without collision (F. Genot & B. Brogliato, Eur. J. Mech. A 18, 1999) at a state whose forces have no
+ * consistent mode: friction pulls stiff surfaces into each other without bound, until slips change. Its impulses are
+ * the limits Lambda of h f for h -> 0, f the forces of a time step of J. J. Moreau's (CISM 302, 1988), with
+ * r + h (b + W f) for the rates after it. They vanish where forces are bounded, else energy decreases: normal rates
+ * with impulses are 0 and friction opposes the slip after it, so that
+ * T+ - T- = Lambda r+ - Lambda W Lambda / 2 < 0. Returns whether there are any. */
+static int jump(const event_step *step, event_sample *at, contact_terms *of, contact_change *now)
+{
+  contact_problem in = {.of = of};
+  contact_mode mode[EVENT_CONTACTS];
+  real right[CONTACT_ROWS], after[CONTACT_ROWS], impulse[CONTACT_ROWS] = {0.0};
+  real speed = 0.0, approach = 0.0, largest = 0.0;
+  int closed[EVENT_CONTACTS], first = -1;
+  const int none[EVENT_CONTACTS] = {0};
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int normal = CONTACTS[k].normal, slips = CONTACTS[k].slips;
+    allow_modes(&in, k, now, step->watch->fastest[k]);
+    closed[k] = is_met(of, now, none, k) || (normal >= 0 && !in.is_free[k]); /* also one that separates */
+    in.is_free[k] &= !closed[k];
+    in.begins[k] = in.limit[k] = 0;
+    in.rests[k] = !in.is_free[k] && slips > 0;
+    if (!in.is_free[k])
+      in.role[k] = in.rests[k] ? CONTACT_STICKS : CONTACT_SLIPS;
+    if (closed[k])
+      approach = fmax(approach, -of->second[normal]);
+    if (closed[k] && slips > 0)
+      speed = fmax(speed, length_of(of->rate + CONTACTS[k].tangential, slips));
+  }
+  if (!(speed > 0.0 && approach > 0.0))
+    return 0;
+  const real h = CONTACT_AHEAD * speed / approach;
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    right[r] = of->second[r] + of->rate[r] / h;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int normal = CONTACTS[k].normal;
+    if (closed[k] && of->rate[normal] <= CONTACT_ROUNDING * of->speed[normal])
+      right[normal] = of->second[normal];
+  }
+  in.right = right;
+  if (!relax_modes(&in, impulse, mode) || !is_consistent(&in, mode, impulse, after))
+    return 0;
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    impulse[r] *= h;
+  if (!impulses_of(of, none, closed, CONTACT_PLASTIC, of->rate, impulse))
+    return 0;
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    if (closed[k] && in.rests[k] && impulse[CONTACTS[k].normal] > largest) {
+      largest = impulse[CONTACTS[k].normal];
+      first = k;
+    }
+  if (first < 0 || collide(step, at, of, closed, impulse, now) != OK)
+    return 0;
+  if (!step->watch->jumps) {
+    step->watch->jumps = first + 1;
+    step->watch->jumped = at->t;
+  }
+  step->watch->refusal = 0;
+  return 1;
 }

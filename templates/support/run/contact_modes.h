@@ -18,7 +18,7 @@ enum {
 typedef struct {
   const contact_terms *of;
   const real *right;
-  const real *scale; /* of the rates, NULL: 0 */
+  const real *scale; /* of the rates of impulses, which may vanish at closed contacts; NULL: of forces */
   int is_strict; /* slips that begin have a rate */
   int is_relaxed; /* contacts at their limit do not stick */
   int is_free[EVENT_CONTACTS], rests[EVENT_CONTACTS], begins[EVENT_CONTACTS], limit[EVENT_CONTACTS];
@@ -70,7 +70,8 @@ static int is_consistent(const contact_problem *in, const contact_mode *mode, re
     real begin = 0.0, moves = 0.0, aside;
     if (in->is_free[k])
       continue;
-    if (normal >= 0 && mode[k].closed && !(force[normal] * of->W[normal * (CONTACT_ROWS + 1)] > small))
+    if (normal >= 0 && mode[k].closed &&
+        !(force[normal] * of->W[normal * (CONTACT_ROWS + 1)] > (in->scale ? -small : small)))
       return 0;
     if (normal >= 0 && !mode[k].closed && after[normal] < -small)
       return 0;
@@ -208,7 +209,8 @@ static int modes_of_forces(contact_problem *in, int trial, const real *force, co
     const int normal = CONTACTS[k].normal;
     const real tau = length_of(force + CONTACTS[k].tangential, CONTACTS[k].slips);
     mode[k] = role[k];
-    if (normal >= 0 && force[normal] * of->W[normal * (CONTACT_ROWS + 1)] <= rounding_at_row(in, in->right, normal))
+    const real least = in->scale || normal < 0 ? 0.0 : rounding_at_row(in, in->right, normal);
+    if (normal >= 0 && force[normal] * of->W[normal * (CONTACT_ROWS + 1)] <= least)
       mode[k] = CONTACT_IS_OPEN;
     if ((trial == 0 && in->begins[k]) ||
         (mode[k].sticks && tau >= (1.0 - CONTACT_ROUNDING) * friction_limit(of, k, in->limit[k], force)))
@@ -332,24 +334,6 @@ static int refuse(const event_step *step, int reason, int k, real value)
   return NOT_CONVERGED;
 }
 
-/* The first contact of Painleve's paradox, G M^-1 (G - mu d T)^T <= 0 of a slip, at rest in any direction; -1: none. */
-static int painleve(const contact_problem *in, real *entry)
-{
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const int normal = CONTACTS[k].normal, slips = CONTACTS[k].slips;
-    const real *const W = in->of->W + normal * CONTACT_ROWS, *const coupling = W + CONTACTS[k].tangential;
-    real along = in->limit[k] ? length_of(coupling, slips) : 0.0;
-    if (normal < 0 || slips == 0 || in->is_free[k])
-      continue;
-    for (int j = 0; j < slips; j++)
-      along += in->role[k].direction[j] * coupling[j];
-    *entry = W[normal] - in->of->coefficient[3 * k] * along;
-    if (*entry <= 0.0)
-      return k;
-  }
-  return -1;
-}
-
 /* Whether friction is negative, less static than sliding at rest, or a restitution is not in [0, 1]; that number. */
 static int is_impossible(const contact_terms *of, int k, real *number)
 {
@@ -366,7 +350,7 @@ static int choose_modes(const event_step *step, const contact_terms *of, const c
 {
   contact_problem in = {.of = of, .right = of->second, .is_strict = 1};
   contact_mode best[EVENT_CONTACTS], other[EVENT_CONTACTS];
-  real second[CONTACT_ROWS], entry = 0.0;
+  real second[CONTACT_ROWS];
   int imposed[CONTACT_ROWS] = {0};
   for (int k = 0; k < EVENT_CONTACTS; k++)
     allow_modes(&in, k, now, step->watch->fastest[k]);
@@ -375,10 +359,8 @@ static int choose_modes(const event_step *step, const contact_terms *of, const c
     in.rests[k] |= in.begins[k] != 0;
     in.begins[k] = 0;
   }
-  if (!found && !relax_modes(&in, force, best)) {
-    const int paradox = painleve(&in, &entry);
-    return refuse(step, CONTACT_WITHOUT_MODE, paradox, paradox < 0 ? 0.0 : entry);
-  }
+  if (!found && !relax_modes(&in, force, best))
+    return refuse(step, CONTACT_WITHOUT_MODE, -1, 0.0);
   solve_contacts(of, best, of->second, force, second, imposed);
   step->watch->ambiguous |= enumerate_modes(&in, best, second, CONTACT_OTHERS, other);
   for (int k = 0; k < EVENT_CONTACTS; k++) {

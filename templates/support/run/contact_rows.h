@@ -10,7 +10,7 @@
 /* What the modes of contacts do not allow, in watch->refusal. */
 enum {
   CONTACT_PENETRATES = 1,
-  CONTACT_WITHOUT_MODE, /* Painleve's paradox, or redundant contacts */
+  CONTACT_WITHOUT_MODE, /* and without impact: redundant contacts */
   CONTACT_WITHOUT_IMPULSE,
   CONTACT_IN_CORNER,
   CONTACT_IMPOSSIBLE, /* coefficients */

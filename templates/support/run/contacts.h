@@ -8,8 +8,8 @@
  * r'' = 0; sliding adds -mu d times the normal force at the slip. A mode is consistent if normal forces are >= 0, open
  * contacts have g'' >= 0, sticking ones |tau| <= mu_s lambda, and slip that begins w' d > 0. With friction none
  * (P. Painleve, C. R. Acad. Sci. 121, 1895; F. Genot & B. Brogliato, Eur. J. Mech. A 18, 1999) or several may be.
- * Impacts obey the same conditions for impulses and velocities (C. Glocker, Set-Valued Force Laws, 2001). Requires:
- * parts/contacts.c.jinja. */
+ * Impacts obey the same conditions for impulses and velocities (C. Glocker, Set-Valued Force Laws, 2001); where forces
+ * have none, those of an impact without collision may. Requires: parts/contacts.c.jinja. */
 #define CONTACT_START 0x1p-40 /* part of a step after its start at which such a mode ends */
 #define CONTACT_MISSED 128.0 /* effects of rounding beyond which a negative gap shows a missed transition */
 
@@ -84,6 +84,7 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
   contact_terms of;
   contact_mode present[EVENT_CONTACTS];
   real force[CONTACT_ROWS];
+  const real none[CONTACT_ROWS] = {0.0};
   int closed[EVENT_CONTACTS], outside[EVENT_CONTACTS], approach = 0, first = 0;
   TRY(terms_at(step, at, &of));
   for (int k = 0; k < EVENT_CONTACTS; k++) {
@@ -99,13 +100,17 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
   }
   forces_at(at->t, at->q, at->p, step->own, present, force, step->workspace);
   if (approach)
-    TRY(collide(step, at, &of, closed, now));
+    TRY(collide(step, at, &of, closed, none, now));
 #ifdef CONTACTS_IN_SPACE
   else
     TRY(stop_together(step, at, &of, now));
 #endif
   for (int pass = 0; first >= 0 && pass <= EVENT_CONTACTS; pass++) {
-    TRY(choose_modes(step, &of, now, force));
+    const int status = choose_modes(step, &of, now, force);
+    if (status != OK && step->watch->refusal == CONTACT_WITHOUT_MODE && pass < EVENT_CONTACTS &&
+        jump(step, at, &of, now))
+      continue;
+    TRY(status);
     TRY(satisfy_constraints(step, at->t, at->q, at->p, 1));
     TRY(terms_at(step, at, &of));
     first = find_outside(step, &of, CONTACT_ROUNDING, outside);
