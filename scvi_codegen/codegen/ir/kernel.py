@@ -284,12 +284,11 @@ def calls_apart(kernel: Kernel, functions: Collection[str]) -> CallsApart | None
     expressions, moving = (*kernel.temporaries, *kernel.results), set[Load]()
     for k, expression in enumerate(kernel.temporaries):
         moving |= {Load("w", k)} if any(load.source == "u" or load in moving for load in loads(expression)) else set()
-    calls = [x for x in subexpressions(*expressions) if isinstance(x, Operation) and x.operator in functions]
-    calls = [*dict.fromkeys(x for x in calls if any(load.source == "u" or load in moving for load in loads(x)))]
+    found = (x for x in subexpressions(*expressions) if isinstance(x, Operation) and x.operator in functions)
+    calls = [x for x in dict.fromkeys(found) if any(load.source == "u" or load in moving for load in loads(x))]
     values = {call: Load("u", kernel.arguments + k) for k, call in enumerate(calls)}
-    found = tuple(call.operands[0] for call in calls)
     named = replace(kernel, name=f"{kernel.name}_arguments", purpose="Arguments of its functions.")
-    arguments = _with_results(named, kernel.temporaries, found)
+    arguments = _with_results(named, kernel.temporaries, [call.operands[0] for call in calls])
     if not calls or not {*arguments.operation_counts()} <= {"+", "-", "*", "neg"}:
         return None
     temporaries, results = (tuple(replaced(x, values) for x in of) for of in (kernel.temporaries, kernel.results))

@@ -242,9 +242,9 @@ class Nest:
 
     def _parts(self, loop: Loop, inner: Sequence[str], behind: Sequence[Sequence[str]]) -> list[str]:
         """Return the innermost loop, divided into parts if necessary."""
-        span = self._span(loop)
+        first, end = self._span(loop)
         if not self.chunked and not self._offsets(loop):
-            return _loop(loop, *span, inner)
+            return _loop(loop, first, end, inner)
         lines = [*self._part_passed_over(loop), f"lanes values[{len(self.stored)}][CHUNK];"] if self.chunked else []
         lines += _loop(loop, "begin", "end", inner)
         if loop.near:
@@ -256,9 +256,11 @@ class Nest:
                     self._sums_of_row(loop, targets) if together else _loop(loop, "begin", "end", behind[targets[0]])
                 )
         if self.apart:
-            lines = [*self._calls(loop, self.apart), *self._divided(loop, ("chunk", "past"), lines)]
-            return self._divided(loop, span, lines, ("chunk", "past"), chunked=True)
-        return self._divided(loop, span, lines, chunked=self.chunked)
+            lines = [*self._calls(loop, self.apart), *self._divided("chunk", "past", lines)]
+            head = f"for (long long chunk = {first}, past; chunk < {end}; chunk = past) {{"
+            lines = [f"past = {end} - chunk > CHUNK ? chunk + CHUNK : {end};", *lines]
+            return [head, *(f"  {line}" for line in lines), "}"]
+        return self._divided(first, end, lines, chunked=self.chunked)
 
     def _offsets(self, loop: Loop) -> list[int]:
         """Return the distances of neighbours across a periodic boundary."""
@@ -267,25 +269,14 @@ class Nest:
         moved = {place.base.number for place in places if place.index == loop.index and not place.table}
         return sorted(moved - {0}) if loop.periodic else []
 
-    def _divided(
-        self,
-        loop: Loop,
-        span: tuple[str, str],
-        lines: Sequence[str],
-        names: tuple[str, str] = ("begin", "end"),
-        *,
-        chunked: bool = False,
-    ) -> list[str]:
-        """Return a loop over parts of a span, of at most CHUNK elements, with constant distances in these lines."""
-        (first, last), (begin, end), text = span, names, "\n".join(lines)
-        body = [f"{end} = {last} - {begin} > CHUNK ? {begin} + CHUNK : {last};" if chunked else f"{end} = {last};"]
-        shifts = [(offset, _shift(loop.index, offset)) for offset in self._offsets(loop) if names[0] == "begin"]
-        body += [
-            f"const long long {shift} = around(begin, {offset}, {size_text(loop.end)}, &end);"
-            for offset, shift in shifts
-            if re.search(rf"\b{shift}\b", text)
-        ]
-        head = f"for (long long {begin} = {first}, {end}; {begin} < {last}; {begin} = {end}) {{"
+    def _divided(self, first: str, last: str, lines: Sequence[str], *, chunked: bool = False) -> list[str]:
+        """Return a loop over parts, of at most CHUNK elements, with constant distances in these lines."""
+        loop, text = self.rolled.loops[-1], "\n".join(lines)
+        body = [f"end = {last} - begin > CHUNK ? begin + CHUNK : {last};" if chunked else f"end = {last};"]
+        shifts, size = {_shift(loop.index, offset): offset for offset in self._offsets(loop)}, size_text(loop.end)
+        named = [shift for shift in shifts if re.search(rf"\b{shift}\b", text)]
+        body += [f"const long long {shift} = around(begin, {shifts[shift]}, {size}, &end);" for shift in named]
+        head = f"for (long long begin = {first}, end; begin < {last}; begin = end) {{"
         return [head, *(f"  {line}" for line in (*body, *lines)), "}"]
 
     def _calls(self, loop: Loop, apart: CallsApart) -> list[str]:
@@ -296,7 +287,7 @@ class Nest:
         lines += [self.constant(k, each) for k, each in enumerate(self.rolled.constants) if self.is_innermost(each)]
         lines.append(f"{apart.arguments.name}(u, t, parameters, value);")
         lines += [f"called[{k}][{counter(loop)} - chunk] = value[{k}];" for k in range(len(apart.functions))]
-        lines = self._divided(loop, ("chunk", "past"), _loop(loop, "begin", "end", lines))
+        lines = self._divided("chunk", "past", _loop(loop, "begin", "end", lines))
         for k, name in enumerate(apart.functions):
             head = f"for (long long at = 0, all = whole_registers(called[{k}], past - chunk); at < all; at++)"
             lines += [head, f"  called[{k}][at] = {name}(called[{k}][at]);"]
