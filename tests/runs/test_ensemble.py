@@ -17,6 +17,7 @@ import pytest
 from commands import error_of, invoke, output_of
 from notation import hamilton, lagrange
 from numpy.testing import assert_allclose
+from programs import needs
 from samples import ensemble_runs, pushed_pendulum, sample_named, stepper_for
 
 import scvi_codegen as sc
@@ -326,6 +327,22 @@ def test_bits_of_trajectories_do_not_depend_on_others(
             assert found[:rows].tobytes() == expected[:rows, members].tobytes()
         assert one.status.tolist() == runs.status[members].tolist()
         assert one.steps.tolist() == runs.steps[members].tolist()
+
+
+@pytest.mark.second
+def test_bits_of_trajectories_by_clang_do_not_depend_on_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lanes have the same products fused with sums."""
+    monkeypatch.setenv("CC", needs("clang"))
+    energy = "omega_1**2/2 + 0.4*omega_2**2 + 0.2*omega_3**2 - 2*R_33"
+    stepper = sc.compile_stepper(sc.LagrangianSystem.from_text("body", [], energy, rotations={"R": "omega"}), "svi:2")
+    generator = np.random.default_rng(0)
+    starts = [
+        stepper.integrate({"R": R}, velocity={"omega": [1, 2, 3]}, h=1, steps=0) for R in generator.normal(size=(16, 4))
+    ]
+    q, p = (np.concatenate(parts) for parts in zip(*((run.q, run.p) for run in starts), strict=True))
+    order = generator.permutation(16)
+    runs = [stepper.integrate_ensemble(q[of], p[of], h=0.05, steps=60) for of in (np.arange(16), order)]
+    assert runs[1].q.tobytes() == runs[0].q[:, order].tobytes()
 
 
 class TestThreadsAndInterruption:

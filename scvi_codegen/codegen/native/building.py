@@ -76,6 +76,13 @@ PORTABLE_FLAGS = ("-O2", "-ffp-contract=off")
 DECLARATIONS, DIRECTIVE = "declarations.h", re.compile("^#", re.MULTILINE)
 """File of the declarations for cffi, and a pattern of the directives in it that depend on the processor."""
 
+FUSED, FUSED_IN_EXPRESSIONS = "-ffp-contract=fast", "-ffp-contract=on"
+"""Flags of products that are fused with sums: of any statements, and of one expression.
+
+Clang decides about the former for each lane of an ensemble, so that bits would depend on the lane of a trajectory; the
+latter are as fast. Those of gcc do not, and it knows the latter in GNU C alone.
+"""
+
 DIVIDED_FLAGS = ("-fno-gcse", "-fno-tree-pre", "-fno-rerun-cse-after-loop", "-fno-dse", "-fno-schedule-insns2")
 """Flags in addition to -O3 for kernels divided into functions.
 
@@ -233,6 +240,8 @@ def _work(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> 
 def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], folder: Path) -> dict[str, Any]:
     """Compile the parts concurrently, one process each; link them, write the binding and return the manifest."""
     source.write(folder)
+    if FUSED in flags and _takes_flags(compiler, ("-Xclang", FUSED_IN_EXPRESSIONS)):
+        flags = tuple(FUSED_IN_EXPRESSIONS if flag == FUSED else flag for flag in flags)
     is_divided = any(part.contents.divided for part in source.sources)
     cut = DIVIDED_FLAGS if is_divided and _takes_flags(compiler, DIVIDED_FLAGS) else ()
     threads = THREADS if any(part.contents.threads for part in source.sources) else ()
