@@ -145,7 +145,12 @@ enum { EQUAL_MASSES = 1 }; /* for all parameters */
 #define TOGETHER 128 /* steps that are checked at once */
 
 #define ROWS
-enum { REACH = 1, CHUNKED_ROWS = 1, FUSED = 1, FRESH = 1 };
+enum {
+  REACH = 1,
+  CHUNKED_ROWS = 1,
+  FUSED = 1,
+  FRESH = 1
+};
 #define share_rows share_force_0
 
 static long long rows_of(const problem *arrays)
