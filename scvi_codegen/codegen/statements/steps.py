@@ -197,7 +197,8 @@ t[col(e)] += (GROWN * G[e]) * lam[row(e)]
 invert(masses)
 factorise(G)
 f[i] = t[i]
-r[i] = (base_p[i] + (h * (RATTLE_IMPULSE @ f[i]) - ((RATTLE_MEAN @ p[i]) + RATTLE_MEAN_OF_LAST * last_p[i]))) / GROWN
+mean[i] = (RATTLE_MEAN @ p[i]) + RATTLE_MEAN_OF_LAST * last_p[i]
+r[i] = (base_p[i] + (h * (RATTLE_IMPULSE @ f[i]) - mean[i])) / GROWN
 b[i] = mass(r[i])
 y[i] = b[i]
 moved[i] = h * (RATTLE_DISPLACEMENT @ y[i])
@@ -242,19 +243,24 @@ BEGIN = """
 if momentum_terms:
     shifted[i] = forced[i] + (RATTLE_SHIFT @ w[i])
     a[i] = rate * (RATTLE_INVERSE @ shifted[i])
-    low[i] = RATTLE_DRIFT_LOW * (h * v0[i]) + hh * (RATTLE_RESPONSE_LOW @ a[i]) - h * (RATTLE_SHIFT_LOW @ w[i])
 else:
     a[i] = rate * (RATTLE_INVERSE @ forced[i])
-    low[i] = RATTLE_DRIFT_LOW * (h * v0[i]) + hh * (RATTLE_RESPONSE_LOW @ a[i])
+moved[i] = hh * (RATTLE_RESPONSE_LOW @ a[i])
+low[i] = RATTLE_DRIFT_LOW * (h * v0[i]) + moved[i]
+if momentum_terms:
+    low[i] -= h * (RATTLE_SHIFT_LOW @ w[i])
 if velocity_forces:
-    base_v[i] = v0[i] + (RATTLE_VELOCITY_START * v0[i] + h * (RATTLE_VELOCITY_LOW @ a[i]))
+    gained[i] = h * (RATTLE_VELOCITY_LOW @ a[i])
+    base_v[i] = v0[i] + (RATTLE_VELOCITY_START * v0[i] + gained[i])
 base[i] = q0[i] + (carry_q[i] + (low[i] + RATTLE_DRIFT * (h * v0[i])))
 """
 END = """
 b[i] = mass(f[i])
 all[i] = f[i]
 a[i] = b[i]
-push[i] = RATTLE_START * v0[i] + h * ((RATTLE_MOMENTUM @ a[i]) + (RATTLE_MOMENTUM_LOW @ a[i]))
+mean[i] = RATTLE_MOMENTUM @ a[i]
+mean[i] += RATTLE_MOMENTUM_LOW @ a[i]
+push[i] = RATTLE_START * v0[i] + h * mean[i]
 if momentum_terms:
     z[i] = v0[i] + (push[i] - (RATTLE_PROJECTION @ w[i]))
 else:
@@ -269,11 +275,13 @@ t[col(e)] += GROWN * former(derivative[e]) * lam[row(e)]
 f[i] = t[i]
 """
 COUPLED_POSITIONS = """
-base[i] = q0[i] + (carry_q[i] + h * (RATTLE_DISPLACEMENT_LOW @ v[i]))
+low[i] = h * (RATTLE_DISPLACEMENT_LOW @ v[i])
+base[i] = q0[i] + (carry_q[i] + low[i])
 u[i] = base[i] + h * (RATTLE_DISPLACEMENT @ v[i])
 """
 COUPLED_MOMENTA = """
-base_p[i] = p0[i] + (h * (RATTLE_IMPULSE_LOW @ f[i]) - ((RATTLE_MEAN_LOW @ p[i]) + RATTLE_MEAN_OF_LAST_LOW * last_p[i]))
+mean[i] = (RATTLE_MEAN_LOW @ p[i]) + RATTLE_MEAN_OF_LAST_LOW * last_p[i]
+base_p[i] = p0[i] + (h * (RATTLE_IMPULSE_LOW @ f[i]) - mean[i])
 """
 COUPLED_END = "z[i] = RATTLE_UNKNOWNS @ v[i]"
 """The same for masses that depend on positions; the guess has the low words of the tables."""
