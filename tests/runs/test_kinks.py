@@ -64,6 +64,12 @@ def test_motions_at_rest_on_a_surface():
     assert not [*wrong("rope", [85], ["svi:4"], ["error="]), *wrong("floor", [133], ["svi:4"], ["order"])]
 
 
+@pytest.mark.rotated
+def test_first_steps_where_forces_vanish():
+    """So does the one coefficient of curves of SVI(2) there; at the start of a run, and at a kink."""
+    assert not wrong("ramp", [35, 27], ["svi:2"], ["round-off", "tolerance"])
+
+
 @pytest.mark.full
 @pytest.mark.parametrize("method", METHODS)
 @families

@@ -6,12 +6,13 @@
  * Newton's method (NEWTON_ALONE) or, for arrays, by Newton-GMRES (NEWTON_KRYLOV). Requires: run.h or array_step.h,
  * and next_change of a step-size controller. */
 
-#define ALLOWED_TO_HALVES 100 /* admissible difference of the half steps, relative to the admissible error estimate */
+#define ONE_COEFFICIENT (GROWTH < REAL(1.5)) /* of the curve, which vanishes where forces do */
+#define ALLOWED_TO_HALVES (ONE_COEFFICIENT ? 1 : 100) /* admissible difference of the half steps, relative to the
+                                                       * admissible error estimate */
 #define SPURIOUS REAL(1e-8) /* relative to the motion: spurious solutions of the equations differ by more */
 #define MANY_ITERATIONS 10 /* of a step, after which the next one is not larger */
 #define TOO_MANY_ITERATIONS 13 /* the next one is smaller: about ten iterations take the least time per unit of time */
-#define TRUSTED_DECREASE (GROWTH < REAL(1.5) ? REAL(0.97) : 0) /* of the error by a step, if the curve has one \
-                                                               * coefficient, which vanishes where forces do */
+#define TRUSTED_DECREASE (ONE_COEFFICIENT ? REAL(0.97) : 0) /* of the error by a step */
 #define SMALL_PART REAL(0.1) /* of the largest momentum: smaller changes count as little */
 #define SHORT_PART REAL(0.125) /* of the time in which a state changes by its size, or of the span: early trial */
 #define RISING REAL(4.0) /* velocities from rest are larger by this factor in a trial that is much longer */
@@ -725,7 +726,8 @@ static SELDOM int compare_step(run_memory *run, trial *now, int steps_to_compare
 {
   int examined = steps_to_compare || is_leap(run, now) ? MOST_EXAMINED : 0;
   const real allowed = larger(
-      ALLOWED_TO_HALVES * MATH(pow)(now->limits.most, ERROR_POWER), steps_to_compare ? ROUNDOFF_LEVEL : SPURIOUS);
+      ALLOWED_TO_HALVES * MATH(pow)(now->limits.most, ERROR_POWER),
+      ONE_COEFFICIENT || steps_to_compare ? ROUNDOFF_LEVEL : SPURIOUS);
   for (;;) {
     real apart;
     const int status = compare_trial(now, steps_to_compare, options, &apart);
