@@ -86,7 +86,7 @@ def test_statements_of_constraints_are_those_of_their_masses():
         for mass in ("2", "(1 + x**2)")
     )
     first, second = ("".join(sc.derive(system, "svi:2").statements.values()) for system in (constant, varying))
-    assert "a[i] = mass(f[i])" in first
+    assert "d[i] = mass(f[i])" in first
     assert [text.count("z[i] = ") for text in (first, second)] == [1, 1]  # the curve at the end of the step
     assert "momentum_terms" not in first
     assert "invert(masses)" in second

@@ -14,6 +14,7 @@
 #define TOO_MANY_ITERATIONS 13 /* the next one is smaller: about ten iterations take the least time per unit of time */
 #define TRUSTED_DECREASE (ONE_COEFFICIENT ? REAL(0.97) : 0) /* of the error by a step */
 #define SMALL_PART REAL(0.1) /* of the largest momentum: smaller changes count as little */
+#define NEVER_FAILED (1 << 16) /* level beyond all exponents of a number: the iteration failed at no size yet */
 #define SHORT_PART REAL(0.125) /* of the time in which a state changes by its size, or of the span: early trial */
 #define RISING REAL(4.0) /* velocities from rest are larger by this factor in a trial that is much longer */
 #define FEW_ITERATIONS 3 /* of a trial that is much shorter than the time in which forces change */
@@ -404,6 +405,8 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
   long long highest;
   int found = 0, up = 1, early;
   now->pilot = 0;
+  if (run->avoiding == 0)
+    run->failed = NEVER_FAILED;
   if (now->control->first_step) {
     run->grid_level = level_below(*now->control->first_step);
     run->grid_level += levels_within(run, now, 0);
@@ -506,20 +509,39 @@ static SELDOM void avoid_size(run_memory *run, trial *now)
 #endif
 }
 
+#ifdef NEWTON_ADMITTED
+/* Returns 1 if a step that is larger by so many levels than the one before may have an admissible error: that of its
+ * curve, which is still stored, grows to no more, or is rounding. Displacements are the largest so far. */
+static SELDOM int may_grow(const run_memory *run, const trial *now, int levels)
+{
+  const real rounding = limits_of(ROUNDOFF_ERROR).least, most = error_at(now->limits.most, -levels);
+  step_data before = now->step;
+  solver_data data = now->data;
+  real moved[M];
+  before.h = size_of_level(run->grid_level - run->change);
+  prepare(&before, &data);
+  for (int i = 0; i < M; i++)
+    moved[i] = before.h * run->largest_v[i];
+  return curve_error(&before, &data, STORED(run, &before), moved, EACH, now->limits.decay, 0) <=
+      GROWTH * larger(rounding, most);
+}
+#endif
+
 /* Tries the step by Newton's method where the iteration, not the error, limits the steps: where it fails again at about
- * the size at which it failed before, after a step whose error the estimate does not distinguish from rounding.
- * Newton's method takes several times as long, so that its step has to be so many times as large; it then solves the
- * next steps. Returns 0 where the step has an inadmissible error. The iteration is tried again after those steps; where
- * it has no admissible step of the same size, Newton's method solves the next ones, too. */
+ * the size at which it failed before. Newton's method takes several times as long, so that its step has to be so many
+ * times as large, with an admissible error; it then solves the next steps. Returns 0 where the step has an inadmissible
+ * error. The iteration is tried again after those steps; where it has no admissible step of the same size, Newton's
+ * method solves the next ones, too. */
 static inline int try_by_newton(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
 #ifdef NEWTON_ADMITTED
   const long long level = run->grid_level, above = run->failed + GAIN_OF_NEWTON - level;
   const int again = run->avoiding == TRIED_AGAIN;
   const int first = now->change + level == run->change; /* trial of the step */
-  const int repeated = first && run->avoiding == 0 && run->failed - level <= LEVELS_PER_BINADE;
+  const int near = run->failed - level <= LEVELS_PER_BINADE && level - run->failed <= LEVELS_PER_BINADE;
+  const int repeated = first && run->avoiding == 0 && near;
   const int unlimited = repeated && levels_within(run, now, INT_MAX) >= above;
-  if (!again && !(unlimited && error_at(run->error_before, -(int)run->change) <= GROWTH * now->limits.least))
+  if (!again && !(unlimited && may_grow(run, now, (int)(run->change + above))))
     return 0;
   run->avoiding = -AVOIDED;
   run->grid_level += again || above < 0 ? 0 : above;
