@@ -42,16 +42,21 @@ static int find_outside(const event_step *step, const contact_terms *of, real pa
   return first;
 }
 
-/* Notes that the gaps of open contacts which were closed, or are within rounding, are at a zero of their functions. */
-static void note_opening(const event_step *step, const contact_terms *of, const int *closed)
+/* Notes that the gaps of open contacts which were closed, or are 0 within rounding, are at a zero of their functions:
+ * negative ones, too, as the projection of others moves them, but not those that were negative `before` it. */
+static void note_opening(const event_step *step, const contact_terms *of, const real *before, const int *closed)
 {
   for (int i = 0; i < TRANSITIONS; i++) {
     const int k = TRANSITION[i][0], row = CONTACTS[k].normal;
     const int e = EVENT_FIRST[FIRST_TRANSITION + i];
-    if (TRANSITION[i][1] == CONTACT_CLOSES && !mode_of(step->watch->mode, k).closed &&
-        (closed[k] || (fabs(of->value[row]) <= of->rounding[row] && !JUST_CHANGED(step->watch, e))))
-      step->watch->history[e] = (NAME(event_history)){
-          .last = step->watch->time, .slack = fabs(of->value[row]) + of->rounding[row], .hits = 1};
+    NAME(event_history) *const history = step->watch->history + e;
+    if (TRANSITION[i][1] != CONTACT_CLOSES || mode_of(step->watch->mode, k).closed ||
+        !(closed[k] || of->value[row] <= of->rounding[row]) || (of->absent[k] && of->value[row] < -of->rounding[row]) ||
+        !(closed[k] || before[row] >= -of->rounding[row] - history->slack))
+      continue;
+    if (closed[k] || !JUST_CHANGED(step->watch, e))
+      *history = (NAME(event_history)){.last = step->watch->time, .hits = 1};
+    history->slack = fmax(history->slack, fabs(of->value[row]) + of->rounding[row]);
   }
 }
 
@@ -85,8 +90,10 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
   contact_mode present[EVENT_CONTACTS];
   real force[CONTACT_ROWS];
   const real none[CONTACT_ROWS] = {0.0};
+  real before[CONTACT_ROWS];
   int closed[EVENT_CONTACTS], outside[EVENT_CONTACTS], approach = 0, first = 0;
   TRY(terms_at(step, at, &of));
+  memcpy(before, of.value, sizeof before);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const contact_mode mode = mode_of(step->watch->mode, k);
     if (CONTACTS[k].slips > 0)
@@ -121,7 +128,7 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
     return refuse(step, CONTACT_WITHOUT_MODE, -1, 0.0);
   else if (first >= 0)
     return refuse(step, CONTACT_LEAVES_CONE, first, 0.0);
-  note_opening(step, &of, closed);
+  note_opening(step, &of, before, closed);
   return OK;
 }
 
