@@ -299,3 +299,16 @@ def test_a_body_on_a_leg_passes_painleves_paradox_bounces_and_rests(tmp_path):
     assert np.abs(run.velocity[-1]).max() < 1e-12
     assert np.diff(run.energy()).max() < 1e-12
     assert 10 < len(run.contact_modes) < len(run)
+
+
+@pytest.mark.second
+@pytest.mark.filterwarnings("ignore:impact without collision")
+def test_rebounds_of_a_joint_above_feet_that_rest_end(tmp_path):
+    """In free fall a knee has no acceleration that would end them: the forces of the feet count."""
+    (tmp_path / "leg.xml").write_text(LEGGED)
+    leg = sc.LagrangianSystem.from_mjcf(tmp_path / "leg.xml", limits="contact", contacts="planes", restitution=0.3)
+    run = sc.compile_stepper(leg, "svi:2").integrate(
+        [0, 0.147, 0.109, -0.101, -0.407], velocity=[1.081, 0, 1.935, -0.27, 0], h=0.005, t_end=1.5
+    )
+    assert np.diff(run.energy()).max() < 1e-12
+    assert len(run.contact_modes) < len(run)

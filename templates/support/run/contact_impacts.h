@@ -123,15 +123,16 @@ static real gain_of(const contact_terms *of, const real *impulse)
 
 /* Whether the height w^2 / (2 g'') of a rebound is of the size of rounding, or of the residuals of the located zeros of
  * the contacts that meet, which a projection moves; of a gap that moves, of that of the search, which sees no rounding
- * of time. */
-static int is_low(const event_step *step, const contact_terms *of, real residual, int k)
+ * of time. g'' contains the forces of other contacts before the impact: in free fall joints have none without them. */
+static int is_low(const event_step *step, const contact_terms *of, const real *force, real residual, int k)
 {
   const int row = CONTACTS[k].normal;
+  const real second = fmin(of->second[row], rate_after(of, of->second, force, row));
   real lowest = CONTACT_LOWEST * of->rounding[row] + CONTACT_RESIDUALS * residual;
   for (int i = 0; i < TRANSITIONS && of->drift[row] > CONTACT_ROUNDING * of->speed[row]; i++)
     if (TRANSITION[i][0] == k && TRANSITION[i][1] == CONTACT_CLOSES)
       lowest += 4.0 * step->watch->history[EVENT_FIRST[FIRST_TRANSITION + i]].slack;
-  return of->rate[row] * of->rate[row] <= -2.0 * of->second[row] * lowest;
+  return of->rate[row] * of->rate[row] <= -2.0 * second * lowest;
 }
 
 /* Adds impulses to the momenta. */
@@ -172,8 +173,10 @@ static int collide(const event_step *step, event_sample *at, contact_terms *of, 
     contact_change *now)
 {
   const contact_terms before = *of;
-  real impulse[CONTACT_ROWS], residual = 0.0;
+  contact_mode present[EVENT_CONTACTS];
+  real impulse[CONTACT_ROWS], force[CONTACT_ROWS], residual = 0.0;
   int approaches[EVENT_CONTACTS], law = CONTACT_NEWTON, status;
+  forces_at(at->t, at->q, at->p, step->own, present, force, step->workspace);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal;
     approaches[k] = is_met(of, now, closed, k);
@@ -199,7 +202,7 @@ static int collide(const event_step *step, event_sample *at, contact_terms *of, 
       now->touches[k] = 1;
     if (of->rate[normal] > CONTACT_ROUNDING * before.speed[normal])
       now->touches[k] = 0;
-    if (step->watch->accumulates[k] || is_low(step, of, residual, k))
+    if (step->watch->accumulates[k] || is_low(step, of, force, residual, k))
       now->touches[k] = 1;
     step->watch->accumulates[k] = 0;
   }
