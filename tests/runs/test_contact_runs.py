@@ -134,6 +134,18 @@ def test_contacts_end_at_times_and_beside_others(steps: dict[str, float]) -> Non
     assert contacts_of([floors[0].table]) == (floors[0],)
 
 
+@pytest.mark.parametrize("edge", ["t - T", "x - t - 1 - T"])
+def test_a_floor_takes_over_from_another_at_a_node(edge: str) -> None:
+    """The nodes h k miss T = h n by rounding, before and after."""
+    floors = [sc.contact("y", where=f"{edge} {way} 0") for way in "<>"]
+    stepper = of(POINT, "x y", floors, T=0.1)
+    for n in (1, 2, 5, 8, 9, 10):
+        run = stepper.integrate([1.0, 0.0], velocity=[2.0, 0.0], t_end=0.25, h=0.1 / n)
+        assert run.q[-1] == pytest.approx([1.5, 0.0], abs=1e-15)
+        assert [modes for _, modes in run.contact_modes] == [("slip", "open"), ("open", "slip")]
+        assert run.contact_modes[1][0] == pytest.approx(0.1, abs=1e-15)
+
+
 @pytest.mark.parametrize(("steps", "error"), [({"h": 0.05}, 1e-10), ({}, 5e-14)])
 def test_friction_on_a_surface_is_that_of_the_true_normal_force(steps: dict[str, float], error: float) -> None:
     parabola = sc.contact(

@@ -44,6 +44,11 @@ def test_zeros_of_other_functions(function: str, zeros: Any) -> None:
     assert_allclose(times(function, KICK, t_end=97.5).events[0].t, zeros, rtol=1e-14)
 
 
+def test_zeros_within_rounding_of_nodes() -> None:
+    for steps in (5, 8, 9, 12):
+        assert_allclose(times("t - 1/10", KICK, h=0.1 / steps, t_end=0.25).events[0].t, [0.1], rtol=2e-16)
+
+
 def test_zeros_of_polynomials_are_found_along_steps() -> None:
     run = times("(t - 1)*(t - 2)*(t - 3)", KICK, t_end=97.5)
     assert_allclose(run.events[0].t, [1.0, 2.0, 3.0], rtol=1e-12)

@@ -144,10 +144,13 @@ static int terms_at(const event_step *step, const event_sample *at, contact_term
 {
   real *const v = step->memory + 3 * M, power = 0.0;
   const real duration = fabs(step->whole);
+  event_sample next = {.t = at->t + EVENT_SAME_TIME * fabs(at->t), .q = v + M};
   TRY(rows_at(at->t, at->q, at->p, step->own, of, step->workspace));
   TRY(NAME(velocity)(at->t, at->q, at->p, step->own, v, step->workspace));
-  for (int i = 0; i < M; i++)
+  for (int i = 0; i < M; i++) {
     power += at->p[i] * v[i];
+    next.q[i] = at->q[i] + EVENT_TIE * step->whole * v[i];
+  }
   for (int r = 0; r < CONTACT_ROWS; r++) {
     const real by_position = size_by_position(of->G + r * M, at->q);
     real by_velocity = 0.0;
@@ -170,7 +173,9 @@ static int terms_at(const event_step *step, const event_sample *at, contact_term
     int exists;
     if (TRANSITION[i][1] != CONTACT_CLOSES || !IS_CONDITIONAL[event])
       continue;
-    TRY(conditions(EVENT_FIRST[event], at->t, at->q, at->p, step->parameters, &exists, step->workspace));
+    TRY(conditions(EVENT_FIRST[event], next.t, at->q, at->p, step->parameters, &exists, step->workspace));
+    if (!exists) /* within rounding, as where one contact replaces another */
+      TRY(conditions(EVENT_FIRST[event], next.t, next.q, at->p, step->parameters, &exists, step->workspace));
     of->absent[k] = !exists || of->value[row] < -CONTACT_PENETRATION * of->size[row];
   }
   return OK;

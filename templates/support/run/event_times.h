@@ -7,7 +7,6 @@
  * time_reach and time_value of parts/event_functions.c.jinja. */
 #define EVENT_INTERVALS (1 << 20) /* largest number of a step */
 #define EVENT_TIME_NOISE (8.0 * DBL_EPSILON) /* of a function, for each ulp of its terms */
-#define EVENT_SAME_TIME (8.0 * DBL_EPSILON) /* relative to the time: rounding of a zero */
 
 /* Value of function e at the end t of a step in the direction of `span`. */
 static int end_value(const event_step *step, int e, real t, real span, real *g)
@@ -32,6 +31,7 @@ static int add_time(const event_step *step, int e, event_sample from, const even
     else
       from.t = middle, from.g = g;
   }
+  TRY(time_value(e, high.t, step->parameters, &high.g, step->workspace)); /* not that behind the end of a step */
   if (fabs(from.g) < fabs(high.g) && from.t != left->t)
     high.t = from.t, high.g = from.g;
   high.fraction = high.t == right->t ? 1.0 : (high.t - step->t) / step->h;
@@ -68,7 +68,7 @@ static int search_until(const event_step *step, int e, real t, const event_sampl
   if ((t - step->t) / step->h >= step->horizon->fraction)
     return OK;
   TRY(time_value(e, middle.t, step->parameters, &middle.g, step->workspace));
-  TRY(time_reach(e, middle.t, fabs(half), step->parameters, reach, step->workspace));
+  TRY(time_reach(e, middle.t, fabs(half) + EVENT_SAME_TIME * fabs(to->t), step->parameters, reach, step->workspace));
   const real noise = EVENT_TIME_NOISE * reach[2];
   if (fabs(middle.g) > reach[0])
     return fabs(middle.g) > noise ? note_sign(step, e, last, &middle, left, right) : OK;

@@ -17,6 +17,7 @@ enum {
 };
 
 #define EVENT_TIE 0x1p-30 /* relative to the step: closer crossings may coincide */
+#define EVENT_SAME_TIME (8.0 * DBL_EPSILON) /* relative to the time: rounding of a zero of a function of time */
 #define EVENT_AT_ZERO (16.0 * DBL_EPSILON) /* relative to the range of a function on a whole step: residual of a
                                             * located zero */
 #define EVENT_UNCHANGED (4.0 * DBL_EPSILON) /* relative to the range of a function on a step: a change that may be
