@@ -438,7 +438,7 @@ def straight(stages: StageSystem, q: Any, v: Any, p: Any, h: Any, number: Callab
     return [
         number(block.straight[0]) * q + number(block.straight[1]) * h ** (1 - block.power) * v + block.momentum * p
         if block.size is None
-        else 0 * q[: block.size]
+        else 0 * q[[0] * block.size]
         for block in stages.blocks
     ]
 
