@@ -284,8 +284,8 @@ def calls_apart(kernel: Kernel, functions: Collection[str]) -> CallsApart | None
     expressions, moving = (*kernel.temporaries, *kernel.results), set[Load]()
     for k, expression in enumerate(kernel.temporaries):
         moving |= {Load("w", k)} if any(load.source == "u" or load in moving for load in loads(expression)) else set()
-    found = (x for x in subexpressions(*expressions) if isinstance(x, Operation) and x.operator in functions)
-    calls = [x for x in dict.fromkeys(found) if any(load.source == "u" or load in moving for load in loads(x))]
+    of_functions = (x for x in subexpressions(*expressions) if isinstance(x, Operation) and x.operator in functions)
+    calls = [x for x in dict.fromkeys(of_functions) if any(load.source == "u" or load in moving for load in loads(x))]
     values = {call: Load("u", kernel.arguments + k) for k, call in enumerate(calls)}
     named = replace(kernel, name=f"{kernel.name}_arguments", purpose="Arguments of its functions.")
     arguments = _with_results(named, kernel.temporaries, [call.operands[0] for call in calls])

@@ -254,6 +254,8 @@ static int jump(const event_step *step, event_sample *at, contact_terms *of, con
     impulse[r] *= h;
   if (!impulses_of(of, none, closed, CONTACT_PLASTIC, of->rate, impulse))
     return 0;
+  if (gain_of(of, impulse) > CONTACT_GAIN)
+    return 0;
   for (int k = 0; k < EVENT_CONTACTS; k++)
     if (closed[k] && in.rests[k] && impulse[CONTACTS[k].normal] > largest) {
       largest = impulse[CONTACTS[k].normal];
