@@ -160,6 +160,16 @@ def test_a_certificate_is_text_json_and_a_verdict(tmp_path: Path) -> None:
     assert "all measured properties are satisfied" in certificate.to_text()
 
 
+def test_the_state_is_given_by_momenta_or_by_velocities() -> None:
+    rod = sc.LagrangianSystem.from_text("rod", ["q"], "2*q_dot**2 + cos(q)")
+    certificate = sc.verify(rod, "svi:1", [0.5], velocity={"q": 0.25}, h=0.1)
+    assert certificate.passed
+    assert (certificate.q, certificate.p) == ((0.5,), (1.0,))
+    for state, message in (({"q": 1.0}, "got neither"), ({"velocity": 1.0}, "without q"), ({"p": 1.0}, "without q")):
+        with pytest.raises(sc.StateError, match=message):
+            sc.verify(rod, "svi:1", **state)
+
+
 @pytest.mark.parametrize("method", ["svi:4", "svi:8"])
 def test_rounding_of_growing_motions_is_no_drift(method: str) -> None:
     """A body falls 10^5 times its initial distance: terms of the energy and of the boost grow alike in all runs."""

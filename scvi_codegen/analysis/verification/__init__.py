@@ -84,16 +84,17 @@ def verify(
     Args:
         system: mechanical system.
         method: method, or its name, as ``"svi:8"``.
-        q, p: (m,) state at which to measure, both or neither; by default a random state at which steps succeed.
+        q, p: (m,) state at which to measure; by default a random state at which steps succeed.
         h: step size, in transformed time of tau; by default one that changes this state by about a tenth of its size.
         t: time.
         stepper: stepper under test, for example from ``load_package``; by default compiled now. For a stepper with a
             time-rescaling function (:func:`~scvi_codegen.compile_stepper`) its adaptive steps are measured, too.
         tolerance: also measure runs with adaptive step size and this relative local error; 0: round-off.
         solver: as for ``compile_stepper``.
-        velocity, parameters, tables: only for arrays of run-time sizes, which also need q and h (fields on a mesh do
-            not), as of :meth:`Stepper.integrate`: properties are measured on a few indices of the arrays first, then at
-            full size; the state of the certificate is that of the few indices.
+        velocity: (m,) velocities of the state, instead of p.
+        parameters, tables: only for arrays of run-time sizes, which also need q and h (fields on a mesh do not), as of
+            :meth:`Stepper.integrate`: properties are measured on a few indices of the arrays first, then at full size;
+            the state of the certificate is that of the few indices.
 
     Returns:
         The certificate. The properties follow from the method (order, symmetry, symplecticity) and the system (momentum
@@ -102,7 +103,7 @@ def verify(
     Raises:
         BuildError: without a C compiler.
         MethodError: if the method does not apply to the system, or has no such solver.
-        StateError: if only one of q and p is passed, or no state is found.
+        StateError: for q without p and velocity or with both, p or velocity without q, or if no state is found.
     """
     of_run: dict[str, Any] = {"velocity": velocity, "parameters": parameters, "tables": tables}
     if isinstance(system, ArraySystem) and system.mesh is not None and q is None and p is None:
@@ -123,7 +124,7 @@ def verify(
     if stepper.interface.masked != len(form.reactions):
         raise StateError(f"'{system.name}' has other contacts than {stepper!r}: pass a system with them, contacts=")
     system = located if stepper.interface.modes else form
-    start = _initial_state(system, stepper, q, p, h, t)
+    start = _initial_state(system, stepper, (q, p, velocity), h, t)
     return _certificate(system, method, stepper, start, began, solver=solver, tolerance=tolerance)
 
 
@@ -134,11 +135,9 @@ def _check_arguments(
     of_arrays = isinstance(system, ArraySystem)
     if of_arrays and (q is None or h is None):
         raise StateError(f"verify requires q and h for arrays of '{system.name}': their shapes determine the sizes")
-    for name, value in of_run.items():
-        if value is not None and not of_arrays:
-            raise StateError(
-                f"{name} is for arrays of run-time sizes: give p, and parameters as defaults of the system"
-            )
+    for name in ("parameters", "tables"):
+        if of_run[name] is not None and not of_arrays:
+            raise StateError(f"{name} is for arrays of run-time sizes: give parameters as defaults of the system")
     if stepper is None or stepper.run_time_sizes == of_arrays:
         return
     if of_arrays:
@@ -198,12 +197,15 @@ def _newton(
     return _compiled(system, method, solver="newton", flags=flags)
 
 
-def _initial_state(system: MechanicalSystem, stepper: Stepper, q: Any, p: Any, h: float | None, t: float) -> State:
-    if (q is None) != (p is None):
-        raise StateError("only one of q and p was passed: give both, or neither")
-    if q is None or p is None:
+def _initial_state(
+    system: MechanicalSystem, stepper: Stepper, state: tuple[Any, Any, Any], h: float | None, t: float
+) -> State:
+    if all(part is None for part in state):
         return _random_state(system, stepper, h, t)
-    position, momentum = stepper._states.pair(q, p)
+    q, p, velocity = stepper._states.start(*state)
+    if q is None:
+        raise StateError("p or velocity was passed without q: give the whole state, or none")
+    position, momentum = stepper._states.pair(q, stepper._initial_momenta(q, p, velocity, t, None))
     if system.constraints:
         position, momentum = stepper.project(position, momentum, t=t)
     return State(position, momentum, t, h if h else _step(stepper, position, momentum, t))
