@@ -32,14 +32,12 @@ enum {
 /* A mass. Operations: constants. */
 static void mass_0(const double *u, double t, const double *parameters, double *value)
 {
-  (void)u, (void)t, (void)parameters;
   value[0] = 1.0;
 }
 
 /* The term. Operations: 5 *, 1 +, 1 -. */
 static void term_0(const double *u, double t, const double *parameters, double *value)
 {
-  (void)t;
   const double w0 = u[0] - u[1];
   const double w1 = w0 * w0;
   value[0] = (-0.25) * (2.0 * w1 + parameters[0] * (w1 * w1));
@@ -48,7 +46,6 @@ static void term_0(const double *u, double t, const double *parameters, double *
 /* Derivatives with respect to its coordinates. Operations: 3 *, 1 +, 2 -, 1 neg. */
 static void force_0(const double *u, double t, const double *parameters, double *value)
 {
-  (void)t;
   const double w0 = u[0] - u[1];
   const double w1 = parameters[0] * (w0 * w0 * w0) - u[1] + u[0];
   value[0] = -w1;
@@ -63,7 +60,6 @@ static void add_mass_0(const problem *arrays, double *mass)
   double value[1];
   double parameters[1] = {0};
   parameters[0] = arrays->parameters[0];
-  (void)arrays;
   for (long long index_i = 0; index_i < size_N; index_i++) {
     mass_0(NULL, 0.0, parameters, value);
     mass[start_q + index_i] += value[0];
@@ -79,7 +75,6 @@ static void sum_term_0(const problem *arrays, const double *q, double t, compens
   double value[1];
   double parameters[1] = {0};
   parameters[0] = arrays->parameters[0];
-  (void)arrays;
   for (long long begin = 0, end; begin < size_N; begin = end) {
     end = size_N;
     const long long shift_i_plus_1 = around(begin, 1, size_N, &end);
@@ -96,13 +91,11 @@ static void sum_term_0(const problem *arrays, const double *q, double t, compens
 static long long coordinates_of(const problem *arrays)
 {
   const long long size_N = arrays->size[0];
-  (void)arrays;
   return size_N;
 }
 
 static void field_lengths(const problem *arrays, long long *length)
 {
-  (void)arrays;
   (void)length;
 }
 
@@ -119,7 +112,6 @@ static void state_energies(const problem *arrays, double t, const double *q, con
   compensated kinetic = {0.0, 0.0}, terms = {0.0, 0.0};
   add_kinetic_energy(&kinetic, p, inverse_mass, coordinates_of(arrays));
   sum_term_0(arrays, q, t, &terms);
-  (void)t, (void)q;
   energies[0] = kinetic.sum + kinetic.rest;
   energies[1] = -(terms.sum + terms.rest);
   energies[2] = (kinetic.sum - terms.sum) + (kinetic.rest - terms.rest);
@@ -131,7 +123,6 @@ enum { CHUNK = 512 }; /* values computed before any is added */
 static inline void describe_coordinate_arrays(const problem *arrays, coordinate_array *all)
 {
   const long long size_N = arrays->size[0];
-  (void)arrays;
   long long end = 0;
   end = append_array(&all[0], end, size_N, 1);
 }
@@ -156,7 +147,6 @@ enum {
 static long long rows_of(const problem *arrays)
 {
   const long long size_N = arrays->size[0];
-  (void)arrays;
   return size_N;
 }
 
@@ -172,7 +162,6 @@ static void add_force_0(const problem *arrays, const lanes *X, times t, double b
   lanes value[2];
   double parameters[1] = {0};
   parameters[0] = arrays->parameters[0];
-  (void)arrays, (void)here;
   for (long long begin = here->of.first, end; begin < here->of.end; begin = end) {
     end = here->of.end - begin > CHUNK ? begin + CHUNK : here->of.end;
     const long long shift_i_plus_1 = around(begin, 1, size_N, &end);
@@ -199,8 +188,6 @@ static void add_force_0(const problem *arrays, const lanes *X, times t, double b
 static sharing share_force_0(const run_memory *run, const problem *arrays, long long n)
 {
   const long long size_N = arrays->size[0];
-  (void)arrays;
-  (void)run, (void)n;
   return alternating_blocks(0, size_N, 1, 1);
 }
 
@@ -224,13 +211,13 @@ static void add_forces(const run_memory *run, const problem *arrays, const doubl
 static void prepare_rows(const sweep *of, section rows)
 {
   window here;
-  (void)of, (void)rows, (void)here;
+  (void)here;
 }
 
 static void add_rows(sweep *of, section rows)
 {
   window here;
-  (void)of, (void)rows, (void)here;
+  (void)here;
   here = window_of_rows(share_force_0(of->run, of->arrays, of->work->n), rows);
   add_force_0(of->arrays, of->X, of->t, of->by, of->F, &here, of);
 }
@@ -238,7 +225,7 @@ static void add_rows(sweep *of, section rows)
 static void complete_rows(const sweep *of, section rows)
 {
   window here;
-  (void)of, (void)rows, (void)here;
+  (void)here;
 }
 
 /* Returns 1 if there is enough work for more than one thread. */
@@ -247,7 +234,6 @@ static inline int is_worth_sharing(const run_memory *run, const problem *arrays)
   const long long n = coordinates_of(arrays);
   int shared = blocks_of(n) > 1;
   shared |= share_force_0(run, arrays, n).blocks > 1;
-  (void)run;
   return shared;
 }
 
@@ -262,7 +248,6 @@ static void describe_maps(const problem *arrays, momentum_map *all)
 {
   const long long size_N = arrays->size[0];
   const long long start_q = 0;
-  (void)arrays;
   const momentum_map described[] = {
       {start_q, start_q + size_N, 1, 0, 0, TRANSLATION},
   };

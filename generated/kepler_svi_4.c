@@ -108,7 +108,6 @@ static inline real inverse_root_5(real x)
 /* L_q and L_v at u = (q, v). Operations: 5 *, 1 +, 1 inverse_root_3, 2 neg. */
 static void quadrature_value(const double *u, double t, const double *parameters, double *value)
 {
-  (void)t;
   value[2] = u[2];
   value[3] = u[3];
   const double w0 = parameters[0] * inverse_root_3(u[0] * u[0] + u[1] * u[1]);
@@ -121,7 +120,6 @@ static void quadrature_value(const double *u, double t, const double *parameters
 static void quadrature_derivatives(const double *u, double t, const double *parameters, double *value,
     double *derivative)
 {
-  (void)t;
   value[2] = u[2];
   value[3] = u[3];
   derivative[4] = 1.0;
@@ -144,7 +142,6 @@ static void quadrature_derivatives(const double *u, double t, const double *para
 /* Momenta L_v and mass matrix L_vv at u = (q, v). Operations: constants. */
 static void legendre(const double *u, double t, const double *parameters, double *value, double *derivative)
 {
-  (void)t, (void)parameters;
   value[0] = u[2];
   value[1] = u[3];
   derivative[0] = 1.0;
@@ -154,14 +151,12 @@ static void legendre(const double *u, double t, const double *parameters, double
 /* L at u = (q, v). Operations: 7 *, 3 +, 1 inverse_root_1. */
 static void lagrangian(const double *u, double t, const double *parameters, double *value)
 {
-  (void)t;
   value[0] = 0.5 * (u[2] * u[2] + u[3] * u[3] + 2.0 * parameters[0] * inverse_root_1(u[0] * u[0] + u[1] * u[1]));
 }
 
 /* Momentum maps at u = (q, p), then the sums of the squares of their terms. Operations: 8 *, 1 +, 1 -. */
 static void momentum_maps(const double *u, double t, const double *parameters, double *value)
 {
-  (void)t, (void)parameters;
   value[0] = u[3] * u[0] - u[2] * u[1];
   value[1] = u[2] * u[2] * (u[1] * u[1]) + u[3] * u[3] * (u[0] * u[0]);
 }
@@ -282,7 +277,6 @@ static const lanes BEFORE[POINTS * GROUPS] = {
 /* L_q at all points. Operations: 4 *, 1 +, 2 inverse_root_3_times, 2 neg. */
 static inline void force_lanes(const lanes *u, lanes t, const double *parameters, lanes *value)
 {
-  (void)t;
   const lanes w0 = u[0] * u[0] + u[1] * u[1];
   value[0] = lanes_inverse_root_3_times(w0, -(parameters[0] * u[0]));
   value[1] = lanes_inverse_root_3_times(w0, -(parameters[0] * u[1]));
@@ -291,7 +285,6 @@ static inline void force_lanes(const lanes *u, lanes t, const double *parameters
 /* The constant masses. Operations: constants. */
 static void mass(const double *u, double t, const double *parameters, double *value)
 {
-  (void)u, (void)t, (void)parameters;
   value[0] = 1.0;
   value[1] = 1.0;
 }

@@ -57,7 +57,6 @@ static const int MASS_ENTRY[1][2] = {{0, 0}};
 /* L_q and L_v at u = (q, v). Operations: 6 *, 1 neg, 1 sin. */
 static void quadrature_value(const double *u, double t, const double *parameters, double *value)
 {
-  (void)t;
   value[0] = -(parameters[2] * parameters[1] * parameters[0] * sin(u[0]));
   value[1] = parameters[0] * (parameters[1] * parameters[1]) * u[1];
 }
@@ -66,7 +65,6 @@ static void quadrature_value(const double *u, double t, const double *parameters
 static void quadrature_derivatives(const double *u, double t, const double *parameters, double *value,
     double *derivative)
 {
-  (void)t;
   const double w0 = parameters[2] * parameters[1] * parameters[0];
   value[0] = -(w0 * sin(u[0]));
   derivative[0] = -(w0 * cos(u[0]));
@@ -78,7 +76,6 @@ static void quadrature_derivatives(const double *u, double t, const double *para
 /* Momenta L_v and mass matrix L_vv at u = (q, v). Operations: 3 *. */
 static void legendre(const double *u, double t, const double *parameters, double *value, double *derivative)
 {
-  (void)t;
   const double w0 = parameters[0] * (parameters[1] * parameters[1]);
   value[0] = w0 * u[1];
   derivative[0] = w0;
@@ -88,7 +85,6 @@ static void legendre(const double *u, double t, const double *parameters, double
 static void lagrangian(const double *u, double t, const double *parameters, double *value)
 {
   /* clang-format off */
-  (void)t;
   value[0] = 0.5 * (parameters[0] * (parameters[1] * parameters[1]) * (u[1] * u[1]) + 2.0 * parameters[0] *
       parameters[1] * parameters[2] * cos(u[0]));
   /* clang-format on */
@@ -185,14 +181,12 @@ static const lanes BEFORE[POINTS * GROUPS] = {
 /* L_q at all points. Operations: 3 *, 1 neg, 1 sin. */
 static inline void force_lanes(const lanes *u, lanes t, const double *parameters, lanes *value)
 {
-  (void)t;
   value[0] = -(parameters[2] * parameters[1] * parameters[0] * lanes_sin(u[0]));
 }
 
 /* The constant masses. Operations: 2 *. */
 static void mass(const double *u, double t, const double *parameters, double *value)
 {
-  (void)u, (void)t;
   value[0] = parameters[0] * (parameters[1] * parameters[1]);
 }
 

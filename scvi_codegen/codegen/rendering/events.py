@@ -530,7 +530,7 @@ class ArrayEvents:
         nest = _Entries(self, rolled, within=within)
         places = [nest.place_of(access) for _, access in to]
         inner = [f"{name}(u, at->t, parameters, value);"] * bool(values) + [line.format(*places) for line in lines]
-        body = ["(void)arrays, (void)at, (void)in, (void)to;", *nest.text(innermost=inner)]
+        body = nest.text(innermost=inner)
         declared = f"double value[{len(values)}]" if values else ""
         self.kernels += [rolled.kernel] * bool(values)
         self.functions.append(nest.function(f"static void add_{name}", ARGUMENTS, body, values=declared))

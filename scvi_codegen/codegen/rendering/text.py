@@ -112,11 +112,12 @@ class HeaderRecord:
     functions: list[str] = field(default_factory=list)
     run_fields: list[str] = field(default_factory=list)
 
-    def prototype(self, result: str, name: str, *arguments: str) -> str:
+    def prototype(self, result: str, name: str, *arguments: str | Sequence[str]) -> str:
         """Return the declaration of ``<prefix>_<name>``; types may contain ``{prefix}`` and ``{real}``."""
         self.functions.append(name)
+        words = [word for part in arguments for word in ([part] if isinstance(part, str) else part)]
         between = "" if result.endswith("*") else " "
-        head = f"{result}{between}{{prefix}}_{name}({', '.join(arguments) or 'void'});"
+        head = f"{result}{between}{{prefix}}_{name}({', '.join(words) or 'void'});"
         return wrapped_prototype(head.format(prefix=self.prefix, real=self.real))
 
     def optional(self, name: str) -> str:

@@ -90,15 +90,14 @@ def splitting_header(split: Splitting, layout: Layout, *, action: bool) -> str:
     statements = [*velocities_by_masses(statements)] if split.by_masses else statements
     lines = Printer(quantities, layout, operations).function_body(statements)
     purpose = "Computes the increments of one step{}. F is the last force; it is that of the first kick if `known`"
-    first = [] if split.leaps else ["(void)known, (void)F;"]
+    first = []
     if split.driven and words == 2:
-        first += ["known = 0; /* inputs, which may jump between steps, have changed the last force */"]
+        first = ["known = 0; /* inputs, which may jump between steps, have changed the last force */"]
     if words == 1:
         acted = ", and if the action is summed\n * acted[1], its part over h, and acted[0], the last L at v = 0"
         arguments = "const solver_data *data, int known, number *F, number *dq, number *dp,\n    number *acted"
         starts = ["memset(dq, 0, sizeof(number) * M);", "memset(dp, 0, sizeof(number) * M);"]
-        starts += ["acted[1] = 0;"] if action else ["(void)acted;"]
-        starts += [] if split.by_masses or split.bodies else ["(void)data;"]
+        starts += ["acted[1] = 0;"] if action else []
         head = f"SPLITTING void leap(const step_data *step, {arguments})"
         return _function(purpose.format(acted), head, *starts, *first, *lines)
     kind, zero = ("ddl", "ddl_word(lanes_of(0.0))") if layout.lanes else ("dd", "dd_word(0.0)")
@@ -372,9 +371,9 @@ def rattle_functions(part: str, features: Sequence[str]) -> str:
         if not selected(text, features):
             continue
         printer = Printer(_of_constraints(names), PointsAsLanes(), operations)
-        first = "const real scale = 1 / (step->h * step->h);" if "scale" in text else "(void)step;"
+        first = ["const real scale = 1 / (step->h * step->h);"] if "scale" in text else []
         head = f"static inline void {name}(const step_data *step, rattle_step *now{arguments})"
-        functions.append(_function(title, head, first, *printer.function_of_points(read(text, features))))
+        functions.append(_function(title, head, *first, *printer.function_of_points(read(text, features))))
     return "\n".join(functions)
 
 

@@ -5,9 +5,8 @@
 
 /* Points of a step of an array Hamiltonian system, with the equations of hamiltonian_iteration.h, and their fixed-point
  * iteration. Since one function computes all rates from terms that contain positions and momenta, both are updated
- * together (Jacobi), not in turn. Requires: one_trajectory.h, point_weights.h, the tables, forces_at, which
- * computes the rates at the points: -H_q of the momenta, then H_p of the positions. Momenta follow positions in
- * memory. */
+ * together (Jacobi), not in turn. Requires: the tables, forces_at, which computes the rates at the points: -H_q of the
+ * momenta, then H_p of the positions. Momenta follow positions in memory. */
 
 #define SUDDEN_GROWTH 1e20 /* of the largest coordinate in one iteration: a larger one changes the whole state */
 #define KEPT_FIRST(apart) ((apart) / 2) /* velocities follow forces */
@@ -159,7 +158,6 @@ static inline lanes residual_at(const step_points *w, int part, int g, long long
 /* Value without rates. */
 static inline lanes unforced_at(const step_points *w, int part, int g, long long i)
 {
-  (void)g;
   return lanes_of(start_at(w, part, i));
 }
 
@@ -208,8 +206,7 @@ static int fixed_point(const step_data *step, const iteration_data *data, histor
   }
   TRY(outcome(&now, report));
   find_increments(&w, own_part(step), dq, dp);
-  if (!accept(step, dq, dp, report))
-    return NOT_FINITE;
+  TRY(accept(step, dq, dp));
   *steps = next_guess(*steps, &now, report);
   return OK;
 }

@@ -118,7 +118,6 @@ static run_memory run_of(const long long *sizes, const int *const *tables)
 #ifdef NEWTON_KRYLOV
   run.pattern = tables[TABLES];
 #endif
-  (void)sizes, (void)tables;
   return run;
 }
 
@@ -162,7 +161,6 @@ static void discard_factors(run_memory *run)
   if (run->factors)
     run->factors[0] = 0.0;
 #endif
-  (void)run;
 }
 
 /* Lets the following computations use these parameters and fields; the inverse masses are computed if they are new.
@@ -188,8 +186,7 @@ static int use_parameters(run_memory *run, const double *parameters)
   run->has_values = 0;
   if (size > 0)
     memcpy(run->values, parameters, size);
-  if (compute_inverse_masses(&run->data, run->inverse_mass) != OK)
-    return SINGULAR;
+  TRY(compute_inverse_masses(&run->data, run->inverse_mass));
   run->has_values = 1;
   return OK;
 }

@@ -4,7 +4,7 @@
  * apart, so that a row is continued as soon as those of the next rows are added. Blocks of rows are the tasks of the
  * forces: even ones before their odd neighbours, as in add_forces, so that sums round alike. FUSED: add_rows continues
  * coordinates where it adds their last forces, in the same loop over a chunk; FRESH: the forces are 0 before. Requires:
- * arrays.h, continue_section, CHUNK, REACH, CHUNKED_ROWS (rows are the innermost loop), rows_of, share_rows,
+ * continue_section, CHUNK, REACH, CHUNKED_ROWS (rows are the innermost loop), rows_of, share_rows,
  * describe_coordinate_arrays; add_rows, which adds the forces that couple rows, prepare_rows and complete_rows, which
  * add others before and behind. */
 enum {
@@ -144,16 +144,8 @@ static int sweep_alone(sweep *of)
 static int kick_by_rows(const run_memory *run, const problem *arrays, const work_arrays *work, const double *X,
     double t, double by, double *F, const continuation *then)
 {
-  sweep of = {.run = run,
-      .arrays = arrays,
-      .work = work,
-      .X = X,
-      .t = t,
-      .by = by,
-      .F = F,
-      .then = then,
-      .how = share_rows(run, arrays, work->n),
-      .rows = rows_of(arrays)};
+  sweep of = {.run = run, .arrays = arrays, .work = work, .X = X, .t = t, .by = by, .F = F, .then = then};
+  of.how = share_rows(run, arrays, work->n), of.rows = rows_of(arrays);
   const long long blocks = of.how.blocks;
   if (FUSED && blocks == 1 && threads_of(run) == 1 && of.rows >= 2 * BORDER)
     return sweep_alone(&of);

@@ -3,7 +3,7 @@
 #include "arrays.h"
 
 /* Worker threads. They are started by a call and joined at its end, so that none exists when a process forks. Requires:
- * arrays.h, MOST_THREADS, is_worth_sharing. */
+ * MOST_THREADS, is_worth_sharing. */
 #ifdef SCVI_THREADS
 #include <pthread.h>
 #endif
@@ -72,9 +72,8 @@ static int run_workers(run_memory *run, const job *way, solver_report *report)
 }
 #endif
 
-/* Runs of array systems. Requires: array_memory.h, bind_work_arrays, perform_step of a solver, or perform_steps and
- * TOGETHER, ERROR_POWER; with
- * CONSTRAINTS_OF_ARRAYS project_run. */
+/* Runs of array systems. Requires: bind_work_arrays, perform_step of a solver, or perform_steps and TOGETHER,
+ * ERROR_POWER; with CONSTRAINTS_OF_ARRAYS project_run. */
 
 /* Stores the state after a step if its number is a multiple of `every`, and at the end of an adaptive run; each thread
  * its own coordinates. */
@@ -133,18 +132,16 @@ static int take_steps(run_memory *run, const job *way, solver_report *report)
 static int perform(run_memory *run, job way, const double *parameters, const solver_options *options,
     solver_report *report)
 {
-  const solver_options standard = NAME(default_options)();
   solver_report unread;
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
   report->t = run->t;
   TRY(use_parameters(run, parameters));
 #ifdef HEAT_BATH
-  if (!prepare_bath(run))
-    return NOT_FINITE;
+  TRY(prepare_bath(run) ? OK : NOT_FINITE);
 #endif
   way.arrays = &run->data;
-  way.options = options || way.control ? options : &standard;
+  way.options = options || way.control ? options : &STANDARD_OPTIONS;
 #ifdef CONSTRAINTS_OF_ARRAYS
   if (run->is_changed)
     project_run(run, report, 0);
@@ -159,7 +156,6 @@ int NAME(advance)(run_memory *run, long long steps, long long every, const doubl
     double *workspace)
 {
   const job way = {.go = take_steps, .steps = steps, .every = every, .t = t, .q = q, .p = p, .iterations = iterations};
-  (void)workspace;
   return perform(run, way, parameters, options, report);
 }
 
@@ -180,7 +176,6 @@ int NAME(step)(double t, double h, const double *q0, const double *p0, const dou
 #ifdef NO_ERROR_ESTIMATE
 double NAME(step_error)(const run_memory *run)
 {
-  (void)run;
   return NAN;
 }
 #endif

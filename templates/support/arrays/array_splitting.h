@@ -7,8 +7,8 @@
  * step. Within a step the increments are in the memory of the compensation terms. Infinite and undefined numbers remain
  * in a state, so that many steps are checked at once; if one fails, they are repeated one by one. With PLAIN_SUMS
  * increments are added to the state at once, and their rounding errors are dropped; the kicks at the end of a step and
- * at the start of the next one are one where steps are checked together. Requires: arrays.h, LEAPS, TOGETHER,
- * EQUAL_MASSES, the tables, later add_forces; with ROWS array_rows.h. */
+ * at the start of the next one are one where steps are checked together. Requires: LEAPS, TOGETHER, EQUAL_MASSES, the
+ * tables, later add_forces; with ROWS array_rows.h. */
 static void add_forces(const run_memory *run, const problem *arrays, const double *X, double t, double by, double *F);
 
 /* Workspace: positions of the next kick, forces at the end of a step; the state before steps that are checked. */
@@ -71,7 +71,6 @@ static inline __attribute__((always_inline)) void continue_coordinates(double *r
 {
   const int forces = by.starts || (by.ends && ends_with_a_kick()); /* F, else increments that have them */
 #ifdef PLAIN_SUMS
-  (void)dq, (void)dp, (void)X, (void)fresh;
   for (long long i = 0; i < count; i++) {
     if (forces)
       p[i] += (by.starts ? by.start : by.end) * F[i];
@@ -174,13 +173,8 @@ static void kick(const run_memory *run, const problem *arrays, const work_arrays
 /* The first drift of a step, with the first kick if its forces are known. */
 static continuation starting(double h, int ends, int starts)
 {
-  return (continuation){.ends = ends,
-      .starts = starts,
-      .moves = 1,
-      .arrives = LEAPS == 2 && ends_with_a_kick(),
-      .end = h * KICK[LEAPS - 1],
-      .start = h * KICK[0],
-      .drift = h * DRIFT[0]};
+  const int arrives = LEAPS == 2 && ends_with_a_kick();
+  return (continuation){ends, starts, 1, arrives, h * KICK[LEAPS - 1], h * KICK[0], h * DRIFT[0]};
 }
 
 /* Performs a step; `continues` from a former one, and into a next one. */
@@ -245,7 +239,6 @@ static int perform_steps(run_memory *run, const problem *arrays, const work_arra
     solver_report *report, long long most)
 {
   long long together = TOGETHER;
-  (void)options;
   run->error = NAN;
   while (most > 0) {
     const run_memory before = *run;

@@ -1,8 +1,7 @@
 #include "array_memory.h"
 
 /* Functions of states: Legendre transform, energies and momentum maps, for all states of a call in one loop. Requires:
- * array_memory.h, state_energies; with SITE_TRANSFORM find_velocities and find_momenta; with MOMENTUM_MAPS MAPS and
- * describe_maps. */
+ * state_energies; with SITE_TRANSFORM find_velocities and find_momenta; with MOMENTUM_MAPS MAPS and describe_maps. */
 
 #ifdef JOINED_STATES
 /* The numbers of a state, then those of its momenta or velocities, in the memory of a run. */
@@ -25,10 +24,8 @@ static int legendre_transform(double t, const double *q, const double *x, const 
   (inverse ? find_momenta : find_velocities)(&run->data, joined(run, q, x), t, y);
   return OK;
 #elif defined(HAMILTONIAN_SYSTEM)
-  (void)t, (void)q, (void)x, (void)y, (void)inverse;
   return SINGULAR; /* unknown */
 #else
-  (void)t, (void)q;
   for (long long i = 0; i < coordinates_of(&run->data); i++)
     y[i] = inverse ? x[i] / run->inverse_mass[i] : x[i] * run->inverse_mass[i];
   return OK;
@@ -141,7 +138,6 @@ int NAME(momentum_maps)(long long count, const double *t, const double *q, const
   const run_memory *run = run_in(workspace);
   const long long n = coordinates_of(&run->data);
   momentum_map all[MAPS];
-  (void)t, (void)parameters;
   describe_maps(&run->data, all);
   for (long long k = 0; k < count; k++)
     for (int j = 0; j < MAPS; j++) {

@@ -6,16 +6,10 @@
 
 static step_data step_of(const run_memory *run, const problem *arrays, const work_arrays *work)
 {
-  return (step_data){.t = run->t,
-      .h = run->h,
-      .q0 = run->q,
-      .p0 = run->p,
-      .carry_q = run->carry_q,
-      .carry_p = run->carry_p,
-      .run = run,
-      .arrays = arrays,
-      .work = work,
-      .n = work->n};
+  step_data step = {.t = run->t, .h = run->h, .q0 = run->q, .p0 = run->p};
+  step.carry_q = run->carry_q, step.carry_p = run->carry_p;
+  step.run = run, step.arrays = arrays, step.work = work, step.n = work->n;
+  return step;
 }
 
 /* Advances the state to the end of a solved step. */

@@ -14,10 +14,10 @@
  *   L_k = sum_d c[d] (1 - cos(2 pi k d / size)) = 2 sum_d c[d] sin^2(pi k d / size).
  *
  * Of an axis of even size, the places 2 j and 2 j + 1 of a line are real and imaginary part of a line of half the size.
- * From the transforms E, O of even and odd places follow the modes k and k + size/2, E + w O and E - w O with
- * w = exp(-2 pi i k / size); the eigenvalue of the latter is the conjugate of L_(size/2 - k). Requires:
- * lattice_transform.h, coordinates_of; PLANS, KINDS, SUM_VECTORS and STATES, the numbers of circulant matrices, of
- * convolutions, of vectors of their values, and of vectors of a state. */
+ * From the transforms E, O of even and odd places follow the modes k and k + size/2, E + w O and E - w O with w =
+ * exp(-2 pi i k / size); the eigenvalue of the latter is the conjugate of L_(size/2 - k). Requires: coordinates_of;
+ * PLANS, KINDS, SUM_VECTORS and STATES, the numbers of circulant matrices, of convolutions, of vectors of their values,
+ * and of vectors of a state. */
 
 enum {
   PLAN = 7, /* numbers per place of an axis */

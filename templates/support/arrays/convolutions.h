@@ -1,7 +1,7 @@
 #include "circulant.h"
 
-/* Convolutions of arrays of the state, their derivatives and the energies that depend on them. Requires: circulant.h;
- * CONVOLUTIONS, KINDS, STATES; MOST_STAGES, the largest number of circulant matrices of a convolution. */
+/* Convolutions of arrays of the state, their derivatives and the energies that depend on them. Requires: CONVOLUTIONS,
+ * KINDS, STATES; MOST_STAGES, the largest number of circulant matrices of a convolution. */
 
 /* Values of all convolutions of a state and of a direction, and derivatives with respect to them, at a group of points;
  * `length` numbers each. */

@@ -5,9 +5,9 @@
  * with the mean F' over the points. In eigenvectors of A = V diag(mu) V^-1 these are the systems m - mu h^2 F', for a
  * Hamiltonian 1 - mu h F', of a complex pair only one (J. C. Butcher, BIT 16 (1976), 237). They are factorised as L D U
  * within the envelope of the rows (A. Jennings, Comput. J. 9 (1966), 281), where U is L^T if F' is symmetric (SIDES =
- * 1). With FORCES_OF_VELOCITIES they are m - mu h F_v - mu^2 h^2 F_q, for the velocities. Requires: array_newton.h;
- * UNKNOWNS, their number per coordinate; SHIFTS, the number of systems, MU, TO_SHIFTS and FROM_SHIFTS, real parts, then
- * imaginary parts. */
+ * 1). With FORCES_OF_VELOCITIES they are m - mu h F_v - mu^2 h^2 F_q, for the velocities. Requires: UNKNOWNS, their
+ * number per coordinate; SHIFTS, the number of systems, MU, TO_SHIFTS and FROM_SHIFTS, real parts, then imaginary
+ * parts. */
 
 enum { PROBES = X_VECTORS / UNKNOWNS }; /* parts of the state by which the forces of an unknown are differentiated */
 
@@ -161,17 +161,6 @@ static void find_factors(linear_system *of)
   wait_at_barrier(of->run);
 }
 
-static inline int has_factors(const linear_system *of)
-{
-  return *envelope_of(of).valid_for == of->step->h;
-}
-
-/* Residual of a coordinate in eigenvectors of A, times its mass. */
-static inline complex_shifts to_shifts(const envelope *all, const lanes *x, double mass)
-{
-  return into_shifts(x, all->stride, mass);
-}
-
 static inline void from_shifts(const envelope *all, complex_shifts z, lanes *y)
 {
   for (int g = 0; g < GROUPS; g++)
@@ -201,7 +190,7 @@ static void apply_factors(const linear_system *of, const lanes *x, lanes *y)
   wait_at_barrier(of->run);
   for (long long i = 0; is_first_thread(of) && i < all.n; i++) {
     const long long at = all.order[i], first = all.first[i];
-    z[i] = to_shifts(&all, x + solved_part + at, mass_of(of->points, at));
+    z[i] = into_shifts(x + solved_part + at, all.stride, mass_of(of->points, at));
     z[i] = minus_products(z[i], row_of(&all, 0, i) + first, z + first, i - first);
   }
   for (long long i = 0; is_first_thread(of) && i < all.n; i++)

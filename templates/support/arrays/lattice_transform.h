@@ -2,8 +2,7 @@
 
 /* Fast Fourier transforms along the axes of lattices, at all points of a step, with one pass per factor of the size,
  * each from one array into another (Stockham autosort; C. Van Loan, Computational Frameworks for the Fast Fourier
- * Transform, 1992, section 1.7). Requires: arrays.h, lanes, lanes_of,
- * GROUPS. */
+ * Transform, 1992, section 1.7). Requires: lanes, lanes_of, GROUPS. */
 
 enum { LARGEST_FACTOR = 499 }; /* of a size with an alternative: a pass costs as many products per element */
 

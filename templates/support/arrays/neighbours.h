@@ -5,10 +5,8 @@
 /* Lists of neighbours (L. Verlet, Phys. Rev. 159 (1967) 98) by cells of at least the cutoff plus the skin (Hockney and
  * Eastwood, Computer Simulation Using Particles, 1981). A list contains all pairs closer than cutoff + skin at the
  * positions at which it was made; it contains all pairs closer than the cutoff while no point has moved from there by
- * half of the skin. This is checked for the positions of every evaluation of forces. Neighbours are in ascending
- * order, and pairs beyond the cutoff add zeros, so that no bit of a result depends on when a list was made. Requires:
- * arrays.h.
- */
+ * half of the skin. This is checked for the positions of every evaluation of forces. Neighbours are in ascending order,
+ * and pairs beyond the cutoff add zeros, so that no bit of a result depends on when a list was made. */
 typedef NAME(neighbours) neighbours;
 
 enum {

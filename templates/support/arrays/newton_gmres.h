@@ -4,8 +4,8 @@
 #include "preconditioner.h"
 
 /* Restarted GMRES with right preconditioning (Y. Saad, Iterative Methods for Sparse Linear Systems, 2003, algorithm
- * 9.5) on vectors over all points of all coordinates. Requires: array_newton.h; linear_system with count, state
- * and work; multiply, precondition and reconsider. */
+ * 9.5) on vectors over all points of all coordinates. Requires: linear_system with count, state and work; multiply,
+ * precondition and reconsider. */
 
 enum { MOST_CYCLES = 30 }; /* then Newton's method continues with the correction so far */
 
@@ -110,7 +110,7 @@ static double find_correction(linear_system *of, solver_report *report)
   return last;
 }
 
-/* Newton's method for the points of a step of an array system. Requires: array_newton.h. */
+/* Newton's method for the points of a step of an array system. */
 
 #define REFRESHED 1e-6 /* squared: the preconditioner is recomputed while points change by more than 1e-3 of the
                         * state */
@@ -205,10 +205,7 @@ static int leaves_more(const progress *now, const solver_options *options)
 
 typedef iteration_data solver_data;
 
-static void prepare(const step_data *step, solver_data *data)
-{
-  prepare_iteration(step, data);
-}
+#define prepare prepare_iteration
 
 /* Computes the increments of one step: iterates until the points, extrapolated from *guess steps, converge. On success
  * *guess is the number of steps for the next predictor. */
@@ -216,28 +213,22 @@ static int solve(const step_data *step, const solver_data *data, history past, l
     const solver_options *options, solver_report *report, double *workspace)
 {
   const step_points w = points_in(step, data, past);
-  linear_system of = {.step = step,
-      .run = step->run,
-      .points = &w,
-      .work = step->work,
-      .n = step->n,
-      .count = ROWS * step->n,
-      .own = own_part(step),
-      .by_factors = step->run->pattern != NULL};
+  linear_system of = {.step = step, .run = step->run, .points = &w, .work = step->work, .n = step->n};
   progress now = before_iterations();
-  const int direct = of.by_factors || X_VECTORS == 2; /* corrections by the preconditioner without GMRES */
+  const int direct = step->run->pattern || X_VECTORS == 2; /* corrections by the preconditioner without GMRES */
   int slow = 0; /* iterations with the factors that reduced the change too little */
-  (void)workspace;
+  of.count = ROWS * of.n, of.own = own_part(step), of.by_factors = step->run->pattern != NULL;
   first_points(&w, past, *guess);
   forces(&w);
   find_scales(&of, options);
   start_nearer(&of);
   of.state = sqrt(size_of_state(&of));
   for (int k = 0; needs_iteration(&now); k++) {
+    const int no_factors = of.by_factors && *envelope_of(&of).valid_for != step->h;
     double change, size, left;
     find_residual(&of, &w);
     if (!direct             ? now.last > REFRESHED /* also before the first iteration */
-            : of.by_factors ? !has_factors(&of) || slow == 1 || (k == 0 && step->first == COMPARISON)
+            : of.by_factors ? no_factors || slow == 1 || (k == 0 && step->first == COMPARISON)
                             : k == 0 || slow == 1)
       find_inverses(&of);
     left = 0.0;
@@ -264,5 +255,5 @@ static int solve(const step_data *step, const solver_data *data, history past, l
   TRY(outcome(&now, report));
   find_increments(&w, own_part(step), dq, dp);
   *guess = next_guess(*guess, &now, report);
-  return accept(step, dq, dp, report) ? OK : NOT_FINITE;
+  return accept(step, dq, dp);
 }

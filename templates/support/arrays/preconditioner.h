@@ -104,7 +104,8 @@ static void apply_inverses_of_modes(const linear_system *of, lanes *x, section o
   for (long long i = own.first; i < own.end; i++) {
     const double *rates = rates_of_mode(of, i);
     const complex_shifts mu = {shifts_at(MU), shifts_at(MU + SHIFTS)}, square = product_of(mu, mu);
-    const complex_shifts q = to_shifts(&all, x + i, 1.0 / places), p = to_shifts(&all, x + of->n + i, 1.0 / places);
+    const complex_shifts q = into_shifts(x + i, all.stride, 1.0 / places);
+    const complex_shifts p = into_shifts(x + of->n + i, all.stride, 1.0 / places);
     const complex_shifts from_q = product_of(mu, q), from_p = product_of(mu, p);
     const shifts re = 1.0 - rates[0] * rates[1] * square.re, im = -(rates[0] * rates[1]) * square.im;
     const shifts size = 1.0 / (re * re + im * im);
@@ -331,20 +332,15 @@ static void precondition(const linear_system *of, const lanes *x, lanes *y)
 /* Computes the preconditioner, at the first points of a step the Fourier one if coordinates are coupled. */
 static void find_inverses(linear_system *of)
 {
-#ifdef FACTORS_ALONE
-  if (!of->by_factors) {
-    of->by_fourier = invert_modes(of);
+  if (of->by_factors) {
+    find_factors(of);
     return;
   }
-#else
-  if (!of->by_factors) {
-    of->by_fourier = (of->tried == 0 || of->by_fourier) && invert_modes(of);
-    if (!of->by_fourier)
-      find_own_inverses(of);
-    return;
-  }
+  of->by_fourier = (of->tried == 0 || of->by_fourier) && invert_modes(of);
+#ifndef FACTORS_ALONE
+  if (!of->by_fourier)
+    find_own_inverses(of);
 #endif
-  find_factors(of);
 }
 
 /* Called with the reduction of the residual by a cycle: if the Fourier preconditioner did not suffice, tries the
@@ -352,7 +348,6 @@ static void find_inverses(linear_system *of)
 static void choose_preconditioner(linear_system *of, double left)
 {
 #ifdef FACTORS_ALONE
-  (void)of, (void)left;
   return;
 #endif
   if (of->tried == 0 && of->by_fourier) {

@@ -1,8 +1,7 @@
 #include "../iteration/separable_iteration.h"
 
 /* Points of a step for Newton's method: positions, whose increments by the forces are h^2 A F / m, where A is PRODUCT;
- * with FORCES_OF_VELOCITIES also velocities, with h B F / m, where B is VELOCITY and A is B^2. Requires:
- * separable_iteration.h. */
+ * with FORCES_OF_VELOCITIES also velocities, with h B F / m, where B is VELOCITY and A is B^2. */
 
 /* Index of the rate of an unknown in F. */
 #define index_of_rate(n, i) (i)
@@ -19,7 +18,6 @@ static inline lanes increment_at(const step_points *w, int part, int g, long lon
   if (part == 1)
     return w->data->inverse_mass[i] * (w->step->h * contribution_of_points(VELOCITY, g, &F[i], w->n));
 #endif
-  (void)part;
   return unit_of(w, i) * contribution_of_points(PRODUCT, g, &F[i], w->n);
 }
 
@@ -38,7 +36,6 @@ static inline lanes residual_at(const step_points *w, int part, int g, long long
   if (part == 1)
     return (start_at(w, 1, i) - w->X[(2 * g + 1) * w->n + i]) + (low + increment_at(w, 1, g, i, w->F));
 #endif
-  (void)part;
   return (w->step->q0[i] - w->X[g * X_VECTORS * w->n + i]) + DRIFT[g] * along.high +
       (unit_of(w, i) * sum + low_words(w, g, along, i));
 }
@@ -51,7 +48,6 @@ static inline lanes unforced_at(const step_points *w, int part, int g, long long
   if (part == 0)
     return w->step->q0[i] + DRIFT[g] * find_drift(w, i).high;
 #endif
-  (void)g;
   return lanes_of(start_at(w, part, i));
 }
 

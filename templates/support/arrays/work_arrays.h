@@ -1,8 +1,8 @@
 #include "../core/points.h"
 #include "arrays.h"
 
-/* Workspace of steps that are solved by iteration: the arrays in the memory `work` of a run. Requires: points.h,
- * X_VECTORS, F_VECTORS; with ON_LATTICES AXES. */
+/* Workspace of steps that are solved by iteration: the arrays in the memory `work` of a run. Requires: X_VECTORS,
+ * F_VECTORS; with ON_LATTICES AXES. */
 
 enum { BASIS = 16 }; /* basis vectors of GMRES before a restart */
 

@@ -2,7 +2,7 @@
 #include "constraint_matrix.h"
 
 /* Constrained step: RATTLE substeps (H. C. Andersen, J. Comput. Phys. 52, 1983; Hairer, Lubich & Wanner, Geometric
- * Numerical Integration, sec. VII.1.4), composed with the coefficients PART. Requires: arrays.h, add_forces,
+ * Numerical Integration, sec. VII.1.4), composed with the coefficients PART. Requires: add_forces,
  * evaluate_constraints, constraint_matrix.h, progress.h, PARTS of a step, PART and their ends, PART_END. */
 
 #ifdef FORCES_OF_VELOCITIES
@@ -28,18 +28,17 @@ static work_arrays bind_work_arrays(const run_memory *run, long long n)
 /* Data shared by the substeps. */
 typedef struct {
   run_memory *run;
-  const problem *arrays;
-  const work_arrays *work;
+  work_arrays work;
   constraint_system held;
   long long n;
   const solver_options *options;
   solver_report *report;
 } constrained_run;
 
-static inline constrained_run constrained_run_of(run_memory *run, const problem *arrays, const work_arrays *work,
-    const solver_options *options, solver_report *report)
+static inline constrained_run constrained_run_of(run_memory *run, const solver_options *options, solver_report *report)
 {
-  return (constrained_run){run, arrays, work, constraint_arrays(run, work->n), work->n, options, report};
+  const long long n = coordinates_of(&run->data);
+  return (constrained_run){run, bind_work_arrays(run, n), constraint_arrays(run, n), n, options, report};
 }
 
 /* x = G^T lambda. */
@@ -55,24 +54,22 @@ static void compute_constraint_forces(const constraint_system *held, const doubl
 static void find_forces(const constrained_run *of, const double *X, const double *dp, double t, double *F)
 {
 #ifdef FORCES_OF_VELOCITIES
-  double *Y = of->work->Y;
+  double *Y = of->work.Y;
   if (X != Y)
     memcpy(Y, X, sizeof(double) * (size_t)of->n);
   for (long long i = 0; i < of->n; i++)
     Y[of->n + i] = of->run->inverse_mass[i] * (of->run->p[i] + (dp ? dp[i] : 0.0));
   X = Y;
-#else
-  (void)dp;
 #endif
   memset(F, 0, sizeof(double) * (size_t)of->n);
-  add_forces(of->run, of->arrays, X, t, 1.0, F);
+  add_forces(of->run, &of->run->data, X, t, 1.0, F);
 }
 
 /* Computes forces, constraint derivatives and their matrix at the state. */
 static int begin(const constrained_run *of)
 {
-  find_forces(of, of->run->q, NULL, of->run->t, of->work->F);
-  evaluate_constraints(of->arrays, of->run->q, of->run->t, of->held.g, of->held.rate, of->held.derivative);
+  find_forces(of, of->run->q, NULL, of->run->t, of->work.F);
+  evaluate_constraints(&of->run->data, of->run->q, of->run->t, of->held.g, of->held.rate, of->held.derivative);
   return assemble(&of->held, of->run->inverse_mass) ? OK : SINGULAR;
 }
 
@@ -81,7 +78,7 @@ static int begin(const constrained_run *of)
 static double trial_increments(const constrained_run *of, double h)
 {
   const run_memory *run = of->run;
-  const work_arrays *work = of->work;
+  const work_arrays *work = &of->work;
   double size = 0.0;
   for (long long i = 0; i < of->n; i++) {
     const double p = run->p[i] + work->dp[i], pushed = h / 2 * work->R[i];
@@ -121,13 +118,13 @@ static int end_of_iteration(const progress *now, const constraint_system *held, 
 static int solve_positions(const constrained_run *of, double h, double t, double *size)
 {
   const constraint_system *held = &of->held;
-  const work_arrays *work = of->work;
+  const work_arrays *work = &of->work;
   progress now = before_iterations();
   compute_constraint_forces(held, held->lambda, work->R, of->n);
   for (int iteration = 0;; iteration++) {
     double moved;
     *size = trial_increments(of, h);
-    evaluate_constraints(of->arrays, work->Y, t, held->g, held->rate, held->next);
+    evaluate_constraints(&of->run->data, work->Y, t, held->g, held->rate, held->next);
     for (long long k = 0; k < held->count; k++)
       held->right[k] = -2.0 / (h * h) * held->g[k];
     if (now.status || !held->is_exact)
@@ -157,7 +154,7 @@ static void find_right(const constraint_system *held, const double *rate, const 
  * change. */
 static double update_forces(const constrained_run *of, double by, double t)
 {
-  const work_arrays *work = of->work;
+  const work_arrays *work = &of->work;
   find_forces(of, work->Y, work->dp, t, work->R);
   for (long long i = 0; i < of->n; i++) {
     work->R[i] -= work->F[i];
@@ -177,15 +174,15 @@ static int project_momenta(const constrained_run *of, double by, double unit, do
   for (int k = 0;; k++) {
     double moved = t && VELOCITY_FORCES ? update_forces(of, by, *t) : 0.0;
     for (long long i = 0; i < of->n; i++)
-      of->work->D[i] = run->inverse_mass[i] * (run->p[i] + of->work->dp[i]);
-    find_right(held, held->rate, of->work->D, 1.0 / by);
+      of->work.D[i] = run->inverse_mass[i] * (run->p[i] + of->work.dp[i]);
+    find_right(held, held->rate, of->work.D, 1.0 / by);
     if (!held->is_exact)
-      compute_rounding(held, held->derivative, of->work->X, 1.0 / by);
+      compute_rounding(held, held->derivative, of->work.X, 1.0 / by);
     if (now.status)
       return outcome(&now, of->report);
     TRY(solve_constraint_system(held, NEAR_ENOUGH, of->report));
-    compute_constraint_forces(held, held->change, of->work->R, of->n);
-    moved += push(of->work->dp, of->work->R, by, run->inverse_mass, of->n);
+    compute_constraint_forces(held, held->change, of->work.R, of->n);
+    moved += push(of->work.dp, of->work.R, by, run->inverse_mass, of->n);
     if (t && held->is_exact && !VELOCITY_FORCES) /* a linear system */
       return OK;
     moved *= unit * by * (unit * by);
@@ -196,7 +193,7 @@ static int project_momenta(const constrained_run *of, double by, double unit, do
 /* Performs one substep of size h that ends at t. */
 static int constrained_substep(const constrained_run *of, double h, double t)
 {
-  const work_arrays *work = of->work;
+  const work_arrays *work = &of->work;
   const constraint_system *held = &of->held;
   const run_memory *run = of->run;
   double size;
@@ -205,8 +202,7 @@ static int constrained_substep(const constrained_run *of, double h, double t)
   add_to(work->dp, work->R, h / 2, of->n);
   memcpy(work->dq, work->D, sizeof(double) * (size_t)of->n);
   memcpy(held->derivative, held->next, sizeof(double) * (size_t)held->entries);
-  if (!assemble(held, run->inverse_mass))
-    return SINGULAR;
+  TRY(assemble(held, run->inverse_mass) ? OK : SINGULAR);
   find_forces(of, work->Y, work->dp, t, work->F);
   compute_constraint_forces(held, held->lambda, work->R, of->n);
   for (long long i = 0; i < of->n; i++) {
@@ -222,7 +218,7 @@ static int constrained_substep(const constrained_run *of, double h, double t)
 static int perform_step(run_memory *run, const problem *arrays, const work_arrays *work, const solver_options *options,
     solver_report *report)
 {
-  const constrained_run of = constrained_run_of(run, arrays, work, options, report);
+  const constrained_run of = constrained_run_of(run, options, report);
   const long long n = work->n;
   const int has_begun = run->guess != 0;
   run->error = NAN;
@@ -231,12 +227,12 @@ static int perform_step(run_memory *run, const problem *arrays, const work_array
     memset(of.held.lambda, 0, sizeof(double) * (size_t)of.held.count);
     TRY(begin(&of));
   }
-  memcpy(of.work->dq, run->carry_q, sizeof(double) * (size_t)n);
-  memcpy(of.work->dp, run->carry_p, sizeof(double) * (size_t)n);
+  memcpy(of.work.dq, run->carry_q, sizeof(double) * (size_t)n);
+  memcpy(of.work.dp, run->carry_p, sizeof(double) * (size_t)n);
   for (int k = 0; k < PARTS; k++)
     TRY(constrained_substep(&of, run->h * PART[k], run->t + run->h * PART_END[k]));
   for (long long i = 0; i < n; i++) {
-    run->carry_q[i] = of.work->dq[i], run->carry_p[i] = of.work->dp[i];
+    run->carry_q[i] = of.work.dq[i], run->carry_p[i] = of.work.dp[i];
     add_increment(&run->q[i], &run->carry_q[i]);
     add_increment(&run->p[i], &run->carry_p[i]);
   }

@@ -2,7 +2,7 @@
 #include "../core/step.h"
 
 /* Sparsity pattern of G M^-1 G^T below its diagonal, by rows: which constraints act on the same coordinates. Requires:
- * arrays.h, list_coordinates. */
+ * list_coordinates. */
 
 /* For each constraint its first entry; for each entry its coordinate (place) and constraint (owner); for each
  * coordinate its first entry (at) in `list`, ordered by constraint; for each row its first pair, for each pair its
@@ -85,10 +85,10 @@ static long long find_pairs(run_memory *run)
   list_coordinates(arrays, &now);
   of.first[count] = (int)now.entries;
   list_entries(&of, count, now.entries, n);
-  for (long long k = 0; k < count; k++)
+  for (int k = 0; k < count; k++) {
     of.where[k] = -1;
-  for (int k = 0; k < count; k++)
     pairs = find_row(&of, k, pairs);
+  }
   of.row[count] = (int)pairs;
   for (long long k = 0; k < count; k++)
     of.where[k] = -1;
@@ -139,28 +139,17 @@ typedef struct {
 
 static inline constraint_system constraint_arrays(const run_memory *run, long long n)
 {
-  const long long count = run->constraints, entries = run->entries;
-  double *const numbers = run->held, *const further = numbers + 11 * count;
-  return (constraint_system){
-      .of = pattern_of(run, n),
-      .count = count,
-      .entries = entries,
-      .is_exact = run->is_exact,
-      .g = numbers,
-      .rate = numbers + count,
-      .lambda = numbers + 2 * count,
-      .right = numbers + 3 * count,
-      .change = numbers + 4 * count,
-      .preconditioned = numbers + 5 * count,
-      .direction = numbers + 6 * count,
-      .image = numbers + 7 * count,
-      .rounding = numbers + 8 * count,
-      .diagonal = numbers + 9 * count,
-      .pivot = numbers + 10 * count,
-      .derivative = further,
-      .next = further + entries,
-      .entry = further + 2 * entries,
-      .factor = further + 2 * entries + run->pairs};
+  constraint_system held = {.of = pattern_of(run, n), .count = run->constraints, .entries = run->entries};
+  double **const of_constraints[] = {&held.g, &held.rate, &held.lambda, &held.right, &held.change, &held.preconditioned,
+      &held.direction, &held.image, &held.rounding, &held.diagonal, &held.pivot};
+  held.is_exact = run->is_exact;
+  for (int k = 0; k < 11; k++)
+    *of_constraints[k] = run->held + k * held.count;
+  held.derivative = run->held + 11 * held.count;
+  held.next = held.derivative + held.entries;
+  held.entry = held.next + held.entries;
+  held.factor = held.entry + run->pairs;
+  return held;
 }
 
 /* Computes the row of a constraint: products of derivatives with respect to the same coordinates. */
@@ -306,13 +295,11 @@ static int solve_constraint_system(const constraint_system *held, double toleran
     precondition(held, held->right, held->change);
     return OK;
   }
-  double size = product_of(held->right, held->right, n), derivative,
-         length; /* squared length of the search direction in the
-                                                                         * metric of L D L^T */
+  double size = product_of(held->right, held->right, n), derivative;
+  double length; /* squared, of the search direction in the metric of L D L^T */
   const double least = tolerance * tolerance * size;
   memset(held->change, 0, sizeof(double) * (size_t)n);
-  if (!(size < INFINITY))
-    return NOT_FINITE;
+  TRY(size < INFINITY ? OK : NOT_FINITE);
   precondition(held, held->right, held->preconditioned);
   memcpy(held->direction, held->preconditioned, sizeof(double) * (size_t)n);
   length = derivative = product_of(held->right, held->preconditioned, n);
@@ -323,8 +310,7 @@ static int solve_constraint_system(const constraint_system *held, double toleran
     multiply(held, held->direction, held->image);
     report->products++;
     curve = product_of(held->direction, held->image, n);
-    if (!(curve > DEPENDENT * length))
-      return SINGULAR;
+    TRY(curve > DEPENDENT * length ? OK : SINGULAR);
     size = move_on(held, derivative / curve);
     precondition(held, held->right, held->preconditioned);
     derivative = product_of(held->right, held->preconditioned, n);

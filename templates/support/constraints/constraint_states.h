@@ -46,7 +46,6 @@ int NAME(apart)(double t, const double *q0, const double *p0, const double *q1, 
 {
   const long long n = coordinates_of(&run_in(workspace)->data);
   double size[2];
-  (void)t, (void)parameters;
   apart[0] = distance(q0, q1, n, &size[0]);
   apart[1] = distance(p0, p1, n, &size[1]);
   if (apart[0] <= ROUNDED_NEAR_ORIGIN && apart[0] > LITTLE_NEAR_ORIGIN * size[0])
@@ -58,8 +57,7 @@ int NAME(apart)(double t, const double *q0, const double *p0, const double *q1, 
 
 static void values_of_run(run_memory *run, double *g, double *rate)
 {
-  const work_arrays work = bind_work_arrays(run, coordinates_of(&run->data));
-  const constrained_run of = constrained_run_of(run, &run->data, &work, NULL, NULL);
+  const constrained_run of = constrained_run_of(run, NULL, NULL);
   evaluate_constraints(&run->data, run->q, run->t, g, rate, of.held.next);
   for (long long k = 0; k < of.held.count; k++)
     for (int e = of.held.of.first[k]; e < of.held.of.first[k + 1]; e++) {
@@ -72,26 +70,24 @@ static void values_of_run(run_memory *run, double *g, double *rate)
  * changed. */
 static int multipliers_of_run(run_memory *run, double *lambda)
 {
-  const problem *arrays = &run->data;
   solver_report report = {0};
-  const work_arrays work = bind_work_arrays(run, coordinates_of(arrays));
-  const constrained_run of = constrained_run_of(run, arrays, &work, NULL, &report);
+  const constrained_run of = constrained_run_of(run, NULL, &report);
   const constraint_system *held = &of.held;
-  double *F = of.work->D, *pulled = of.work->Y;
+  double *F = of.work.D, *pulled = of.work.Y;
   if (!run->guess)
     TRY(begin(&of));
   find_forces(&of, run->q, NULL, run->t, F);
   for (long long i = 0; i < of.n; i++)
     pulled[i] = run->inverse_mass[i] * run->p[i];
-  compute_second_derivatives(arrays, run->q, pulled, run->t, held->g);
+  compute_second_derivatives(&run->data, run->q, pulled, run->t, held->g);
   memset(lambda, 0, sizeof(double) * (size_t)held->count);
   for (int round = 0; round < REFINEMENTS; round++) {
-    compute_constraint_forces(held, lambda, of.work->R, of.n);
+    compute_constraint_forces(held, lambda, of.work.R, of.n);
     for (long long i = 0; i < of.n; i++)
-      pulled[i] = run->inverse_mass[i] * (F[i] + of.work->R[i]);
+      pulled[i] = run->inverse_mass[i] * (F[i] + of.work.R[i]);
     find_right(held, held->g, pulled, 1.0);
     for (long long i = 0; i < of.n; i++)
-      pulled[i] = run->inverse_mass[i] * (fabs(F[i]) + fabs(of.work->R[i]));
+      pulled[i] = run->inverse_mass[i] * (fabs(F[i]) + fabs(of.work.R[i]));
     compute_rounding(held, held->derivative, pulled, 1.0);
     TRY(solve_constraint_system(held, REFINED, &report));
     add_to(lambda, held->change, 1.0, held->count);

@@ -6,11 +6,11 @@
  * multipliers. For the latter, g = 0 and A v + b is the constraint rate.
  *
  * Positions: Gauss-Newton iteration in the metric of the mass matrix; momenta: p -= G^T y with G H_pp G^T y = rate
- * (Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. VII.1). Requires: legendre.h, band.h, the
- * kernels constraints, constraint_rounding and constrained_motion, and CONSTRAINT_ENTRY, the indices of the entries of
- * G = g_q or A. With MASKED_CONSTRAINTS g and G are multiplied by masks c, the matrix is [L_vv, G^T; G, 1 - c], and
- * [L_vv, D^T; G, 1 - c] for the multipliers of forces D^T lambda: requires the kernel reactions, of 1 - c and the
- * entries of D, whose indices are DIRECTION_ENTRY. */
+ * (Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. VII.1). Requires: legendre.h, the kernels
+ * constraints, constraint_rounding and constrained_motion, and CONSTRAINT_ENTRY, the indices of the entries of G = g_q
+ * or A. With MASKED_CONSTRAINTS g and G are multiplied by masks c, the matrix is [L_vv, G^T; G, 1 - c], and [L_vv, D^T;
+ * G, 1 - c] for the multipliers of forces D^T lambda: requires the kernel reactions, of 1 - c and the entries of D,
+ * whose indices are DIRECTION_ENTRY. */
 
 #define MAX_PROJECTIONS 1000 /* Gauss-Newton iterations: unequal masses far away need hundreds */
 #define MOST_UPDATE_HALVINGS 60 /* of an update */
@@ -55,7 +55,7 @@ static void add_reactions(real t, const real *u, const real *parameters, int for
 #endif
 
 /* Factorises the matrix at u = (q, v), with the given kind of forces, and computes g. */
-static int factorise_saddle_of(int forces, real t, const real *u, const real *parameters, saddle *at, real *g)
+static int factorise_saddle(int forces, real t, const real *u, const real *parameters, saddle *at, real *g)
 {
   const band shape = band_of(SITES, 1);
   real p[M], mass[MASS_ENTRIES], derivative[CONSTRAINT_ENTRIES];
@@ -72,27 +72,19 @@ static int factorise_saddle_of(int forces, real t, const real *u, const real *pa
   }
 #ifdef MASKED_CONSTRAINTS
   add_reactions(t, u, parameters, forces, &shape, at->matrix);
-#else
-  (void)forces;
 #endif
-  if (!all_finite(g, CONSTRAINTS) || !all_finite(at->matrix, (int)band_size(&shape)))
-    return NOT_FINITE;
+  TRY(all_finite(g, CONSTRAINTS) && all_finite(at->matrix, (int)band_size(&shape)) ? OK : NOT_FINITE);
   return factorise(at->matrix, &shape, at->pivot) ? OK : SINGULAR;
 }
 
-static int factorise_saddle(real t, const real *u, const real *parameters, saddle *at, real *g)
-{
-  return factorise_saddle_of(IDEAL_FORCES, t, u, parameters, at, g);
-}
-
-/* Solves L_vv x + G^T y = a (0 if NULL), G x = b. */
+/* Solves L_vv x + G^T y = a (0 if NULL), G x = -b. */
 static void solve_saddle(saddle *at, const real *a, const real *b, real *x, real *y)
 {
   const band shape = band_of(SITES, 1);
   for (int i = 0; i < M; i++)
     at->x[POSITION_IN_MATRIX[i]] = a ? a[i] : 0;
   for (int k = 0; k < CONSTRAINTS; k++)
-    at->x[POSITION_IN_MATRIX[M + k]] = b[k];
+    at->x[POSITION_IN_MATRIX[M + k]] = -b[k];
   back_substitute(at->matrix, &shape, at->pivot, at->x);
   for (int i = 0; i < M; i++)
     x[i] = at->x[POSITION_IN_MATRIX[i]];
@@ -127,8 +119,7 @@ int NAME(constraint_values)(long long count, const real *t, const real *q, const
 {
   real u[2 * M];
   for (long long k = 0; k < count; k++)
-    TRY(constrained(t[k], q + k * M, p + k * M, parameters, u, g + k * CONSTRAINTS,
-        rate + k * CONSTRAINTS, workspace));
+    TRY(constrained(t[k], q + k * M, p + k * M, parameters, u, g + k * CONSTRAINTS, rate + k * CONSTRAINTS, workspace));
   return OK;
 }
 #endif
@@ -140,12 +131,12 @@ static SELDOM void add_constraint_sizes(real t, const real *q, const real *param
 {
   real u[2 * M] = {0}, g[CONSTRAINTS], rounding[CONSTRAINTS], x[M], y[CONSTRAINTS];
   memcpy(u, q, sizeof(real) * M);
-  if (factorise_saddle(t, u, parameters, at, g) != OK)
+  if (factorise_saddle(IDEAL_FORCES, t, u, parameters, at, g) != OK)
     return;
   constraint_rounding(u, t, parameters, rounding);
   for (int k = 0; k < CONSTRAINTS; k++) {
     memset(g, 0, sizeof g);
-    g[k] = rounding[k];
+    g[k] = -rounding[k];
     solve_saddle(at, NULL, g, x, y);
     for (int i = 0; i < M && all_finite(x, M); i++)
       size[i] += MATH(fabs)(x[i]);
@@ -256,22 +247,19 @@ static void add_size_of_update(real t, const real *u, const real *parameters, re
  * updates: positions may be 0. */
 static int project_position(real t, real *u, const real *parameters, saddle *at)
 {
-  real g[CONSTRAINTS], right[CONSTRAINTS], y[CONSTRAINTS], update[M], nearest[M], size[CONSTRAINTS],
+  real g[CONSTRAINTS], y[CONSTRAINTS], update[M], nearest[M], size[CONSTRAINTS],
       derivative[CONSTRAINT_ENTRIES], last = 0;
   for (int k = 0; k < MAX_PROJECTIONS; k++) {
     int halvings = 0, is_rounding;
     real left, now, square = 0;
-    TRY(factorise_saddle(t, u, parameters, at, g));
+    TRY(factorise_saddle(IDEAL_FORCES, t, u, parameters, at, g));
     constraint_rounding(u, t, parameters, size);
     if (is_below(g, REAL_EPSILON / 2, size))
       return OK;
+    solve_saddle(at, NULL, g, update, y);
+    TRY(all_finite(update, M) ? OK : SINGULAR);
     for (int j = 0; j < CONSTRAINTS; j++)
-      right[j] = -g[j];
-    solve_saddle(at, NULL, right, update, y);
-    if (!all_finite(update, M))
-      return SINGULAR;
-    for (int j = 0; j < CONSTRAINTS; j++)
-      square -= right[j] * y[j]; /* x^T L_vv x, as L_vv x = -G^T y */
+      square += g[j] * y[j]; /* x^T L_vv x, as L_vv x = -G^T y */
     add_size_of_update(t, u, parameters, larger(MATH(fabs)(square), last), size);
     is_rounding = is_below(g, ROUNDED_RESIDUAL, size);
     last = MATH(fabs)(square);
@@ -319,9 +307,7 @@ static int project_momentum(real t, const real *q, real *p, const real *paramete
   real fastest = 0; /* the projection may be at rest */
   for (int k = 0; k < MOST_MOMENTUM_PROJECTIONS; k++) {
     TRY(constrained(t, q, p, parameters, u, g, rate, workspace));
-    TRY(factorise_saddle(t, u, parameters, at, g));
-    for (int j = 0; j < CONSTRAINTS; j++)
-      rate[j] = -rate[j];
+    TRY(factorise_saddle(IDEAL_FORCES, t, u, parameters, at, g));
     solve_saddle(at, NULL, rate, update, y);
     constraints(u, t, parameters, g, derivative);
     for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
@@ -404,15 +390,12 @@ int NAME(multipliers)(long long count, const real *t, const real *q, const real 
     real u[2 * M], value[M + 2 * CONSTRAINTS], g[CONSTRAINTS], a[M], *y = multiplier + k * CONSTRAINTS;
     TRY(find_velocity(t[k], q + k * M, p + k * M, parameters, u + M, workspace));
     memcpy(u, q + k * M, sizeof(real) * M);
-    TRY(factorise_saddle_of(ACTUAL_FORCES, t[k], u, parameters, at, g));
+    TRY(factorise_saddle(ACTUAL_FORCES, t[k], u, parameters, at, g));
     constrained_motion(u, t[k], parameters, value);
-    for (int j = 0; j < CONSTRAINTS; j++)
-      value[M + CONSTRAINTS + j] = -value[M + CONSTRAINTS + j];
     solve_saddle(at, value, value + M + CONSTRAINTS, a, y);
     for (int j = 0; j < CONSTRAINTS; j++)
       y[j] = -y[j];
-    if (!all_finite(y, CONSTRAINTS))
-      return NOT_FINITE;
+    TRY(all_finite(y, CONSTRAINTS) ? OK : NOT_FINITE);
   }
   return OK;
 }
@@ -433,7 +416,7 @@ int NAME(contact_terms)(real t, const real *q, const real *p, const real *idle, 
   real x[M], y[CONSTRAINTS];
   TRY(find_velocity(t, q, p, idle, u + M, workspace));
   memcpy(u, q, sizeof(real) * M);
-  TRY(factorise_saddle(t, u, idle, at, g));
+  TRY(factorise_saddle(IDEAL_FORCES, t, u, idle, at, g));
   constraints(u, t, imposed, g, derivative);
   constrained_motion(u, t, imposed, value);
   memcpy(terms, g + FIRST, sizeof(real) * MASKED);
@@ -445,7 +428,7 @@ int NAME(contact_terms)(real t, const real *q, const real *p, const real *idle, 
     if (CONSTRAINT_ENTRY[e][0] >= FIRST)
       G[(CONSTRAINT_ENTRY[e][0] - FIRST) * M + CONSTRAINT_ENTRY[e][1]] = derivative[e];
   for (int k = 0; k < FIRST; k++)
-    right[k] = -value[M + CONSTRAINTS + k];
+    right[k] = value[M + CONSTRAINTS + k];
   constrained_motion(u, t, idle, value);
   for (int column = 0; column <= MASKED; column++) { /* the last one: free motion */
     const int is_free = column == MASKED;

@@ -34,8 +34,6 @@ static void prepare_rattle(const step_data *step, rattle_data *data)
     data->grown[n] = MATH(exp)(growth * RATTLE_ABSCISSA[n]);
   data->shrunk = MATH(exp)(-growth);
   data->loss = MATH(expm1)(-growth);
-#else
-  (void)step, (void)data;
 #endif
 }
 

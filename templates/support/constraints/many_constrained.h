@@ -2,15 +2,12 @@
 
 /* Constrained steps of trajectories that are SIMD lanes. Each is accepted in the iteration in which it would be alone.
  * A trajectory that needs more than the iteration, wider sizes or Newton's method, fails: it is continued alone from
- * its last state. Requires: multiplier_sizes.h, the table END_POSITION; N unknowns of a step. */
+ * its last state. Requires: the table END_POSITION; N unknowns of a step. */
 enum { SOLUTION_VECTORS = __builtin_offsetof(rattle_step, g) / sizeof(lanes) };
 
 typedef rattle_data iteration_data;
 
-static void prepare_iteration(const step_data *step, iteration_data *data)
-{
-  prepare_rattle(step, data);
-}
+#define prepare_iteration prepare_rattle
 
 /* Verdict of `accepts` in each lane: 1, 0 or -1. */
 static inline lanes verdicts(const lanes *change, const lanes *overall, const solver_options *options, int k)

@@ -1,17 +1,10 @@
-#include "../core/vector_width.h"
+#define POINTS POINT_LANES /* in vectors */
+#include "../core/vectors.h"
 #include "../newton/newton.h"
 
 /* Points of a constrained step as SIMD lanes, in groups that fill a register. trajectory_lanes.h defines the same
- * names. Requires: newton.h; POINT_LANES, a power of two. */
+ * names. Requires: POINT_LANES, a power of two. */
 #define RATTLE
-#pragma GCC diagnostic ignored "-Wpsabi" /* all functions with vector arguments are static */
-
-#define REGISTER_LANES (VECTOR_BYTES / REAL_BYTES)
-#if POINT_LANES < REGISTER_LANES
-#define LANES POINT_LANES
-#else
-#define LANES REGISTER_LANES
-#endif
 #if LANES == 1
 #define FORMER_LANES 1
 #elif LANES == 2
@@ -28,15 +21,9 @@ enum {
   DEGREE = B - 1, /* of B points; point n + 1 of positions is point n of forces and multipliers */
   GROUPS = (DEGREE + LANES - 1) / LANES, /* of points; point n is lane n % LANES of group n / LANES */
   GROUP_LANES = GROUPS * LANES,
-  LAST_GROUP = (DEGREE - 1) / LANES,
-  LANE_BYTES = LANES * sizeof(real)
+  LAST_GROUP = (DEGREE - 1) / LANES
 };
-#ifdef RATTLE_IN_PAIRS
-#include "../core/vectors.h"
-#else
-typedef real lanes __attribute__((vector_size(LANE_BYTES)));
-#endif
-typedef real_bits lane_numbers __attribute__((vector_size(LANE_BYTES)));
+typedef real_bits lane_numbers __attribute__((vector_size(LANES * REAL_BYTES)));
 
 typedef real number; /* a value of the trajectory */
 typedef int condition;
@@ -44,9 +31,6 @@ typedef int condition;
 #define FIRST_LANE(x) (x)[0] /* value at the first point, of group 0 */
 #define LAST_LANE(x) (x)[(DEGREE - 1) % LANES] /* at the last one, of LAST_GROUP */
 
-#if defined(__AVX512F__) && POINT_LANES >= 8 && !defined(__clang__)
-#pragma GCC target("prefer-vector-width=512") /* loops over lanes become whole vectors, not halves */
-#endif
 #ifdef __clang__
 #define FORMER(x, before) __builtin_shufflevector(x, before, FORMER_LANES)
 #else
@@ -70,44 +54,16 @@ LANE_FUNCTION void store(real *x, int g, lanes values)
   memcpy(x + g * LANES, &values, sizeof values);
 }
 
-#ifndef RATTLE_IN_PAIRS
-LANE_FUNCTION lanes lanes_of(real x)
-{
-  const lanes zero = {0};
-  return zero + x;
-}
-#endif
-
-/* Group g of the numbers of a table, one for each point. */
-LANE_FUNCTION lanes weights(const real *table, int g)
-{
-  return load(table, g);
-}
-
-LANE_FUNCTION lanes lanes_of_number(number x)
-{
-  return lanes_of(x);
-}
+#define weights(table, g) load(table, g) /* group g of the numbers of a table, one for each point */
+#define lanes_of_number(x) lanes_of(x)
+#define magnitude(x) MATH(fabs)(x)
+#define larger_number(a, b) larger(a, b)
+#define all_of(holds) (holds)
 
 /* Group g of x at the points before, first at the first point. */
 LANE_FUNCTION lanes former(const real *x, real first, int g)
 {
   return FORMER(load(x, g), g > 0 ? load(x, g - 1) : lanes_of(first));
-}
-
-static inline number magnitude(number x)
-{
-  return MATH(fabs)(x);
-}
-
-static inline number larger_number(number a, number b)
-{
-  return larger(a, b);
-}
-
-static inline int all_of(condition holds)
-{
-  return holds;
 }
 
 /* a / b, 0 unless a is positive. */

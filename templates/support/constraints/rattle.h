@@ -197,7 +197,6 @@ static void begin(const step_data *step, const rattle_data *run, const number *m
     rattle_step *now)
 {
   number forced[M][GROUP_LANES]; /* displacements by accelerations, divided by h */
-  (void)start;
   memcpy(now->inverse_mass, run->inverse_mass, sizeof now->inverse_mass);
   begin_first(step, now);
   for (int i = 0; i < M; i++)
@@ -229,7 +228,6 @@ static inline void last_force(const step_data *step, const rattle_step *now, con
   }
   constrained_force(u, step->t + RATTLE_ABSCISSA[DEGREE] * step->h, step->parameters, force);
 #else
-  (void)step, (void)z;
   TAKE_LANE(force, M, now->force, DEGREE - 1);
 #endif
 }
@@ -239,7 +237,6 @@ static inline void last_force(const step_data *step, const rattle_step *now, con
 /* Velocities at the end, where the momenta are p0 + dp. */
 static inline void end_velocity(const step_data *step, const rattle_step *now, const number *dp, number *v)
 {
-  (void)step;
   find_velocities(now->inverse_mass, dp, v);
   for (int i = 0; i < M; i++) {
     v[i] += now->v0[i];

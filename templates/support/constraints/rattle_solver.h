@@ -1,7 +1,7 @@
 #include "multiplier_sizes.h"
 
 /* Constrained steps by an iteration for the multipliers at the points, then the multipliers that project p1 onto the
- * tangent space. Requires: multiplier_sizes.h. */
+ * tangent space. */
 
 enum { LOST_DIGITS = -1 }; /* beside the status codes: Newton's method loses none */
 

@@ -1,12 +1,16 @@
 #include "../core/trajectories.h"
 
 /* Trajectories as SIMD lanes of a constrained step, whose points are in turn: group g is point g. point_lanes.h defines
- * the same names, and the order of sums is the same. Requires: trajectories.h; POINT_LANES, columns of the tables. */
+ * the same names, and the order of sums is the same. Requires: POINT_LANES, columns of the tables. */
 #define RATTLE
 #define LANE_FUNCTION static inline __attribute__((always_inline)) /* vectors are not passed to functions */
 #define IN_MEMORY(values) (void)0
 #define FIRST_LANE(x) (x)
 #define LAST_LANE(x) (x)
+#define load(x, g) (x)[g]
+#define store(x, g, values) ((x)[g] = (values))
+#define weights(table, g) lanes_of((table)[g])
+#define largest_lane(x) (*(x))
 
 enum {
   DEGREE = B - 1, /* of B points; point n + 1 of positions is point n of forces and multipliers */
@@ -21,21 +25,6 @@ typedef lane_numbers condition; /* all bits of the lanes where it holds */
 typedef struct {
   number relative, overall, absolute;
 } movement;
-
-LANE_FUNCTION lanes load(const lanes *x, int g)
-{
-  return x[g];
-}
-
-LANE_FUNCTION void store(lanes *x, int g, lanes values)
-{
-  x[g] = values;
-}
-
-LANE_FUNCTION lanes weights(const real *table, int g)
-{
-  return lanes_of(table[g]);
-}
 
 LANE_FUNCTION lanes former(const lanes *x, lanes first, int g)
 {
@@ -74,9 +63,4 @@ LANE_FUNCTION number larger_number(number a, number b)
 static inline number share(number a, number b)
 {
   return where((condition)(a > 0.0), a / b, lanes_of(0));
-}
-
-LANE_FUNCTION number largest_lane(const lanes *x)
-{
-  return *x;
 }

@@ -2,19 +2,15 @@
 #include "status_codes.h"
 #include "step.h"
 
-/* Termination of the iteration of one trajectory. Requires: stagnation.h, step.h. */
+/* Termination of the iteration of one trajectory. */
 typedef trajectory_progress progress;
 
 static inline progress before_iterations(void)
 {
-  const progress none = {.last = INFINITY, .before = INFINITY, .earlier = INFINITY};
-  return none;
+  return (progress){.last = INFINITY, .before = INFINITY, .earlier = INFINITY};
 }
 
-static inline int needs_iteration(const progress *now)
-{
-  return now->status == 0;
-}
+#define needs_iteration(now) ((now)->status == 0)
 
 static inline void take_change(progress *now, double change, const solver_options *options, int k,
     solver_report *report)
@@ -49,24 +45,10 @@ static inline int has_remainder(const progress *now, const solver_options *optio
   return last > SLOWLY * before || last * last * last > least * before * before || last * last > least * now->earlier;
 }
 
-static inline int any_positive(double x)
-{
-  return x > 0.0;
-}
-
-static inline int is_stagnant(progress *now, const solver_options *options, int k)
-{
-  return is_one_stagnant(now, options, k);
-}
-
-/* Where is_stagnant returned 1. */
-#define stagnant(now) 1.0
-
-static inline int must_amplify(progress *now, const solver_options *options, int k)
-{
-  return is_to_amplify(now, options, k);
-}
-
+#define any_positive(x) ((x) > 0.0)
+#define is_stagnant is_one_stagnant
+#define stagnant(now) 1.0 /* where is_stagnant returned 1 */
+#define must_amplify is_to_amplify
 #define amplification(now) AMPLIFICATION
 
 /* Status of the finished iteration. */
@@ -79,15 +61,7 @@ static inline int outcome(const progress *now, solver_report *report)
   return OK;
 }
 
-/* Returns 1 if the increments are finite and may be added. */
-static inline int accept(const step_data *step, const double *dq, const double *dp, solver_report *report)
-{
-  (void)report;
-  return reaches(step, dq, dp);
-}
+/* Returns OK if the increments are finite and may be added. */
+#define accept(step, dq, dp) (reaches(step, dq, dp) ? OK : NOT_FINITE)
 
-static inline long long next_guess(long long steps, const progress *now, const solver_report *report)
-{
-  (void)report;
-  return steps_to_continue(steps, now->first);
-}
+#define next_guess(steps, now, report) steps_to_continue(steps, (now)->first)

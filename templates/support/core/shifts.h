@@ -15,8 +15,7 @@ static inline shifts shifts_at(const double *table)
 
 static inline complex_shifts product_of(complex_shifts x, complex_shifts y)
 {
-  const complex_shifts product = {x.re * y.re - x.im * y.im, x.re * y.im + x.im * y.re};
-  return product;
+  return (complex_shifts){x.re * y.re - x.im * y.im, x.re * y.im + x.im * y.re};
 }
 
 /* a - x y. */

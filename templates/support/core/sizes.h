@@ -130,7 +130,6 @@ static inline real motion_of_step(const step_data *step, real h, real displaceme
   real motion = 0;
   for (int k = 0; k < COORDINATE_ARRAYS; k++)
     motion = larger(motion, motion_size(step->run, h, displacement, curvature, k));
-  (void)i;
   return motion;
 }
 #else
@@ -152,8 +151,6 @@ static inline void enlarge_to_arrays(real *size)
     for (int i = array[k][0]; i < array[k][1]; i++)
       size[i] = largest;
   }
-#else
-  (void)size;
 #endif
 }
 #endif

@@ -1,6 +1,6 @@
 #include "../iteration/convergence.h"
 
-/* Stagnation of the iteration of one trajectory, by rounding or by slow convergence. Requires: convergence.h. */
+/* Stagnation of the iteration of one trajectory, by rounding or by slow convergence. */
 
 /* Progress of the iteration of a step of one trajectory: the first change, the last three; the change that was
  * amplified by AMPLIFICATION, if any, and the number of iterations since; by_largest: 1 if changes are relative to the

@@ -2,7 +2,7 @@
 #include "vectors.h"
 
 /* SIMD lanes are trajectories: a vector contains values of LANES trajectories at one point. points.h defines the same
- * names. Requires: vectors.h. */
+ * names. */
 enum {
 #ifdef TRAJECTORIES_AS_LANES
   GROUPS = S - 1, /* vectors for all points of a constrained step but one */
@@ -20,11 +20,7 @@ typedef lanes number; /* a value of each trajectory */
 typedef real weight; /* a value of a point, the same for all trajectories */
 typedef const real (*point_table)[S];
 
-static inline number number_of(real x)
-{
-  return lanes_of(x);
-}
-
+#define number_of(x) lanes_of(x)
 #define lanes_of_number(x) (x)
 
 LANE_BY_LANE(magnitude, MATH(fabs));
@@ -103,13 +99,7 @@ static inline lanes contribution_of_points(const real (*table)[S], int n, const 
   return sum_in_parts(table[n], x, apart, POINTS_THERE < 8 ? 1 : 4);
 }
 
-/* The same for one coordinate. */
-static inline lanes apply(const real (*table)[S], int n, lanes (*x)[M], int i)
-{
-  return contribution_of_points(table, n, &x[0][i], M);
-}
-
-/* The same of stored values. */
+/* The same of stored values of a coordinate. */
 typedef lanes (*stored_forces)[M];
 
 static inline lanes sum_of_stored(const real (*table)[S], int n, stored_forces x, int i)
@@ -144,17 +134,8 @@ static inline lanes points_total(lanes *x)
 #define CHANGES_OF(n) ((weight)((n) < S - 1 ? 1.0 : S > 1 ? 1.0 + POINTS_THERE - S \
                                                           : 2.0))
 
-/* Value at the first point. */
-static inline number at_first(const lanes *x)
-{
-  return x[0];
-}
-
-/* Value at the last point. */
-static inline number at_last(const lanes *x, long long apart)
-{
-  return x[(S - 1) * apart];
-}
+#define at_first(x) (x)[0] /* value at the first point */
+#define at_last(x, apart) (x)[(S - 1) * (apart)]
 
 #define LANES_OF_WEIGHT(x) lanes_of(x)
 #include "weighted_points.h"
@@ -206,11 +187,6 @@ typedef struct {
 #endif
   const lanes *q0, *p0, *carry_q, *carry_p, *parameters;
 } step_data;
-
-/* Range of coordinates. */
-typedef struct {
-  long long first, end;
-} section;
 
 /* Stored values at the points, of the last step and of the one before, which the next step overwrites. */
 typedef struct {

@@ -30,18 +30,13 @@ static inline number weigh_apart_thrice(const weight *weights, const weight *low
   return points_total(part);
 }
 
-/* weigh_apart, and values at the first and at the last point, of one coordinate. */
+/* weigh_apart, and contribution_of_points, of one coordinate. */
 static inline number weigh(const weight *weights, lanes (*x)[M], int i)
 {
   return weigh_apart(weights, &x[0][i], M);
 }
 
-static inline number at_start(lanes (*x)[M], int i)
+static inline lanes apply(const point_table table, int group, lanes (*x)[M], int i)
 {
-  return at_first(&x[0][i]);
-}
-
-static inline number at_end(lanes (*x)[M], int i)
-{
-  return at_last(&x[0][i], M);
+  return contribution_of_points(table, group, &x[0][i], M);
 }

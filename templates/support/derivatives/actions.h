@@ -3,7 +3,7 @@
 
 #ifdef UNKNOWNS_OF_POINTS
 /* Actions of steps that are solved by fixed-point iteration. The unknowns z follow from the values at the points. The
- * action is stationary in z, so that their rounding errors enter squared. Requires: linearise.h, UNKNOWN_OF_POINTS. */
+ * action is stationary in z, so that their rounding errors enter squared. Requires: UNKNOWN_OF_POINTS. */
 
 /* Steps first <= k < end; returns 0 if the iteration fails for one of them. */
 static int actions_by_iteration(propagation *over, long long first, long long end, real *z, real *action)
@@ -31,13 +31,12 @@ static int actions_by_iteration(propagation *over, long long first, long long en
 #endif
 
 /* Actions of steps from given states: h sum_n w_n L along the curve of each step, without forces and constraints.
- * Requires: newton_from_line.h, sums_along. */
+ * Requires: sums_along. */
 
 int NAME(actions)(long long steps, const real *t, const real *h, const real *q, const real *p, const real *parameters,
     long long stride, const solver_options *options, real *q1, real *p1, real *action, solver_report *report,
     real *workspace)
 {
-  const solver_options standard = NAME(default_options)();
   const real carry[M] = {0};
   newton_data *data = newton_in(workspace + SCRATCH);
   memset(report, 0, sizeof *report);
@@ -59,7 +58,7 @@ int NAME(actions)(long long steps, const real *t, const real *h, const real *q, 
     real dq[M], dp[2 * M] = {0}, totals[SUMS];
     int keep = 0;
     report->t = t[k];
-    TRY(newton_from_line(&step, data, dp, &keep, options ? options : &standard, report));
+    TRY(newton_from_line(&step, data, dp, &keep, options ? options : &STANDARD_OPTIONS, report));
     gather(END_POSITION, 1, step.h, data->z, M, dq, 0, 1);
     for (int i = 0; i < M; i++) {
       q1[k * M + i] = step.q0[i] + dq[i];
@@ -67,8 +66,7 @@ int NAME(actions)(long long steps, const real *t, const real *h, const real *q, 
     }
     sums_along(&step, data->z, totals);
     action[k] = totals[SUMS - 1];
-    if (!all_finite(action + k, 1) || !all_finite(q1 + k * M, M) || !all_finite(p1 + k * M, M))
-      return NOT_FINITE;
+    TRY(all_finite(action + k, 1) && all_finite(q1 + k * M, M) && all_finite(p1 + k * M, M) ? OK : NOT_FINITE);
     report->steps++;
   }
   return OK;

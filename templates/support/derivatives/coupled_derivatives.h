@@ -10,9 +10,9 @@
  *   x = x0 + h A v,        f = L_qq x + L_qv v,        p = p0 + h W f,        v = L_vv^-1 (p - L_vq x),
  * and the adjoint variables y, z, w of f, x, p satisfy the transposed equations
  *   y = y0 + h W^T w,      z = L_qq y - L_qv w,        v = v0 + h A^T z,      w = L_vv^-1 (v + L_vq y).
- * The derivatives are those of the exact solution of the stage equations. Requires: coupled_iteration.h,
- * vector_convergence.h; CHANGE_POSITION (A), CHANGE_MOMENTUM (W) and their transposes with _BACK; the kernels
- * point_derivatives, derivative_product, TRANSPOSED_PRODUCT; POINT_INPUTS and input_derivatives. */
+ * The derivatives are those of the exact solution of the stage equations. Requires: coupled_iteration.h;
+ * CHANGE_POSITION (A), CHANGE_MOMENTUM (W) and their transposes with _BACK; the kernels point_derivatives,
+ * derivative_product, TRANSPOSED_PRODUCT; POINT_INPUTS and input_derivatives. */
 
 enum { STORED_OF_STEP = M * (POINTS + 2) }; /* numbers: velocities, then the increments of q and p */
 
@@ -31,7 +31,6 @@ typedef struct {
 static void store_step(const step_data *step, const iteration_data *data, const double *memory, const double *dq,
     const double *dp, double *to)
 {
-  (void)step, (void)data;
   memcpy(to, memory, sizeof(double) * M * POINTS);
   memcpy(to + M * POINTS, dq, sizeof(double) * M);
   memcpy(to + M * (POINTS + 1), dp, sizeof(double) * M);
@@ -130,8 +129,7 @@ static __attribute__((noinline)) int jvp_by_iteration(iterated_step *at, double 
       x0[n][i] = v[i] + dh * at->D[n][i];
       p0[n][i] = v[M + i] + dh * at->E[n][i] + h * apply(CHANGE_MOMENTUM, n, F, i) + given[n][M + i];
     }
-  if (solve_vectors(at, 0, x0, p0, f, look) != OK)
-    return NOT_CONVERGED;
+  TRY(solve_vectors(at, 0, x0, p0, f, look));
   for (int i = 0; i < M; i++) {
     lanes moved[GROUPS], pushed[GROUPS];
     for (int n = 0; n < GROUPS; n++) {
@@ -155,8 +153,7 @@ static __attribute__((noinline)) int vjp_by_iteration(iterated_step *at, double 
       y0[n][i] = at->end_momentum[n] * v[M + i];
       v0[n][i] = at->end_position[n] * v[i];
     }
-  if (solve_vectors(at, 1, y0, v0, z, look) != OK)
-    return NOT_CONVERGED;
+  TRY(solve_vectors(at, 1, y0, v0, z, look));
   v[INPUT_T + 1] += v[INPUT_T];
   add_input_gradient(at->given, at->u[0], 2 * M + POINT_DERIVATIVES, v);
   for (int i = 0; i < M; i++) {

@@ -67,7 +67,6 @@ int NAME(energy_gradient)(const real *q, const real *p, const real *parameters, 
   memcpy(u, q, sizeof(real) * M);
 #ifdef FROM_MOMENTA
   memcpy(u + M, p, sizeof(real) * M);
-  (void)workspace;
 #else
   TRY(NAME(velocity)(0, q, p, parameters, u + M, workspace));
 #endif
@@ -85,8 +84,8 @@ static void end_time(const linearised_step *at, int back)
 #endif
 
 /* Derivative of a step (JVP) and its transpose (VJP) by implicit differentiation of the stage equations. Requires:
- * newton_from_line.h and STAGE_GROUPS, the stage groups; if DAMPED, growth_wide, from inputs to gamma h; end_time, the
- * derivative of the time at the end. */
+ * STAGE_GROUPS, the stage groups; if DAMPED, growth_wide, from inputs to gamma h; end_time, the derivative of the time
+ * at the end. */
 
 static linearised_step linearised_in(const step_data *step, real *workspace)
 {
@@ -136,8 +135,7 @@ static int linearise_step(linearised_step *at, const solver_options *options, re
   if (is_spurious(step, at->data->z, dq, report->iterations - before))
     return STATUS(SPURIOUS_SOLUTION);
   evaluate(step, at->data->z, at->data->rows, size_p, size_q, at->data->factors, &at->shape);
-  if (!factorise(at->data->factors, &at->shape, at->data->pivot))
-    return SINGULAR;
+  TRY(factorise(at->data->factors, &at->shape, at->data->pivot) ? OK : SINGULAR);
   for (int f = 0; f < COUNT_OF_GROUPS; f++)
     partials = derivatives_of_group(STAGE_GROUPS + f, step, at->data->z, partials);
 #ifdef FIRST_ORDER_SYSTEM
@@ -285,19 +283,29 @@ static void vjp_step(const linearised_step *at)
   vjp_with_unknowns(at);
 }
 
+static void read_lanes(wide *to, int own, const real *from)
+{
+  memset(to, 0, sizeof(wide) * STEP_INPUTS);
+  for (int j = 0; j < own; j++)
+    for (int i = 0; i < STEP_INPUTS; i++)
+      to[i].lane[j] = from[j * STEP_INPUTS + i];
+}
+
+static void add_lanes(const wide *from, int own, real *to)
+{
+  for (int j = 0; j < own; j++)
+    for (int i = 0; i < STEP_INPUTS; i++)
+      to[j * STEP_INPUTS + i] += from[i].lane[j];
+}
+
 /* Adds to the vectors `to` the JVPs (back: VJPs) of `from`, WIDTH at a time. */
 static int propagate_vectors(const linearised_step *at, int back, int count, const real *from, real *to)
 {
   for (int first = 0; first < count; first += WIDTH) {
     const int own = least(WIDTH, count - first);
-    memset(at->v, 0, sizeof(wide) * STEP_INPUTS);
-    for (int j = 0; j < own; j++)
-      for (int i = 0; i < STEP_INPUTS; i++)
-        at->v[i].lane[j] = from[(first + j) * STEP_INPUTS + i];
+    read_lanes(at->v, own, from + first * STEP_INPUTS);
     (back ? vjp_step : jvp_step)(at);
-    for (int j = 0; j < own; j++)
-      for (int i = 0; i < STEP_INPUTS; i++)
-        to[(first + j) * STEP_INPUTS + i] += at->v[i].lane[j];
+    add_lanes(at->v, own, to + first * STEP_INPUTS);
   }
   return all_finite(to, count * STEP_INPUTS) ? OK : NOT_FINITE;
 }

@@ -1,6 +1,6 @@
 #include "jvp_and_vjp.h"
 
-/* Tangent and adjoint vectors over steps solved by Newton's method. Requires: jvp_and_vjp.h. */
+/* Tangent and adjoint vectors over steps solved by Newton's method. */
 
 /* Steps and the vectors propagated over them, of shape (steps + 1, count, STEP_INPUTS). */
 typedef struct {
@@ -14,26 +14,20 @@ typedef struct {
 } propagation;
 
 /* Propagation by the arguments of a function. */
-#define PROPAGATION_OF_ARGUMENTS                                                                      \
-  .t = t, .h = h, .q = q, .p = p, .parameters = parameters, .options = options ? options : &standard, \
+#define PROPAGATION_OF_ARGUMENTS                                                                              \
+  .t = t, .h = h, .q = q, .p = p, .parameters = parameters, .options = options ? options : &STANDARD_OPTIONS, \
   .q1 = q1, .p1 = p1, .workspace = workspace, .report = report
 
 static step_data step_of(const propagation *over, long long k, const real *nothing)
 {
-  const step_data step = step_from(over->t[k], over->h[k], over->q + k * M, over->p + k * M, nothing, nothing,
+  return step_from(over->t[k], over->h[k], over->q + k * M, over->p + k * M, nothing, nothing,
       over->parameters, over->workspace);
-  return step;
 }
 
-/* Vectors at the side of step k where the propagation starts; vectors_to: where it ends. */
-static const real *vectors_from(const propagation *over, long long k)
+/* Vectors at the start of step k; step k propagates them from there to k + 1, or back. */
+static real *vectors_at(const propagation *over, long long k)
 {
-  return over->vectors + (k + over->back) * over->count * STEP_INPUTS;
-}
-
-static real *vectors_to(const propagation *over, long long k)
-{
-  return over->vectors + (k + !over->back) * over->count * STEP_INPUTS;
+  return over->vectors + k * over->count * STEP_INPUTS;
 }
 
 /* Propagates the vectors from index `first` on over step k. */
@@ -46,8 +40,8 @@ static int vectors_by_newton(propagation *over, long long k, int first)
   over->guess = 0;
   TRY(linearise_step(&at, over->options, over->q1 ? over->q1 + k * M : NULL, over->q1 ? over->p1 + k * M : NULL,
       over->report));
-  return propagate_vectors(&at, over->back, over->count - first, vectors_from(over, k) + first * STEP_INPUTS,
-      vectors_to(over, k) + first * STEP_INPUTS);
+  return propagate_vectors(&at, over->back, over->count - first, vectors_at(over, k + over->back) + first * STEP_INPUTS,
+      vectors_at(over, k + !over->back) + first * STEP_INPUTS);
 }
 
 #ifdef VECTORS_BY_ITERATION
@@ -97,9 +91,9 @@ static int solve_steps(propagation *over, long long first, long long end)
 /* Propagates the vectors over a solved step; returns the number propagated before an iteration failed. */
 static int propagate_by_iteration(propagation *over, long long k, const double *kept)
 {
-  const double nothing[M] = {0.0}, *from = vectors_from(over, k);
+  const double nothing[M] = {0.0}, *from = vectors_at(over, k + over->back);
   const step_data step = step_of(over, k, nothing);
-  double *to = vectors_to(over, k);
+  double *to = vectors_at(over, k + !over->back);
   iteration_data data;
   iterated_step at;
   prepare_iteration(&step, &data);
@@ -114,6 +108,13 @@ static int propagate_by_iteration(propagation *over, long long k, const double *
   }
   return over->count;
 }
+#else
+/* Tangent and adjoint vectors over steps that are each solved by Newton's method. */
+enum { STEPS_AT_ONCE = 1 };
+
+#define solve_steps(over, first, end) 0
+#define propagate_by_iteration(over, k, kept) 0
+#endif
 
 /* Propagates the vectors over steps first <= k < end. */
 static int propagate_steps(propagation *over, long long first, long long end)
@@ -124,29 +125,14 @@ static int propagate_steps(propagation *over, long long first, long long end)
   for (long long done = 0; status == OK && done < end - first; done++) {
     const long long k = over->back ? end - 1 - done : first + done;
     const int carried = iterated ? propagate_by_iteration(over, k, stored_of(over, k - first)) : 0;
-    if (carried < over->count)
+    if (!iterated || carried < over->count)
       status = vectors_by_newton(over, k, carried);
-    else if (!all_finite(vectors_to(over, k), over->count * STEP_INPUTS))
+    else if (!all_finite(vectors_at(over, k + !over->back), over->count * STEP_INPUTS))
       status = NOT_FINITE;
     over->report->steps += status == OK;
   }
   return status;
 }
-#else
-/* Tangent and adjoint vectors over steps that are each solved by Newton's method. */
-enum {
-  STEPS_AT_ONCE = 1
-};
-
-/* Propagates the vectors over step `first`. */
-static int propagate_steps(propagation *over, long long first, long long end)
-{
-  const int status = vectors_by_newton(over, first, 0);
-  (void)end;
-  over->report->steps += status == OK;
-  return status;
-}
-#endif
 
 /* Tangent or adjoint vectors over a sequence of steps, forward or backward. On failure report->t is the time of the
  * failed step. Requires: propagate_steps, which propagates them over at most STEPS_AT_ONCE steps. */
@@ -154,7 +140,6 @@ int NAME(linearise)(long long steps, const real *t, const real *h, const real *q
     const real *parameters, const solver_options *options, int back, int count, real *vectors, real *q1, real *p1,
     solver_report *report, real *workspace)
 {
-  const solver_options standard = NAME(default_options)();
   propagation over = {PROPAGATION_OF_ARGUMENTS, .back = back, .count = count, .vectors = vectors};
   int status = OK;
   memset(report, 0, sizeof *report);

@@ -2,8 +2,8 @@
 
 /* Second derivatives of a step by forward-over-reverse differentiation: the tangent of the adjoint. The stage equations
  * times the adjoint multipliers are a function of the inputs and the unknowns; its Hessian times a tangent vector is
- * the source of the tangents of the multipliers, which are solved for with the same factors. Requires: jvp_and_vjp.h,
- * kernels of second derivatives, HESSIAN_ARGUMENTS, HESSIAN_VALUES. */
+ * the source of the tangents of the multipliers, which are solved for with the same factors. Requires: kernels of
+ * second derivatives, HESSIAN_ARGUMENTS, HESSIAN_VALUES. */
 
 /* Memory for WIDTH tangent and adjoint vectors. Tangent vectors of the inputs (change) and of the unknowns (dz);
  * adjoint variables (input_adjoints), their tangents (adjoint_tangents), and the contributions of the nonlinear terms
@@ -163,21 +163,6 @@ static void hessian_of_step(const linearised_step *at, const second_order_memory
   memcpy(to->adjoint_tangents, at->v, sizeof(wide) * STEP_INPUTS);
 }
 
-static void read_lanes(wide *to, int own, const real *from)
-{
-  memset(to, 0, sizeof(wide) * STEP_INPUTS);
-  for (int j = 0; j < own; j++)
-    for (int i = 0; i < STEP_INPUTS; i++)
-      to[i].lane[j] = from[j * STEP_INPUTS + i];
-}
-
-static void add_lanes(const wide *from, int own, real *to)
-{
-  for (int j = 0; j < own; j++)
-    for (int i = 0; i < STEP_INPUTS; i++)
-      to[j * STEP_INPUTS + i] += from[i].lane[j];
-}
-
 /* Adds to (2, count, STEP_INPUTS) adjoint vectors and their tangents `to` the result of the step for `from`, WIDTH at a
  * time. */
 static int hessian_of_vectors(const linearised_step *at, int count, const real *changes, const real *from, real *to)
@@ -199,7 +184,6 @@ int NAME(second_order)(long long steps, const real *t, const real *h, const real
     const real *parameters, const solver_options *options, int count, const real *changes, real *vectors,
     solver_report *report, real *workspace)
 {
-  const solver_options standard = NAME(default_options)();
   const real carry[M] = {0};
   const long long across = (long long)count * STEP_INPUTS;
   memset(report, 0, sizeof *report);
@@ -207,7 +191,7 @@ int NAME(second_order)(long long steps, const real *t, const real *h, const real
     const step_data step = step_from(t[k], h[k], q + k * M, p + k * M, carry, carry, parameters, workspace);
     linearised_step at = linearised_in(&step, workspace);
     report->t = t[k];
-    TRY(linearise_step(&at, options ? options : &standard, NULL, NULL, report));
+    TRY(linearise_step(&at, options ? options : &STANDARD_OPTIONS, NULL, NULL, report));
     TRY(hessian_of_vectors(
         &at, count, changes + k * across, vectors + (k + 1) * 2 * across, vectors + k * 2 * across));
     report->steps++;

@@ -8,9 +8,8 @@
  * adjoint variables y of the forces are the fixed points of
  *   x = x0 + s P (K x),      y = y0 + s P^T (K^T y),
  * which converge at the rate of the step itself. The derivatives are those of the exact solution of the stage
- * equations. Requires: separable_iteration.h, vector_convergence.h, PRODUCT_BACK, the transposed table,
- * point_derivatives and derivative_product, TRANSPOSED_PRODUCT, POINT_INPUTS and input_derivatives, MASS_INPUTS and
- * mass_by_inputs. */
+ * equations. Requires: PRODUCT_BACK, the transposed table, point_derivatives and derivative_product,
+ * TRANSPOSED_PRODUCT, POINT_INPUTS and input_derivatives, MASS_INPUTS and mass_by_inputs. */
 
 enum { STORED_OF_STEP = M * (POINTS + 2) }; /* numbers: D, then the increments of q and p */
 
@@ -121,8 +120,6 @@ static inline void vary_masses(iterated_step *at, const double *v, double *dm)
 #ifdef VARIABLE_MASSES
   for (int e = 0; e < MASS_DERIVATIVES; e++)
     dm[MASS_INPUTS[e][0]] += at->mass_derivative[e] * v[2 * M + MASS_INPUTS[e][1]];
-#else
-  (void)at, (void)v;
 #endif
 }
 
@@ -153,8 +150,7 @@ static __attribute__((noinline)) int jvp_by_iteration(iterated_step *at, double 
     for (int n = 0; !of_state && n < GROUPS; n++)
       at->u[n][i] += at->scale[i] * apply(PRODUCT, n, F, i);
   }
-  if (solve_vectors(at, 0, f, look) != OK)
-    return NOT_CONVERGED;
+  TRY(solve_vectors(at, 0, f, look));
   for (int i = 0; i < M; i++) {
     const double by_length = 2.0 * dh - data->inverse_mass[i] * dm[i];
     const double drift = h * data->inverse_mass[i] * (v[M + i] - dh * at->step->p0[i]);
@@ -177,8 +173,7 @@ static __attribute__((noinline)) int vjp_by_iteration(iterated_step *at, double 
   for (int i = 0; i < M; i++)
     for (int n = 0; n < GROUPS; n++)
       at->u[n][i] = POINT_END_POSITION[n] * (at->scale[i] * v[i]) + data->kick[n] * v[M + i];
-  if (solve_vectors(at, 1, f, look) != OK)
-    return NOT_CONVERGED;
+  TRY(solve_vectors(at, 1, f, look));
   v[INPUT_T + 1] += v[INPUT_T];
   add_input_gradient(at->given, at->u[0], M + POINT_DERIVATIVES, v);
   for (int i = 0; i < M; i++) {

@@ -4,7 +4,7 @@
 /* Steps between given positions, as intervals of a path: their momenta p0 = -D1 L_d, p1 = D2 L_d and the derivatives of
  * these, the Hessian of L_d (Marsden & West, Acta Numerica 2001, sec. 1.3; with forces, the discrete
  * Lagrange-d'Alembert momenta). The stage equations with the row END_POSITION z = (q1 - q0) / h and the unknown p0 are
- * linearised. Requires: jvp_and_vjp.h, sums_along. */
+ * linearised. Requires: sums_along. */
 
 /* Factorises the Jacobian of a solved step with this row. Returns 0 if it is singular. */
 static int linearise_between(linearised_step *at, const real *q1)
@@ -79,7 +79,6 @@ int NAME(steps_between)(long long steps, const real *t, const real *h, const rea
     const real *parameters, long long stride, const solver_options *options, int count, const real *variations,
     real *p0, real *p1, real *action, real *derivatives, solver_report *report, real *workspace)
 {
-  const solver_options standard = NAME(default_options)();
   const real carry[M] = {0};
   memset(report, 0, sizeof *report);
   for (long long k = 0; k < steps; k++) {
@@ -87,7 +86,7 @@ int NAME(steps_between)(long long steps, const real *t, const real *h, const rea
     const step_data step = step_from(t[k], h[k], q0 + k * M, start_p, carry, carry, parameters + k * stride, workspace);
     linearised_step at = linearised_in(&step, workspace);
     report->t = t[k];
-    TRY(newton_between(&step, at.data, q1 + k * M, start_p, increment, options ? options : &standard, report));
+    TRY(newton_between(&step, at.data, q1 + k * M, start_p, increment, options ? options : &STANDARD_OPTIONS, report));
     for (int i = 0; i < M; i++) {
       p0[k * M + i] = start_p[i];
       p1[k * M + i] = at.p1[i] = start_p[i] + increment[i];

@@ -1,7 +1,7 @@
 #include "../iteration/convergence.h"
 
 /* Convergence criterion for the fixed-point iterations of tangent and adjoint vectors, and their dependence on
- * parameters and time. Requires: convergence.h, POINT_INPUTS. */
+ * parameters and time. Requires: POINT_INPUTS. */
 
 enum { INPUT_T = STEP_INPUTS - 2 };
 

@@ -1,7 +1,3 @@
 /* Pairs from words, and from the array of parameters. */
-static inline dd dd_of(double high, double low)
-{
-  return (dd){high, low};
-}
-
+#define dd_of(high_word, low_word) ((dd){high_word, low_word})
 #define PARAMETER(i) dd_of(parameters[i], parameters[PARAMETERS + (i)])

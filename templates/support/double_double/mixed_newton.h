@@ -6,7 +6,7 @@
  * Numerical Algorithms, ch. 12). Newton's method solves the stage equations in double, to 1e-16; their residual in
  * pairs has 16 digits as one word, and is solved in double with the factors of the Jacobian at the solution. Each
  * correction gains up to 16 digits, so that two evaluations in pairs suffice; the second shows that they do. Requires:
- * newton.h, evaluate_pairs, the rows in pairs. */
+ * evaluate_pairs, the rows in pairs. */
 
 #define REFINED 1e-34 /* change by the last correction, relative to the state: momenta are those before it */
 #define REFINED_ROUNDING 1e-24 /* changes that may be rounding errors, if they stop decreasing */
@@ -79,10 +79,8 @@ static int refine_unknowns(const step_data *step, double *memory, double t_low, 
 #endif
   memcpy(data->z, memory, sizeof(double) * N);
   evaluate(step, data->z, data->rows, size_p, size_q, data->factors, &shape);
-  if (!all_finite(data->rows, N + SITES) || !all_finite(size_q, M))
-    return NOT_FINITE;
-  if (!linearise(step, data, &shape))
-    return SINGULAR;
+  TRY(all_finite(data->rows, N + SITES) && all_finite(size_q, M) ? OK : NOT_FINITE);
+  TRY(linearise(step, data, &shape) ? OK : SINGULAR);
   memcpy(memory + N, data->point, sizeof(double) * POINT);
   for (int i = 0; i < M; i++)
     largest = larger(largest, size_q[i]);
@@ -94,8 +92,7 @@ static int refine_unknowns(const step_data *step, double *memory, double t_low, 
     evaluate_pairs(&at);
     const double change = correct_pairs(&at, data, &shape, inverse_size);
     const int stagnates = !(change < last / 4);
-    if (!is_finite(change))
-      return NOT_FINITE;
+    TRY(is_finite(change) ? OK : NOT_FINITE);
     if (change <= REFINED || (change <= REFINED_ROUNDING && stagnates))
       break;
     if (k + 1 >= MOST_REFINEMENTS)
@@ -114,8 +111,6 @@ static int refine_unknowns(const step_data *step, double *memory, double t_low, 
 #ifdef TIME_TRANSFORMATION
   const dd duration = duration_of_pairs(&at);
   passed[0] = duration.high, passed[1] = duration.low;
-#else
-  (void)passed;
 #endif
 #ifdef DAMPED
   shrink_pairs(&at);

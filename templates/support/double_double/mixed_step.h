@@ -216,8 +216,7 @@ static inline void find_residual(pair_step *w, const number *q, const number *q_
       const lanes node = LANES_OF_WEIGHT(DRIFT[n]);
       const ddl line = ddl_two_product(node, drift.high), start = ddl_two_sum(lanes_of_number(q[i]), line.high);
       const ddl point = ddl_two_sum(start.high, moved.high);
-      const lanes lower =
-          multiply_add(LANES_OF_WEIGHT(DRIFT_LOW[n]), drift.high, DRIFT_LOWEST[n] * drift.high);
+      const lanes lower = multiply_add(LANES_OF_WEIGHT(DRIFT_LOW[n]), drift.high, DRIFT_LOWEST[n] * drift.high);
       const lanes low = line.low + multiply_add(node, drift.low, lower);
       w->rest[n][i] = (point.high - w->X[n][i]) + ((start.low + point.low) + ((low + q_low[i]) + moved.low));
     }
@@ -246,7 +245,6 @@ static inline void find_bias(const pair_step *w, number wanted, lanes (*f)[M], l
       e[n][i] = CHOSEN(wanted, bias, e[n][i]);
     }
   }
-  (void)wanted;
 }
 
 /* States of the correction of a trajectory: e is 0, is to be computed, is known; D is found, is not. */
@@ -361,7 +359,6 @@ HOT int refine_increments(const step_data *step, double *memory, double t_low, d
     double *passed, double *workspace)
 {
   int state = LINEAR;
-  (void)memory, (void)passed, (void)workspace;
   refine_step(step, t_low, h_low, dq, dp, &state);
   if (state != SOLVED)
     return state == SLOW ? NOT_CONVERGED : NOT_FINITE;

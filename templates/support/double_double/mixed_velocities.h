@@ -10,8 +10,8 @@
  * is solved in double by fixed-point iteration with the derivatives at the solution in double, to half the digits; what
  * it leaves, and what is quadratic in D, is the residual at the corrected points, whose correction is small enough to
  * be linear: two evaluations in pairs are enough. The tables and the weights h beta, h w have two words, rounded once,
- * so that the map of a variational method has a generating function, as in double. Requires: coupled_iteration.h; the
- * kernels value_lanes_pairs (L_q, L_v), point_derivatives and derivative_product; low words of the tables. */
+ * so that the map of a variational method has a generating function, as in double. Requires: the kernels
+ * value_lanes_pairs (L_q, L_v), point_derivatives and derivative_product; low words of the tables. */
 
 #define LINEAR_CORRECTION 1e-20 /* relative to the velocities: what it omits is below 1e-35 */
 #define CORRECTED_PART 1e-9 /* last change of a correction, relative to its residual */
@@ -189,8 +189,7 @@ static int refine_velocities(const step_data *step, double t_low, double h_low, 
     if (k == 0)
       find_velocity_derivatives(&at);
     size = find_velocity_correction(&at, f);
-    if (!is_finite(size))
-      return NOT_CONVERGED;
+    TRY(is_finite(size) ? OK : NOT_CONVERGED);
     for (int n = 0; n < GROUPS; n++)
       for (int i = 0; i < M; i++)
         at.z[n][i] = ddl_add(at.z[n][i], ddl_word(at.vector[n][M + i]));
@@ -203,8 +202,6 @@ static int refine_velocities(const step_data *step, double t_low, double h_low, 
 #ifdef TIME_TRANSFORMATION
   const dd duration = duration_of_velocity_pairs(&at);
   passed[0] = duration.high, passed[1] = duration.low;
-#else
-  (void)passed;
 #endif
   weigh_pairs(at.position_weight, at.z, scaled);
   for (int i = 0; i < M; i++) {

@@ -2,8 +2,8 @@
 #include "pair_states.h"
 
 /* Projection onto constraints, and Lagrange multipliers, in pairs: solutions in double, corrected with the factors of
- * the same matrices by residuals in pairs. Requires: constraints.h, pair_states.h, the kernels constraints_pairs (g,
- * then the derivatives), constrained_motion_pairs and legendre_pairs (with the mass matrix). */
+ * the same matrices by residuals in pairs. Requires: the kernels constraints_pairs (g, then the derivatives),
+ * constrained_motion_pairs and legendre_pairs (with the mass matrix). */
 
 enum { PAIR_CORRECTIONS = 4,
   MOST_PAIR_CORRECTIONS = 16 };
@@ -43,8 +43,7 @@ int NAME(constraint_values)(long long count, const double *t, const double *q, c
     dd positions[M], momenta[M], u[2 * M], values[CONSTRAINTS + CONSTRAINT_ENTRIES], rates[CONSTRAINTS];
     load_pairs(q + k * 2 * M, positions);
     load_pairs(p + k * 2 * M, momenta);
-    TRY(constrained_pairs(dd_of(t[2 * k], t[2 * k + 1]), positions, momenta, parameters, u, values,
-        rates, workspace));
+    TRY(constrained_pairs(dd_of(t[2 * k], t[2 * k + 1]), positions, momenta, parameters, u, values, rates, workspace));
     high_words(values, CONSTRAINTS, g + k * CONSTRAINTS);
     high_words(rates, CONSTRAINTS, rate + k * CONSTRAINTS);
     if (!all_finite(g + k * CONSTRAINTS, CONSTRAINTS) || !all_finite(rate + k * CONSTRAINTS, CONSTRAINTS))
@@ -85,10 +84,9 @@ int NAME(project)(const double *time, const double *q0, const double *p0, const 
     memcpy(q, moved, sizeof q);
   for (int k = 0; k < MOST_PAIR_CORRECTIONS && size > SETTLED_PAIRS * largest_high(q); k++) {
     high_words(q, M, high);
-    TRY(factorise_saddle(t, high, parameters, at, g));
+    TRY(factorise_saddle(IDEAL_FORCES, t, high, parameters, at, g));
     constraints_pairs(q, now, parameters, values);
-    for (int j = 0; j < CONSTRAINTS; j++)
-      right[j] = -values[j].high;
+    high_words(values, CONSTRAINTS, right);
     solve_saddle(at, NULL, right, update, y);
     for (int i = 0; i < M; i++)
       q[i] = dd_add(q[i], dd_word(update[i]));
@@ -104,9 +102,8 @@ int NAME(project)(const double *time, const double *q0, const double *p0, const 
           dd_multiply(values[CONSTRAINTS + e], sum[CONSTRAINT_ENTRY[e][0]]));
     TRY(constrained_pairs(now, q, p, parameters, u, values, rate, workspace));
     high_words(u, 2 * M, high);
-    TRY(factorise_saddle(t, high, parameters, at, g));
-    for (int j = 0; j < CONSTRAINTS; j++)
-      right[j] = -rate[j].high;
+    TRY(factorise_saddle(IDEAL_FORCES, t, high, parameters, at, g));
+    high_words(rate, CONSTRAINTS, right);
     solve_saddle(at, NULL, right, update, y);
     for (int j = 0; j < CONSTRAINTS; j++)
       sum[j] = dd_add(sum[j], dd_word(y[j]));
@@ -179,7 +176,7 @@ int NAME(multipliers)(long long count, const double *t, const double *q, const d
     load_pairs(p + k * 2 * M, momenta);
     TRY(constrained_pairs(then, positions, momenta, parameters, u, g, rate, workspace));
     high_words(u, 2 * M, high);
-    TRY(factorise_saddle(t[2 * k], high, parameters, at, none));
+    TRY(factorise_saddle(IDEAL_FORCES, t[2 * k], high, parameters, at, none));
     memset(a, 0, sizeof a);
     memset(y, 0, sizeof y);
     legendre_pairs(u, then, parameters, mass);
@@ -187,16 +184,14 @@ int NAME(multipliers)(long long count, const double *t, const double *q, const d
       double forces[M], rates[CONSTRAINTS], change[M], change_of_y[CONSTRAINTS];
       constrained_motion_pairs(u, then, parameters, value); /* residuals: F - L_vv a - G^T y, -(rest) - G a */
       for (int e = 0; e < MASS_ENTRIES; e++)
-        value[MASS_ENTRY[e][0]] =
-            dd_subtract(value[MASS_ENTRY[e][0]], dd_multiply(mass[M + e], a[MASS_ENTRY[e][1]]));
+        value[MASS_ENTRY[e][0]] = dd_subtract(value[MASS_ENTRY[e][0]], dd_multiply(mass[M + e], a[MASS_ENTRY[e][1]]));
       for (int e = 0; e < CONSTRAINT_ENTRIES; e++) {
         const int row = CONSTRAINT_ENTRY[e][0], i = CONSTRAINT_ENTRY[e][1], j = M + CONSTRAINTS + row;
         value[i] = dd_subtract(value[i], dd_multiply(g[CONSTRAINTS + e], y[row]));
         value[j] = dd_add(value[j], dd_multiply(g[CONSTRAINTS + e], a[i]));
       }
       high_words(value, M, forces);
-      for (int j = 0; j < CONSTRAINTS; j++)
-        rates[j] = -value[M + CONSTRAINTS + j].high;
+      high_words(value + M + CONSTRAINTS, CONSTRAINTS, rates);
       solve_saddle(at, forces, rates, change, change_of_y);
       for (int i = 0; i < M; i++)
         a[i] = dd_add(a[i], dd_word(change[i]));
@@ -205,8 +200,7 @@ int NAME(multipliers)(long long count, const double *t, const double *q, const d
     }
     for (int j = 0; j < CONSTRAINTS; j++)
       to[j] = -y[j].high, to[CONSTRAINTS + j] = -y[j].low;
-    if (!all_finite(to, 2 * CONSTRAINTS))
-      return NOT_FINITE;
+    TRY(all_finite(to, 2 * CONSTRAINTS) ? OK : NOT_FINITE);
   }
   return OK;
 }

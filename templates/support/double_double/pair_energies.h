@@ -28,7 +28,6 @@ static int energy_of(dd t, const double *q, const double *p, const double *param
   dd u[2 * M], sum;
   load_pairs(q, u);
 #ifdef HAMILTONIAN_SYSTEM
-  (void)workspace;
   load_pairs(p, u + M);
   hamiltonian_pairs(u, t, parameters, &sum);
 #else
@@ -55,8 +54,7 @@ int NAME(energies)(long long count, const double *t, const double *q, const doub
     double *energy, double *workspace)
 {
   for (long long k = 0; k < count; k++)
-    TRY(energy_of(dd_of(t[2 * k], t[2 * k + 1]), q + k * 2 * M, p + k * 2 * M, parameters,
-        energy + 2 * k, workspace));
+    TRY(energy_of(dd_of(t[2 * k], t[2 * k + 1]), q + k * 2 * M, p + k * 2 * M, parameters, energy + 2 * k, workspace));
   return OK;
 }
 
@@ -76,8 +74,7 @@ int NAME(momentum_maps)(long long count, const double *t, const double *q, const
       if (size)
         size[k * MAPS + j] = sqrt(value[MAPS + j].high);
     }
-    if (!all_finite(map + 2 * k * MAPS, 2 * MAPS))
-      return NOT_FINITE;
+    TRY(all_finite(map + 2 * k * MAPS, 2 * MAPS) ? OK : NOT_FINITE);
   }
   return OK;
 }

@@ -4,11 +4,10 @@
 /* Increments of a step in two words: RATTLE (rattle.h) is continued in pairs of vectors from its solution in
  * double: positions u and multipliers have two words, their corrections have one. With the residuals
  *   r = q0 + h c v0 + h^2 R a - u,    g(u),    a = M^-1 (F(u) + G^T lambda),
- * in pairs, which are small, so that one word of each has 16 digits, the correction of lambda solves P dlambda =
- * -R^-1 (g + G r) / h^2, and that of u is r + h^2 R M^-1 G^T dlambda. What it neglects shrinks as the updates of RATTLE
- * do. Momenta are projected by multipliers of two words. Requires: rattle.h, rattle_solver.h, mixed_newton.h; the
- * kernels constrained_force_of_points, constraints_of_points (of vectors) and constrained_motion; RATTLE_ABSCISSA_LOW,
- * RATTLE_WEIGHT_LOW. */
+ * in pairs, which are small, so that one word of each has 16 digits, the correction of lambda solves P dlambda = -R^-1
+ * (g + G r) / h^2, and that of u is r + h^2 R M^-1 G^T dlambda. What it neglects shrinks as the updates of RATTLE do.
+ * Momenta are projected by multipliers of two words. Requires: rattle.h; the kernels constrained_force_of_points,
+ * constraints_of_points (of vectors) and constrained_motion; RATTLE_ABSCISSA_LOW, RATTLE_WEIGHT_LOW. */
 #define NEGLECTED 4.0 /* multiple of the next update, from the last two, that is below REFINED */
 
 /* Values of a step at its points, as in rattle.h. */
@@ -209,8 +208,7 @@ static int refine_points(solved_step *solved, const step_data *step, const doubl
     real moved = measure_change(change, sizes.inverse, sizes.largest).relative;
     const real next = moved * larger(moved / last, FASTEST_MULTIPLIERS);
     const int stagnates = !(moved < last / 4);
-    if (!is_finite(moved))
-      return NOT_FINITE;
+    TRY(is_finite(moved) ? OK : NOT_FINITE);
     if (moved <= REFINED || (k > 0 && NEGLECTED * next <= REFINED))
       break;
     if (stagnates && moved > REFINED_ROUNDING && !sizes.widened) { /* above the rounding of positions: that of g */

@@ -19,13 +19,12 @@ static int refine_increments(const step_data *step, double *memory, double t_low
       return status;
   }
 #elif defined(MIXED_VELOCITIES)
-  const solver_options options = NAME(default_options)();
   solver_report report = {0};
   double unknowns[N + POINT]; /* memory has the velocities of the iteration */
   int status, keep;
   if (((solved_step *)step->points)->by_iteration && refine_velocities(step, t_low, h_low, dq, dp, passed) == OK)
     return OK;
-  TRY(newton_from_line(step, newton_in(workspace), dp, &keep, &options, &report));
+  TRY(newton_from_line(step, newton_in(workspace), dp, &keep, &STANDARD_OPTIONS, &report));
   memory = unknowns;
   memcpy(memory, newton_in(workspace)->z, sizeof(double) * N);
 #endif

@@ -41,7 +41,6 @@ static inline void fixed_point(const step_data *step, const iteration_data *data
     lanes *dq, lanes *dp, const solver_options *options, solver_report *report)
 {
   pair F[M];
-  (void)options;
   for (int i = 0; i < M; i++)
     F[i] = ddl_of_words(past.last[0][i], past.last[1][i]);
   leap_in_pairs(
@@ -52,22 +51,15 @@ static inline void fixed_point(const step_data *step, const iteration_data *data
   *guess = 1;
 }
 #else
-typedef struct {
-  int unused;
-} solver_data;
+typedef int solver_data; /* not used */
 
-static void prepare(const step_data *step, solver_data *data)
-{
-  (void)step;
-  data->unused = 0;
-}
+#define prepare(step, data) (void)(*(data) = 0)
 
 /* Solves nothing: refine_increments, which has both words of t and h, computes the step. The last number of the memory
  * is 1 if it contains the inverse masses and the last force, which the next step reuses if it starts with a kick. */
 static int solve(const step_data *step, const solver_data *data, double *memory, long long *guess, double *dq,
     double *dp, const solver_options *options, solver_report *report, double *workspace)
 {
-  (void)step, (void)data, (void)options, (void)workspace;
   memset(dq, 0, sizeof(double) * 2 * M);
   memset(dp, 0, sizeof(double) * 2 * M);
   memory[MEMORY - 1] = *guess > 0;
@@ -81,13 +73,11 @@ HOT int refine_increments(const step_data *step, double *memory, double t_low, d
 {
   pair kept[2][M]; /* inverse masses, last force */
   const int known = memory[MEMORY - 1] > 0.0;
-  (void)passed, (void)workspace;
   memcpy(kept, memory, sizeof kept);
   if (!known)
     invert_mass_pairs(step->t, step->parameters, kept[0]);
   leap_in_pairs(step, dd_of(step->t, t_low), dd_of(step->h, h_low), kept[0], known, kept[1], dq, dp);
-  if (!reaches(step, dq, dp))
-    return NOT_FINITE;
+  TRY(reaches(step, dq, dp) ? OK : NOT_FINITE);
   memcpy(memory, kept, sizeof kept);
   return OK;
 }

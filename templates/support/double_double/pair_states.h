@@ -21,7 +21,6 @@ static inline int store_pairs(const dd *x, double *words)
 static inline int transform_of_pairs(dd t, dd *u, const double *parameters, dd *y, double *workspace)
 {
   dd value[M + MASS_ENTRIES];
-  (void)workspace;
   legendre_pairs(u, t, parameters, value);
   memcpy(y, value, sizeof(dd) * M);
   return OK;
@@ -37,8 +36,7 @@ static inline int correct_transform(dd t, dd *u, const dd *y, const double *para
   for (int i = 0; i < 2 * M; i++)
     high[i] = u[i].high;
   transform_and_derivatives(t.high, high, parameters, value, workspace);
-  if (!factorise(workspace, &shape, pivot))
-    return SINGULAR;
+  TRY(factorise(workspace, &shape, pivot) ? OK : SINGULAR);
   for (int k = 0; k < CORRECTIONS; k++) {
     dd now[M];
     transform_of_pairs(t, u, parameters, now, NULL);
@@ -60,7 +58,6 @@ static inline int invert_pairs(dd t, dd *u, const dd *y, const double *parameter
   memcpy(u + M, y, sizeof(dd) * M);
   inverse_legendre_pairs(u, t, parameters, x);
   memcpy(u + M, x, sizeof x);
-  (void)workspace;
   return OK;
 #else
   double q[M], high[M], value[M];
@@ -96,7 +93,6 @@ static inline int state_transform(int inverse, dd t, const dd *q, const dd *x, c
 static inline int momenta_of(dd t, const dd *q, const dd *v, const double *parameters, dd *p, double *workspace)
 {
 #ifdef FIRST_ORDER_SYSTEM
-  (void)t, (void)q, (void)v, (void)parameters, (void)p, (void)workspace;
   return SINGULAR;
 #else
   return state_transform(MOMENTA_INVERTED, t, q, v, parameters, p, workspace);
@@ -118,17 +114,14 @@ static inline int velocities_of(dd t, const dd *q, const dd *p, const double *pa
   for (int e = 0; e < MASS_ENTRIES; e++)
     workspace[shape.first + MASS_POSITION[MASS_ENTRY[e][0]] * shape.stride + MASS_POSITION[MASS_ENTRY[e][1]]] =
         theta[M + e].high;
-  if (!all_finite(workspace, (int)band_size(&shape)))
-    return NOT_FINITE;
-  if (!factorise(workspace, &shape, pivot))
-    return SINGULAR;
+  TRY(all_finite(workspace, (int)band_size(&shape)) ? OK : NOT_FINITE);
+  TRY(factorise(workspace, &shape, pivot) ? OK : SINGULAR);
   memset(v, 0, sizeof(dd) * M);
   for (int k = 0; k < SOLUTIONS; k++) {
     dd rest[M];
     memcpy(rest, rates, sizeof rest);
     for (int e = 0; e < MASS_ENTRIES; e++)
-      rest[MASS_ENTRY[e][1]] =
-          dd_subtract(rest[MASS_ENTRY[e][1]], dd_multiply(theta[M + e], v[MASS_ENTRY[e][0]]));
+      rest[MASS_ENTRY[e][1]] = dd_subtract(rest[MASS_ENTRY[e][1]], dd_multiply(theta[M + e], v[MASS_ENTRY[e][0]]));
     for (int i = 0; i < M; i++)
       right[MASS_POSITION[i]] = rest[i].high;
     back_substitute(workspace, &shape, pivot, right);
@@ -144,7 +137,6 @@ static inline int velocities_of(dd t, const dd *q, const dd *p, const double *pa
 static inline int momenta_of(dd t, const dd *q, const dd *v, const double *parameters, dd *p, double *workspace)
 {
   dd masses[M];
-  (void)q, (void)workspace;
   mass_pairs(NULL, t, parameters, masses);
   for (int i = 0; i < M; i++)
     p[i] = dd_multiply(masses[i], v[i]);
@@ -154,7 +146,6 @@ static inline int momenta_of(dd t, const dd *q, const dd *v, const double *param
 static inline int velocities_of(dd t, const dd *q, const dd *p, const double *parameters, dd *v, double *workspace)
 {
   dd masses[M];
-  (void)q, (void)workspace;
   mass_pairs(NULL, t, parameters, masses);
   for (int i = 0; i < M; i++)
     v[i] = dd_divide(p[i], masses[i]);

@@ -4,11 +4,7 @@ static inline ddl ddl_of(dd x)
   return (ddl){lanes_of(x.high), lanes_of(x.low)};
 }
 
-static inline ddl ddl_of_words(lanes high, lanes low)
-{
-  return (ddl){high, low};
-}
-
+#define ddl_of_words(high_words, low_words) ((ddl){high_words, low_words})
 #define PARAMETER_OF_LANES(i) ddl_of_words(parameters[i], parameters[PARAMETERS + (i)])
 
 /* Lane j. */

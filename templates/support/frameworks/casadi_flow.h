@@ -1,7 +1,7 @@
 #include "flow.h"
 
 /* Flow of FLOW_STEPS steps with a state stored every FLOW_EVERY steps, and its derivatives, under the names by which
- * CasADi finds external functions. Requires: flow.h; EXTERNAL, which forms these names. */
+ * CasADi finds external functions. Requires: EXTERNAL, which forms these names. */
 
 typedef long long casadi_int;
 
@@ -52,7 +52,6 @@ static int external_flow(flow_part part, int count, const double *x, const doubl
 
 int EXTERNAL(, )(const double **arg, double **res, casadi_int *iw, double *w, int mem)
 {
-  (void)iw, (void)w, (void)mem;
   return external_flow(FLOW_STATES, 0, arg[0], NULL, res[0]);
 }
 
@@ -60,7 +59,6 @@ int EXTERNAL(, )(const double **arg, double **res, casadi_int *iw, double *w, in
 int EXTERNAL(jac_, )(const double **arg, double **res, casadi_int *iw, double *w, int mem)
 {
   double each[STEP_INPUTS * STEP_INPUTS] = {0};
-  (void)iw, (void)w, (void)mem;
   for (int i = 0; i < STEP_INPUTS; i++)
     each[i * STEP_INPUTS + i] = 1;
   return external_flow(FLOW_JVP, STEP_INPUTS, arg[0], each, res[0]);
@@ -69,14 +67,13 @@ int EXTERNAL(jac_, )(const double **arg, double **res, casadi_int *iw, double *w
 /* Gradient with respect to the inputs from the adjoint variables of the states (VJP). */
 int EXTERNAL(adj1_, )(const double **arg, double **res, casadi_int *iw, double *w, int mem)
 {
-  (void)iw, (void)w, (void)mem;
   if (!arg[2] && res[0])
     memset(res[0], 0, sizeof(double) * STEP_INPUTS);
   return arg[2] && external_flow(FLOW_VJP, 1, arg[0], arg[2], res[0]);
 }
 
 #ifdef SECOND_DERIVATIVES
-/* Jacobian of the adjoint of a flow for CasADi: exact second derivatives. Requires: flow.h. */
+/* Jacobian of the adjoint of a flow for CasADi: exact second derivatives. */
 
 static const casadi_int NO_INPUT_SHAPE[2 + 1 + 1] = {STEP_INPUTS, 1};
 static const casadi_int HESSIAN_SHAPE[] = {STEP_INPUTS, STEP_INPUTS, 1};
@@ -121,7 +118,6 @@ static int external_transposed(const double *x, double *found)
 int EXTERNAL(jac_adj1_, )(const double **arg, double **res, casadi_int *iw, double *w, int mem)
 {
   int status = OK;
-  (void)iw, (void)w, (void)mem;
   if (res[0] && !arg[2])
     memset(res[0], 0, sizeof(double) * STEP_INPUTS * STEP_INPUTS);
   if (res[0] && arg[2])

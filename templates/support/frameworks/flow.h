@@ -35,11 +35,6 @@ typedef struct {
   real *workspace;
 } flow_call;
 
-static long long kept_states(const flow_call *way)
-{
-  return way->steps / way->every + 1;
-}
-
 /* Numbers of all vectors of inputs. */
 static long long numbers_across(const flow_call *way)
 {
@@ -153,7 +148,7 @@ static int propagate_chunk_of_steps(const flow_call *way, const real *x, long lo
  * is not stored. */
 static long long state_offset(const flow_call *way, long long step, int c)
 {
-  return step % way->every ? -1 : (c * kept_states(way) + step / way->every) * FLOW_STATE;
+  return step % way->every ? -1 : (c * (way->steps / way->every + 1) + step / way->every) * FLOW_STATE;
 }
 
 static void store_tangents(const flow_call *way, long long step, const real *vectors, real *changes)
@@ -251,7 +246,6 @@ static int hessian_along(const flow_call *way, const real *x, const real *kept, 
 static int flow_row(flow_part part, const flow_call *way, const real *x, const real *given, const real *changes,
     real *found, solver_report *report)
 {
-  (void)changes;
   if (part == FLOW_STATES)
     return follow(way, x, way->every, found, report);
   TRY(follow(way, x, 1, way->states, report));
@@ -269,8 +263,9 @@ static int flow_row(flow_part part, const flow_call *way, const real *x, const r
 static int flow_rows(flow_part part, flow_call *way, long long rows, const real *x, const real *given,
     const real *changes, real *found, solver_report *report)
 {
-  const long long states = kept_states(way) * FLOW_STATE, across = numbers_across(way), values = way->count * states;
-  const long long directions = part == FLOW_JVP ? across : values, results[] = {states, values, across, across};
+  const long long states = (way->steps / way->every + 1) * FLOW_STATE, values = way->count * states;
+  const long long across = numbers_across(way), directions = part == FLOW_JVP ? across : values;
+  const long long results[] = {states, values, across, across};
   int status = OK;
   memset(report, 0, sizeof *report);
   if (!allocate_flow(part, way))

@@ -1,6 +1,9 @@
 /* Instances of an FMU and their modes (FMI 3.0, co-simulation). Requires: the integrator's header, the FMI header, and
  * NAME, STATUS, WORKSPACE, TOKEN, STEP, M, PARAMETERS, BY_VELOCITY, and the start values. */
 
+#ifdef __GNUC__
+#pragma GCC diagnostic ignored "-Wunused-parameter" /* the standard has more of them than this FMU */
+#endif
 enum { LONGEST_MESSAGE = 240 };
 
 typedef NAME(run) run_memory;
@@ -90,16 +93,11 @@ static fmi3Status not_now(const fmu *one, const char *call)
 /* Description of a status of the integrator. */
 static const char *reason(int status)
 {
-  switch (status) {
-  case STATUS(NOT_CONVERGED):
-    return "the iteration on the stage equations did not converge: use a smaller step";
-  case STATUS(SINGULAR):
-    return "the Newton matrix or the mass matrix is singular";
-  case STATUS(NOT_FINITE):
-    return "a value is infinite or NaN";
-  default:
-    return "the iteration converged to a spurious solution of the stage equations: use a smaller step";
-  }
+  static const char *const others[] = {"the iteration on the stage equations did not converge: use a smaller step",
+      "the Newton matrix or the mass matrix is singular", "a value is infinite or NaN"};
+  return status <= STATUS(NOT_FINITE)
+      ? others[status - STATUS(NOT_CONVERGED)]
+      : "the iteration converged to a spurious solution of the stage equations: use a smaller step";
 }
 
 static void set_start(fmu_state *now)
@@ -149,7 +147,6 @@ FMI_EXPORT fmi3Instance FMI(InstantiateCoSimulation)(fmi3String name, fmi3String
   fmu *one = calloc(1, sizeof *one);
   const char *wrong = NULL;
   bool without_events = true;
-  (void)name, (void)resources, (void)visible, (void)required, (void)update;
 #ifdef EVENT_SETTINGS
   without_events = false;
 #endif
@@ -198,7 +195,6 @@ FMI_EXPORT fmi3Status FMI(EnterInitializationMode)(fmi3Instance instance, fmi3Bo
     fmi3Float64 start, fmi3Boolean stops, fmi3Float64 stop)
 {
   fmu *one = instance;
-  (void)tolerant, (void)tolerance, (void)stops, (void)stop;
   if (one->now.mode != INSTANTIATED)
     return not_now(one, "fmi3EnterInitializationMode");
   if (0 * start != 0)
@@ -302,7 +298,6 @@ FMI_EXPORT fmi3Status FMI(SetFloat64)(fmi3Instance instance, const fmi3ValueRefe
 static inline int no_constraints(double t, const double *q0, const double *p0, const double *parameters, double *q1,
     double *p1, double *workspace)
 {
-  (void)t, (void)parameters, (void)workspace;
   memcpy(q1, q0, sizeof(double) * M);
   memcpy(p1, p0, sizeof(double) * M);
   return STATUS(OK);
@@ -447,7 +442,6 @@ FMI_EXPORT fmi3Status FMI(DoStep)(fmi3Instance instance, fmi3Float64 point, fmi3
   run_memory *run = &one->now.run;
   run_report report;
   int status;
-  (void)no_return;
   if (one->now.mode != STEP_MODE)
     return not_now(one, "fmi3DoStep");
   if (!(fabs(point - run->t) <= MISTAKEN * slack_at(point)))
@@ -485,7 +479,6 @@ FMI_EXPORT fmi3Status FMI(UpdateDiscreteStates)(fmi3Instance instance, fmi3Boole
     fmi3Boolean *nominals, fmi3Boolean *states, fmi3Boolean *defined, fmi3Float64 *time)
 {
   fmu *one = instance;
-  (void)time;
   if (one->now.mode != EVENT_MODE)
     return not_now(one, "fmi3UpdateDiscreteStates");
   *again = *terminate = *nominals = *states = *defined = false;
@@ -537,7 +530,6 @@ FMI_EXPORT fmi3Status FMI(SetFMUState)(fmi3Instance instance, fmi3FMUState state
 
 FMI_EXPORT fmi3Status FMI(FreeFMUState)(fmi3Instance instance, fmi3FMUState *state)
 {
-  (void)instance;
   if (state) {
     free(*state);
     *state = NULL;
@@ -547,7 +539,6 @@ FMI_EXPORT fmi3Status FMI(FreeFMUState)(fmi3Instance instance, fmi3FMUState *sta
 
 FMI_EXPORT fmi3Status FMI(SerializedFMUStateSize)(fmi3Instance instance, fmi3FMUState state, size_t *size)
 {
-  (void)instance, (void)state;
   *size = sizeof(fmu_state);
   return fmi3OK;
 }

@@ -3,10 +3,6 @@
 /* Functions that FMI 3.0 requires and this FMU does not support: variables of other types, events, clocks,
  * derivatives, model exchange, scheduled execution. Each returns an error. */
 
-#if defined(__GNUC__) || defined(__clang__)
-#pragma GCC diagnostic ignored "-Wunused-parameter"
-#endif
-
 #define ABSENT(word, ...)                                                       \
   FMI_EXPORT fmi3Status FMI(word)(fmi3Instance instance, __VA_ARGS__)           \
   {                                                                             \

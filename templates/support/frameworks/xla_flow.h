@@ -1,6 +1,6 @@
 #include "flow.h"
 
-/* Flow as XLA custom calls through the XLA FFI. Requires: flow.h. */
+/* Flow as XLA custom calls through the XLA FFI. */
 #include <stdio.h>
 
 #include "xla/ffi/api/c_api.h"

@@ -3,8 +3,8 @@
 /* Fixed-point iteration of a collocation method, z_n = h a(q_n, v_n) on the curve of curve.h. The momenta at the ends
  * are quadratures of the action (NODES) or Legendre transforms. */
 #ifdef NODES
-/* Momenta at both ends of a curve by quadrature of the action; p0 determines the initial velocity. Requires:
- * curve.h, the tables of the contributions of the points to p0 and p1, the kernel action_lanes. */
+/* Momenta at both ends of a curve by quadrature of the action; p0 determines the initial velocity. Requires: the tables
+ * of the contributions of the points to p0 and p1, the kernel action_lanes. */
 typedef struct {
   lanes start, end; /* h times the weights of forces */
 } iteration_data;
@@ -41,24 +41,15 @@ static inline void momentum_increment(const step_data *step, const iteration_dat
     const double *dq, double *dp)
 {
   lanes action[2 * M];
-  (void)dq;
   act(step, curve, action);
   for (int i = 0; i < M; i++)
     dp[i] = lanes_total(data->end * action[i] + END_MOMENTUM * action[M + i]);
 }
 #else
-/* Momentum at the end of a curve by the Legendre transform of the velocity there; the initial velocity is known.
- * Requires: curve.h. */
-typedef struct {
-  int unused;
-} iteration_data;
+/* Momentum at the end of a curve by the Legendre transform of the velocity there; the initial velocity is known. */
+typedef int iteration_data; /* not used */
 
-static void prepare_iteration(const step_data *step, iteration_data *data)
-{
-  (void)step;
-  data->unused = 0;
-}
-
+#define prepare_iteration(step, data) (void)(*(data) = 0)
 #define correct_start(step, data, mass, inverse_size, curve) 0.0
 
 /* p1 - p0, with p1 the momentum at the end of a curve with the increment dq; NaN if it is undefined. */
@@ -66,7 +57,6 @@ static void momentum_increment(const step_data *step, const iteration_data *data
     const double *dq, double *dp)
 {
   double u[2 * M];
-  (void)data;
   for (int i = 0; i < M; i++) {
     u[i] = step->q0[i] + (step->carry_q[i] + dq[i]);
     u[M + i] = end_velocity(curve, i);
@@ -79,8 +69,8 @@ static void momentum_increment(const step_data *step, const iteration_data *data
 }
 #endif
 
-/* Step of a collocation method by fixed-point iteration. Requires: curve.h, the momenta at the ends of a curve, the
- * table NODE_TIME, the kernel applied_force_lanes. */
+/* Step of a collocation method by fixed-point iteration. Requires: the momenta at the ends of a curve, the table
+ * NODE_TIME, the kernel applied_force_lanes. */
 
 /* Computes the increments of one step. Each iteration corrects the accelerations at the nodes and, where it is unknown,
  * the initial velocity. On failure the increments are undefined. */
@@ -121,8 +111,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   TRY(outcome(&now, report));
   end_increment(step, &curve, dq);
   momentum_increment(step, data, &curve, dq, dp);
-  if (!accept(step, dq, dp, report))
-    return NOT_FINITE;
+  TRY(accept(step, dq, dp));
   save_curve(&curve, past);
   *steps = next_guess(*steps, &now, report);
   return OK;

@@ -130,8 +130,6 @@ static inline void add_largest_of_arrays(number *size)
     for (int i = coupled[k][0]; i < coupled[k][1]; i++)
       size[i] += largest;
   }
-#else
-  (void)size;
 #endif
 }
 

@@ -18,8 +18,8 @@ static inline void place(const step_data *step, int n, lanes (*scaled)[M], lanes
 }
 
 #ifdef FOLLOWED
-/* Velocity corrections from residual momenta r, with forces and momenta linearised in the correction. Requires:
- * point_weights.h, a mass. */
+/* Velocity corrections from residual momenta r, with forces and momenta linearised in the correction. Requires: a mass.
+ * */
 enum { VALUES = 2 * M + 3 * M * M }; /* of point_lanes: forces, momenta; F_q, F_v, P_q by rows */
 
 /* Product of a matrix row and x. */
@@ -70,21 +70,19 @@ static inline void converged_forces(const step_data *step, const iteration_data 
     lanes (*z)[M], lanes (*r)[M], lanes (*F)[M])
 {
   lanes momentum[GROUPS][M];
-  (void)step, (void)z;
   forces_follow(data, value, r, F, momentum);
   for (int n = 0; n < GROUPS; n++)
     for (int i = 0; i < M; i++)
       F[n][i] += value[n][i];
 }
 #else
-/* Velocity corrections mass^-1 r from residual momenta r, with forces and momenta frozen. Requires: point_weights.h, a
- * mass, the kernel force_lanes. */
+/* Velocity corrections mass^-1 r from residual momenta r, with forces and momenta frozen. Requires: a mass, the kernel
+ * force_lanes. */
 enum { VALUES = 2 * M }; /* of point_lanes: forces, momenta */
 
 /* r = mass^-1 r at all points. */
 static inline void correct(const iteration_data *data, lanes (*value)[VALUES], lanes (*mass)[MASS], lanes (*r)[M])
 {
-  (void)data, (void)value;
   for (int n = 0; n < GROUPS; n++)
     solve_mass(mass[n], r[n]);
 }
@@ -94,7 +92,6 @@ static inline void converged_forces(const step_data *step, const iteration_data 
     lanes (*z)[M], lanes (*r)[M], lanes (*F)[M])
 {
   lanes u[2 * M], scaled[GROUPS][M];
-  (void)value, (void)r;
   scale(data->position_weight, z, scaled);
   for (int n = 0; n < GROUPS; n++) {
     place(step, n, scaled, z, u);

@@ -36,8 +36,6 @@ static __attribute__((noinline)) void keep_early(const step_data *step, const it
   coordinates F[S];
   converged_forces(step, data, value, z, r, F);
   store_early(now, F[0], stored[1][0]);
-#else
-  (void)step, (void)data, (void)value, (void)r;
 #endif
   store_early(now, z[0], stored[0][0]);
   mark_stored(now);
@@ -136,11 +134,8 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
       for (int i = 0; i < M; i++)
         z[n][i] += r[n][i];
 #endif
-    if (k == 0) {
-      for (int i = 0; i < M; i++)
-        inverse_size[i] = magnitude(at_start(z, i)) + magnitude(at_end(z, i));
-      invert_sizes(options, fabs(step->h), inverse_size);
-    }
+    if (k == 0)
+      measure_ends(z[0], M, options, fabs(step->h), inverse_size);
     for (int n = 0; n < GROUPS; n++)
       for (int i = 0; i < M; i++) {
         const lanes moved = r[n][i] * inverse_size[i];
@@ -179,8 +174,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
     dp[i] = data->damping.shrunk * dp[i] + data->damping.loss * (step->p0[i] + step->carry_p[i]);
 #endif
   }
-  if (!accept(step, dq, dp, report))
-    return NOT_FINITE;
+  TRY(accept(step, dq, dp));
   remember_curve(z, past);
 #ifdef MIXED_VELOCITIES
   if (step->points) {

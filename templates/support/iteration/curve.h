@@ -26,7 +26,7 @@ static int nearby_velocity(const step_data *step, double *v0)
 #define nearby_velocity(step, v0) OK
 #endif
 
-/* Requires: one_trajectory.h, a mass, the tables COLLOCATION, NODE_END, NODE_MASK, whose column j multiplies node j. */
+/* Requires: a mass, the tables COLLOCATION, NODE_END, NODE_MASK, whose column j multiplies node j. */
 typedef struct {
   double v0[M];
   lanes z[1][M];
@@ -42,7 +42,7 @@ static void save_curve(curve_data *curve, history past)
 
 static inline lanes apply_to(const lanes *table, lanes x)
 {
-  return lanes_apply(table, &x);
+  return contribution_of_points(table, 0, &x, 1);
 }
 
 /* v1 = v0 + sum b z. */

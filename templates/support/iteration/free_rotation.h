@@ -53,8 +53,7 @@ static inline free_body sorted_axes(const int *axes, const real *rates)
   a[axes[1]] += rates[2];
   const int low = a[0] < a[1], end = low == (a[2] < a[0]) ? 0 : 2, middle = low == (a[1] < a[2]) ? 1 : end;
   const int m = rates[1] == 0 ? (axes[1] + 2) % 3 : middle, l = (m + 2) % 3, s = (m + 1) % 3;
-  const free_body body = {l, m, s, a[m], a[s], a[l] - a[s], a[m] - a[s], a[l] - a[m]};
-  return body;
+  return (free_body){l, m, s, a[m], a[s], a[l] - a[s], a[m] - a[s], a[l] - a[m]};
 }
 
 /* Computes g with 1 + g = exp(t a_m Pi/2) exp(t (a_s - a_m) Pi_s e_s/2) for a_l = a_m and a constant s. */
@@ -92,12 +91,11 @@ static inline elliptic elliptic_by_series(real t, real A, real B, real N)
   const real sigma = t * (1 - p / 6 + (p2 + 12 * q) / 120 - p * (p2 + 132 * q) / 5040);
   const real x = A * sigma * sigma, y = B * sigma * sigma, fourth = 2 * p2 / 45 + q / 5 + r * (2 * p / 3 + r);
   const real sixth = p2 * p / 315 + 3 * p * q / 35 + r * ((p2 + 2 * q) / 5 + r * (p + r));
-  const elliptic at = {.sigma = sigma,
+  return (elliptic){.sigma = sigma,
       .cn = 1 - x * (OVER(2) + x * (OVER(8) + x * (OVER(16) + x * (5 * OVER(128))))),
       .dn = 1 - y * (OVER(2) + y * (OVER(8) + y * (OVER(16) + y * (5 * OVER(128))))),
       .cosine = 1,
       .sine = t * t2 * (OVER(3) - (p / 3 + r) / 5 + fourth / 7 - sixth / 9)};
-  return at;
 }
 
 /* Multiplies exp(i Theta) by x + i y. */

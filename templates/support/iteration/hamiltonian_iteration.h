@@ -37,16 +37,6 @@ static inline void push(const step_data *step, const iteration_data *data, lanes
 #include "moving_frame.h"
 #else
 
-/* 1 / the size of x at both ends of the step, which makes its changes relative, or `absolute`; groups of points are
- * `apart` elements apart. */
-static inline void measure_ends(const lanes *x, int apart, const solver_options *options, real absolute,
-    number *inverse_size)
-{
-  for (int i = 0; i < M; i++)
-    inverse_size[i] = magnitude(at_first(&x[i])) + magnitude(at_last(&x[i], apart));
-  invert_sizes(options, absolute, inverse_size);
-}
-
 /* Forces at the points. */
 static inline void forces(const step_data *step, lanes (*u)[2 * M], lanes (*force)[M])
 {
@@ -214,8 +204,7 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
 #ifdef TURNS
   turn_step(step, past, z, force, dq, dp);
 #endif
-  if (!accept(step, dq, dp, report))
-    return NOT_FINITE;
+  TRY(accept(step, dq, dp));
   remember_curve(z, past);
   remember_curve(force, second_curve(past));
   *steps = next_guess(*steps, &now, report);

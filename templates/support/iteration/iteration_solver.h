@@ -21,7 +21,6 @@ static SELDOM int fall_back(int status, const step_data *step, double *dq, doubl
   newton_data *newtons = newton_in(workspace);
   const long long before = report->iterations;
   int keep;
-  (void)measure;
 #ifdef MIXED_VELOCITIES
   if (step->points)
     ((solved_step *)step->points)->by_iteration = 0;
@@ -46,14 +45,10 @@ static int has_masses(const solver_data *data)
     if (!(fabs(data->inverse_mass[i]) < INFINITY))
       return 0;
 #endif
-  (void)data;
   return 1;
 }
 
-static void prepare(const step_data *step, solver_data *data)
-{
-  prepare_iteration(step, data);
-}
+#define prepare prepare_iteration
 
 /* Computes the increments by fixed-point iteration from the straight line unless it is suspended, else by fall_back. */
 static __attribute__((noinline)) int solve_afresh(const step_data *step, const solver_data *data, history memory,

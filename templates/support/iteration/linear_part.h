@@ -15,12 +15,6 @@ typedef struct {
   double stiffness[LINEAR_ENTRIES], mass[M]; /* mass by places */
 } linear_part;
 
-/* Number of coupled places before place i. */
-static inline int places_before(int i)
-{
-  return i < LINEAR_BAND ? i : LINEAR_BAND;
-}
-
 static void factorise_linear_part(const double *parameters, double square, const double *inverse_mass, linear_part *all)
 {
   const complex_shifts mu = {shifts_at(MU), shifts_at(MU + SHIFTS)};
@@ -47,7 +41,7 @@ static void factorise_linear_part(const double *parameters, double square, const
     at->re += entry * mu.re, at->im += entry * mu.im;
   }
   for (int i = 0; i < M; i++) {
-    const int first = places_before(i);
+    const int first = least(i, LINEAR_BAND); /* coupled places before */
     complex_shifts *row = all->row[i], pivot = row[0];
     for (int d = first; d > 0; d--) /* L D, then L */
       for (int k = d + 1; k <= first; k++)
@@ -68,7 +62,7 @@ static void solve_linear_part(const linear_part *all, lanes *r)
   complex_shifts z[M];
   for (int i = 0; i < M; i++) {
     z[i] = into_shifts(r + LINEAR_COORDINATE[i], M, all->mass[i]);
-    for (int d = places_before(i); d > 0; d--)
+    for (int d = least(i, LINEAR_BAND); d > 0; d--)
       z[i] = minus_product(z[i], all->row[i][d], z[i - d]);
   }
   for (int i = M - 1; i >= 0; i--) {

@@ -2,8 +2,8 @@
 #include "../core/stagnation.h"
 
 /* Fixed-point iteration of many trajectories, which are SIMD lanes: predictor and termination. A step fails for single
- * trajectories, which become inactive, never for all. Requires: trajectories.h, stagnation.h, and the tables
- * LAST_ALONE, LAST, BEFORE, which extrapolate stored values into the next step. */
+ * trajectories, which become inactive, never for all. Requires: the tables LAST_ALONE, LAST, BEFORE, which extrapolate
+ * stored values into the next step. */
 
 /* The second curve of stored values. */
 static inline history second_curve(history past)
@@ -39,7 +39,6 @@ static __attribute__((noinline)) void continue_differently(history past, long lo
 /* Extrapolates the stored values into this step from the last one or from the last two. */
 static inline void continue_curve(const step_data *step, history past, long long steps, lanes (*x)[M])
 {
-  (void)step;
   if (steps != 1 && steps != TWO_STEPS) {
     continue_differently(past, steps, x);
     return;
@@ -54,10 +53,7 @@ static inline void continue_curve(const step_data *step, history past, long long
   }
 }
 
-static inline void remember_curve(lanes (*x)[M], history past)
-{
-  (void)x, (void)past; /* computed in place (kept) */
-}
+#define remember_curve(x, past) (void)0 /* computed in place (kept) */
 
 /* Velocities of the straight line; they are stored before the first step. */
 #define start_velocities(step, z) OK
@@ -78,10 +74,7 @@ static inline progress before_iterations(void)
   return now;
 }
 
-static inline int needs_iteration(const progress *now)
-{
-  return now->pending;
-}
+#define needs_iteration(now) ((now)->pending)
 
 /* Each trajectory has the status of the first iteration that decided it; others may require more iterations. Changes at
  * the level of rounding are random: those of many trajectories rarely meet the criterion in the same iteration. */
@@ -188,11 +181,7 @@ static inline int is_stagnant(progress *now, const solver_options *options, int 
   return decide_if(stagnates, now, options, k, 0);
 }
 
-/* Where is_stagnant returned 1. */
-static inline lanes stagnant(const progress *now)
-{
-  return now->stagnant;
-}
+#define stagnant(now) ((now)->stagnant) /* where is_stagnant returned 1 */
 
 static inline int must_amplify(progress *now, const solver_options *options, int k)
 {
@@ -203,10 +192,7 @@ static inline int must_amplify(progress *now, const solver_options *options, int
   return decide_if(undecided, now, options, k, 1);
 }
 
-static inline lanes amplification(const progress *now)
-{
-  return now->amplification;
-}
+#define amplification(now) ((now)->amplification)
 
 /* Returns 1 if the values of trajectories have to be stored, which have converged before others. */
 static inline int converge_early(const progress *now)
@@ -249,7 +235,7 @@ static inline int outcome(const progress *now, const solver_report *report)
   return OK;
 }
 
-#define accept(step, dq, dp, report) 1
+#define accept(step, dq, dp) OK
 
 static inline long long next_guess(long long steps, const progress *now, const solver_report *report)
 {

@@ -300,8 +300,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   for (int i = 0; i < M; i++)
     dp[i] = weigh(POINT_END_MOMENTUM, scaled, i);
   out_of_frame(step, &state, dq, dp);
-  if (!accept(step, dq, dp, report))
-    return NOT_FINITE;
+  TRY(accept(step, dq, dp));
   remember_curve(curve, past);
   remember_curve(force, past + 2 * M * POINTS);
   *steps = next_guess(*steps, &now, report);

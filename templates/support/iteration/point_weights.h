@@ -1,4 +1,4 @@
-#include "../core/vectors.h"
+#include "convergence.h"
 
 /* Quadrature weights times h, constant during a run. Requires: the tables; with damping, damped_points.h. */
 typedef struct {
@@ -26,3 +26,15 @@ static inline void scale(const weight *weights, lanes (*x)[M], lanes (*scaled)[M
     for (int i = 0; i < M; i++)
       scaled[n][i] = weights[n] * x[n][i];
 }
+
+#ifndef ARRAYS
+/* 1 / the size of x at both ends of the step, which makes its changes relative, or `absolute`; groups of points are
+ * `apart` elements apart. */
+static inline void measure_ends(const lanes *x, int apart, const solver_options *options, real absolute,
+    number *inverse_size)
+{
+  for (int i = 0; i < M; i++)
+    inverse_size[i] = magnitude(at_first(&x[i])) + magnitude(at_last(&x[i], apart));
+  invert_sizes(options, absolute, inverse_size);
+}
+#endif

@@ -184,8 +184,7 @@ PASS end_increments increments_of(const step_points *w, long long i)
   const number kick = data->inverse_mass[i] * (data->square * sum), q = of.high + kick, part = q - of.high;
   end_increments end;
   end.q = q;
-  end.q_low =
-      (of.high - (q - part)) + (kick - part) + (of.low + data->inverse_mass[i] * (data->square_low * sum));
+  end.q_low = (of.high - (q - part)) + (kick - part) + (of.low + data->inverse_mass[i] * (data->square_low * sum));
   end.p = weigh_forces(w, data->kick, data->kick_low, momentum, i);
   return end;
 }
@@ -300,8 +299,7 @@ static void prepare_iteration(const step_data *step, iteration_data *data)
 
 static step_points points_in(const step_data *step, const iteration_data *data, history past)
 {
-  return (step_points){step, data, step->work->X, past.now, step->n, step->work->inverse_size, NULL, NULL,
-      NULL};
+  return (step_points){step, data, step->work->X, past.now, step->n, step->work->inverse_size, NULL, NULL, NULL};
 }
 
 static void forces(const step_points *w)
@@ -620,8 +618,7 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
     find_rough_increments(&w, dq, dp);
   else
     find_increments(&w, own, dq, dp);
-  if (!accept(step, dq, dp, report))
-    return NOT_FINITE;
+  TRY(accept(step, dq, dp));
 #ifndef ARRAYS
   remember_curve(F, past);
 #endif

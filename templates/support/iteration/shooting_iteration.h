@@ -3,8 +3,8 @@
 #include "mass_matrix.h"
 
 /* Fixed-point iteration of a step of a shooting-based variational method (SCVI; Li, Wu & Leok, eqs. (33)-(34), in the
- * stationary form, with multipliers of the collocation equations). Requires: curve.h, the tables, the kernels
- * node_lanes and action_lanes. */
+ * stationary form, with multipliers of the collocation equations). Requires: the tables, the kernels node_lanes and
+ * action_lanes. */
 #define ROUNDING_MARGIN 0.25 /* after one converged iteration, variations are rounding errors and do not decrease */
 
 typedef struct {
@@ -127,8 +127,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   end_increment(step, &curve, dq);
   for (int i = 0; i < M; i++)
     dp[i] = momentum_increment(step, data, action[i], node[M + i]);
-  if (!accept(step, dq, dp, report))
-    return NOT_FINITE;
+  TRY(accept(step, dq, dp));
   save_curve(&curve, past);
   memcpy(past + CURVE_MEMORY, m, sizeof m);
 #ifdef RUN_ACTION
@@ -143,7 +142,6 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
 static inline void integrals_of_iteration(const step_data *step, const iteration_data *data, const double *memory,
     double *sum)
 {
-  (void)step, (void)data;
   *sum = memory[MEMORY - 1];
 }
 #endif

@@ -33,7 +33,6 @@ static void prepare(const step_data *step, solver_data *data)
   for (int k = 0; k < BODIES; k++)
     data->bodies[k] = sorted_axes(BODY[k] + 1, rates + 3 * k);
 #else
-  (void)step;
   data->unused = 0;
 #endif
 }
@@ -60,8 +59,6 @@ SPLITTING int solve(const step_data *step, const solver_data *data, real *memory
     const solver_options *options, solver_report *report, real *workspace)
 {
   real F[M], acted[2];
-  (void)options;
-  (void)workspace;
   memcpy(F, memory, sizeof F);
 #ifdef RUN_ACTION
   acted[0] = memory[M];
@@ -72,8 +69,7 @@ SPLITTING int solve(const step_data *step, const solver_data *data, real *memory
 #endif
   leap(step, data, *guess > 0, F, dq, dp, acted);
   report->iterations++;
-  if (!reaches(step, dq, dp))
-    return NOT_FINITE;
+  TRY(reaches(step, dq, dp) ? OK : NOT_FINITE);
   memcpy(memory, F, sizeof F);
 #ifdef RUN_ACTION
   memory[M] = acted[0], memory[M + 1] = acted[1];
@@ -84,16 +80,12 @@ SPLITTING int solve(const step_data *step, const solver_data *data, real *memory
 #else
 typedef solver_data iteration_data;
 
-static void prepare_iteration(const step_data *step, iteration_data *data)
-{
-  prepare(step, data);
-}
+#define prepare_iteration prepare
 
 /* Computes the increments of one step of each trajectory; the last step has stored its last force. */
 static inline void fixed_point(const step_data *step, const iteration_data *data, history past, long long *guess,
     lanes *dq, lanes *dp, const solver_options *options, solver_report *report)
 {
-  (void)options;
   number acted[2];
   memcpy(past.before[0], past.last[0], sizeof(lanes) * M);
   leap(step, data, *guess > 0, past.before[0], dq, dp, acted);

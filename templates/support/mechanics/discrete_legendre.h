@@ -9,7 +9,6 @@ int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q1, cons
 {
   const real *ends[2] = {q0, q1};
   real p[M], F[2][M], product = 0, sum = 0, energy;
-  (void)options;
   if (report)
     memset(report, 0, sizeof *report);
   mass(NULL, t, parameters, p);
@@ -35,13 +34,12 @@ int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q1, cons
 #include "../newton/newton_between.h"
 
 /* Discrete Lagrangian L_d(q0, q1) and its discrete Legendre transforms p0 = -D1 L_d, p1 = D2 L_d (Marsden & West, Acta
- * Numerica 2001, sec. 1.3). On failure p0, p1 and the action are undefined. Requires: newton_between.h; sums_along,
- * which sums the Lagrangian along the curve z. */
+ * Numerica 2001, sec. 1.3). On failure p0, p1 and the action are undefined. Requires: sums_along, which sums the
+ * Lagrangian along the curve z. */
 
 SELDOM int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q1, const real *parameters,
     const solver_options *options, real *p0, real *p1, real *action, solver_report *report, real *workspace)
 {
-  const solver_options standard = NAME(default_options)();
   const real carry_q[M] = {0};
   solver_report unread;
   newton_data *data = newton_in(workspace + SCRATCH);
@@ -49,7 +47,7 @@ SELDOM int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q
   const step_data step = step_from(t, h, q0, start_p, carry_q, carry_q, parameters, workspace);
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
-  TRY(newton_between(&step, data, q1, start_p, increment, options ? options : &standard, report));
+  TRY(newton_between(&step, data, q1, start_p, increment, options ? options : &STANDARD_OPTIONS, report));
   for (int i = 0; i < M; i++) {
     p0[i] = start_p[i];
     p1[i] = start_p[i] + increment[i];
@@ -64,7 +62,6 @@ SELDOM int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q
 SELDOM int NAME(work_and_impulses)(real t, real h, const real *q0, const real *p0, const real *parameters,
     const solver_options *options, real *q1, real *p1, real *given, solver_report *report, real *workspace)
 {
-  const solver_options standard = NAME(default_options)();
   const real carry[M] = {0};
   newton_data *data = newton_in(workspace + SCRATCH);
   const step_data step = step_from(t, h, q0, p0, carry, carry, parameters, workspace);
@@ -74,11 +71,10 @@ SELDOM int NAME(work_and_impulses)(real t, real h, const real *q0, const real *p
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
   report->t = t;
-  TRY(newton_from_line(&step, data, dp, &keep, options ? options : &standard, report));
+  TRY(newton_from_line(&step, data, dp, &keep, options ? options : &STANDARD_OPTIONS, report));
   sums_along(&step, data->z, given);
   gather(END_POSITION, 1, h, data->z, M, dq, 0, 1);
-  if (!all_finite(given, SUMS) || !reaches(&step, dq, dp))
-    return NOT_FINITE;
+  TRY(all_finite(given, SUMS) && reaches(&step, dq, dp) ? OK : NOT_FINITE);
   for (int i = 0; i < M; i++) {
     q1[i] = q0[i] + dq[i];
     p1[i] = p0[i] + (dp[i] + dp[M + i]);

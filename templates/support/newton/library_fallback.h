@@ -3,7 +3,7 @@
 
 #include <string.h>
 
-/* Newton solver that one library provides to another, which has only the fixed-point iteration. Requires: step.h. */
+/* Newton solver that one library provides to another, which has only the fixed-point iteration. */
 
 /* Computes the increments of a step with their low words, and the relative error of its end if the stages determine it,
  * otherwise NaN. Both libraries have the same first members of the step and of the run to which it refers. */
@@ -26,7 +26,6 @@ static SELDOM int fall_back(int status, const step_data *step, double *dq, doubl
     solver_report *report, double *workspace, const error_measure *measure)
 {
   const fallback *library;
-  (void)status;
   memcpy(&library, step->scratch + SCRATCH - 1, sizeof library);
   if (!library)
     return STATUS(FALLBACK_REQUIRED);

@@ -18,11 +18,6 @@ typedef struct {
   real relative, overall, absolute, stages; /* stages: overall, of the positions of the stages alone */
 } movement;
 
-static movement no_movement(void)
-{
-  return (movement){0};
-}
-
 static void measure(movement *moved, const real *change, const real *size)
 {
   real largest_change = 0, largest_size = 0;
@@ -143,7 +138,6 @@ static int linearise(const step_data *step, newton_data *data, const band *shape
  * u = (q, y). There updates stagnate. */
 static SELDOM void add_sizes_of_arguments(const step_data *step, const real *z, real *size)
 {
-  (void)z;
 #ifdef CONSTRAINED
   const real by_reactions = displacement_by_reactions(step, z);
   add_constraint_sizes(step->t, step->q0, step->parameters, saddle_in(step->scratch), size);
@@ -164,8 +158,6 @@ static SELDOM void add_sizes_of_arguments(const step_data *step, const real *z, 
         size[i] += MATH(fabs)(step->h * (moved[i] - v[i])) / part;
     u[k] = before;
   }
-#else
-  (void)step, (void)size;
 #endif
 }
 
@@ -177,7 +169,7 @@ static int newton(const step_data *step, newton_data *data, const real *q1, real
 {
   const band shape = band_of(SITES, q1 ? B + 1 : B);
   real size_q[M], size_p[SITES], change[M], added[M] = {0}, last = (real)INFINITY;
-  movement moved = no_movement();
+  movement moved = {0};
   int trials = 0, stagnations = 0, slow = 0;
   memset(increment, 0, sizeof(real) * M);
   for (int k = 0;; k++) {
@@ -210,9 +202,8 @@ static int newton(const step_data *step, newton_data *data, const real *q1, real
     if (k >= least(options->max_iterations, MOST_ITERATIONS))
       return NOT_CONVERGED;
     trials = *keep ? trials + 1 : 3;
-    if (!*keep && !linearise(step, data, &shape))
-      return SINGULAR;
-    moved = no_movement();
+    TRY(*keep || linearise(step, data, &shape) ? OK : SINGULAR);
+    moved = (movement){0};
     apply_update(data, &shape, step->h, p0, size_p, size_q, &moved);
     *keep = has_converged(options, &moved, stagnations + has_stagnated(&moved, last), trials) ||
         (moved.overall < REUSE_CHANGE && moved.relative < REUSE_RATE * last);

@@ -1,6 +1,6 @@
 #include "newton.h"
 
-/* Newton's method for the step between two positions. Requires: newton.h. */
+/* Newton's method for the step between two positions. */
 
 /* Solves the stage equations with q1 given, from the straight line; p0 and the increment p1 - p0 are results. step->p0
  * must be p0. */

@@ -1,6 +1,6 @@
 #include "newton.h"
 
-/* Newton's method without previous steps. Requires: newton.h. */
+/* Newton's method without previous steps. */
 
 /* Initial guess: q moves on a straight line with its initial velocity. */
 static int line_from(const step_data *step, newton_data *data)
@@ -74,7 +74,6 @@ static SELDOM int is_spurious(const step_data *step, const real *z, const real *
     return 0;
   return !(MATH(pow)(stage_error(step, z, dq, ALL, DECAY, 0, 0), STAGE_POWER) <= MOST_ERROR);
 #else
-  (void)step, (void)z, (void)dq, (void)iterations;
   return 0;
 #endif
 }

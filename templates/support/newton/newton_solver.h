@@ -2,8 +2,8 @@
 #include "stages.h"
 #include "suspension.h"
 
-/* Step by Newton's method. Requires: newton.h, the table EXTRAPOLATION: the predictor is sum_c EXTRAPOLATION[c][b] z_c
- * of the previous step; for multipliers the rows from B on. */
+/* Step by Newton's method. Requires: the table EXTRAPOLATION: the predictor is sum_c EXTRAPOLATION[c][b] z_c of the
+ * previous step; for multipliers the rows from B on. */
 typedef struct {
   int rattle_alone; /* 1 if a step whose iteration of the multipliers fails is not solved by Newton's method */
 #ifdef RATTLE
@@ -20,8 +20,6 @@ static void prepare(const step_data *step, solver_data *data)
   if (step->points)
     invert_mass_pairs(step, data->rattle.inverse_mass, ((solved_step *)step->points)->inverse_mass);
 #endif
-#else
-  (void)step;
 #endif
 }
 
@@ -77,8 +75,7 @@ static int solve(const step_data *step, const solver_data *way, real *memory, lo
 #ifdef FIRST_ORDER_SYSTEM
   real theta[M];
   step_data with_momenta = *step;
-  if (transform(step->t, step->q0, step->p0, step->parameters, theta, step->scratch) != OK)
-    return NOT_FINITE;
+  TRY(transform(step->t, step->q0, step->p0, step->parameters, theta, step->scratch));
   with_momenta.theta0 = theta;
   step = &with_momenta;
 #endif
@@ -95,8 +92,6 @@ static int solve(const step_data *step, const solver_data *way, real *memory, lo
   falls_back = status != OK;
   if (falls_back && status != LOST_DIGITS && way->rattle_alone)
     return status;
-#else
-  (void)way;
 #endif
   if (status != OK && *guess) {
     guess_from(memory, data);
@@ -108,8 +103,7 @@ static int solve(const step_data *step, const solver_data *way, real *memory, lo
 #ifdef FIRST_ORDER_SYSTEM
   TRY(variables_of_momenta(step, data->z, dq, dp));
 #endif
-  if (!reaches(step, dq, dp))
-    return NOT_FINITE;
+  TRY(reaches(step, dq, dp) ? OK : NOT_FINITE);
   report->fallback_steps += falls_back;
   memcpy(memory, data->z, sizeof(real) * N);
   memcpy(memory + N, data->point, sizeof(real) * POINT);

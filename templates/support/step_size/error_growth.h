@@ -343,7 +343,7 @@ static __attribute__((noinline)) void measure_growth(run_memory *run, const step
       run->growth_start[i] = step->q0[i];
       run->tangent[i][0] = INITIAL(step->q0[i], dq[i]) * cos(i);
 #ifdef VARIABLE_ACCELERATIONS
-      run->tangent[i][1] = INITIAL(step->h * at_start(V, i), dq[i]) * cos(i + 1);
+      run->tangent[i][1] = INITIAL(step->h * at_first(&V[0][i]), dq[i]) * cos(i + 1);
 #else
       run->tangent[i][1] = INITIAL(step->h * data->inverse_mass[i] * step->p0[i], dq[i]) * cos(i + 1);
 #endif

@@ -136,8 +136,7 @@ def pair_kernel_text(kernel: Kernel, lanes: Lanes | None = None) -> str:
             statements.append(f"value[{k}] = {value.settled(kind)};")
     parameters = "lanes" if printer.kind_of("parameters") == "ddl" else "double"
     arguments = f"const {kind} *u, {printer.kind_of('t')} t, const {parameters} *parameters, {kind} *value"
-    unused = ", ".join(f"(void){name}" for name in ("u", "t", "parameters") if not kernel.uses(name))
-    body = "\n".join(wrapped(statement) for statement in ([f"{unused};"] if unused else []) + statements)
+    body = "\n".join(map(wrapped, statements))
     purpose = wrapped_comment(f"{kernel.purpose} In pairs.".strip())
     head = wrapped_prototype(f"static inline void {kernel.name}_pairs({arguments})")
     return f"{purpose}\n{head}\n{{\n  /* clang-format off */\n{body}\n  /* clang-format on */\n}}"

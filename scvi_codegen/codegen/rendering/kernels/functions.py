@@ -277,11 +277,9 @@ def _text(kernel: Kernel, target: Target, lanes: Lanes | None, printed: Printed,
     statements = [*printed(kernel), *(line for loop in kernel.sums for line in _Rows(loop, real, parameter).lines())]
     last = ["derivative"] if len(kernel.results) > kernel.values or partials else []
     names = ["u", "t", "parameters", *(["value"] if kernel.values or not last else []), *last]
-    unused = ", ".join(f"(void){name}" for name in names if name != "value" and not kernel.uses(name))
     counts = ", ".join(f"{count} {operator}" for operator, count in kernel.operation_counts().items()) or "constants"
     comment = wrapped_comment(f"{kernel.purpose} Operations: {counts}.".strip())
-    body = [*([f"{unused};"] if unused else []), *statements]
-    whole = _function("static inline" if lanes else "static", kernel, [declared[name] for name in names], body)
+    whole = _function("static inline" if lanes else "static", kernel, [declared[name] for name in names], statements)
     return "\n\n".join([*texts, f"{comment}\n{whole}"])
 
 

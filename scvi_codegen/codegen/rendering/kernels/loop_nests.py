@@ -129,7 +129,7 @@ def function_of_sizes(layout: Layout, head: str, lines: Sequence[str]) -> str:
     text = "\n".join(lines)
     starts = list(starts_text(layout, text))
     sizes = sizes_text(layout, "\n".join([text, *starts]))
-    body = "\n".join(f"  {line}" for line in (*sizes, *starts, "(void)arrays;", *lines))
+    body = "\n".join(f"  {line}" for line in (*sizes, *starts, *lines))
     return f"{head}\n{{\n{body}\n}}"
 
 

@@ -77,7 +77,7 @@ def rows_text(layout: Layout, forces: Sequence[RolledKernel]) -> tuple[str, str,
 def _part(name: str, forces: Sequence[RolledKernel], *, fused: bool) -> str:
     """Return the function of some term groups."""
     head = f"static void {name}_rows({'' if name == 'add' else 'const '}sweep *of, section rows)"
-    lines = [head, "{", "  window here;", "  (void)of, (void)rows, (void)here;"]
+    lines = [head, "{", "  window here;", "  (void)here;"]
     for rolled in forces:
         group = rolled.kernel.name
         lines.append(f"  here = window_of_rows(share_{group}(of->run, of->arrays, of->work->n), rows);")
@@ -306,7 +306,7 @@ def _force_text(program: ArrayProgram, rolled: RolledKernel, fused_group: str) -
     arguments += ["sweep *of"] if fused else []
     if sharing is Sharing.BY_PLACES:
         zero.append("const int whole = here->whole;")
-    body = ["(void)arrays, (void)here;", *zero, *lines]
+    body = [*zero, *lines]
     head, values = f"static void add_{rolled.kernel.name}", f"lanes value[{max(len(rolled.writes), len(functions))}]"
     text = nest.function(head, arguments, body, values=values)
     return f"{text}\n\n{_sharing_text(program, rolled)}"
@@ -360,7 +360,7 @@ def _list_text(program: ArrayProgram, components: int, lengths: RolledKernel) ->
 def _sharing_text(program: ArrayProgram, rolled: RolledKernel) -> str:
     """Return a function that describes how threads share a term group."""
     head = f"static sharing share_{rolled.kernel.name}(const run_memory *run, const problem *arrays, long long n)"
-    lines = ["(void)run, (void)n;", f"return {sharing_text(rolled)};"]
+    lines = [f"return {sharing_text(rolled)};"]
     return f"/* Its rounds of tasks. */\n{function_of_sizes(program.layout, head, lines)}"
 
 
@@ -377,7 +377,7 @@ def _function(
 ) -> str:
     """Return a function of numbers with the same statements for every element, and others before."""
     nest = Nest(program.layout, rolled, "double", source)
-    text = ["(void)arrays;", *before, *nest.text(innermost=lines)]
+    text = [*before, *nest.text(innermost=lines)]
     declared = f"double value[{values}]" if values else ""
     return nest.function(f"static void {name}", ["const problem *arrays", *arguments], text, values=declared)
 
