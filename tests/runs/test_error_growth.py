@@ -9,6 +9,7 @@ import pytest
 from notation import lagrange
 
 import scvi_codegen as sc
+from scvi_codegen.runs.accuracy.growth import measured_growth
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 
 TOLERANCES = [None, 1e-12, 1e-9, 1e-6, 1e-3]
@@ -158,6 +159,35 @@ def test_growth_is_measured_only_where_the_check_needs_it():
     with without_accuracy_warnings():
         assert not reports(stepper, q, p, t_end)
     assert reports(stepper, q, p, t_end)
+
+
+@pytest.mark.parametrize("tolerance", [None, 1e-9, 1e-6, 1e-4])
+@pytest.mark.parametrize(
+    ("system", "q", "velocity", "t_end", "error"),
+    [
+        (KEPLER, [1.0, 0.1], [0.1, 1.1], 20.0, 0.02),
+        (BURRAU, [1.0, 3.0, -2.0, -1.0, 1.0, -1.0], [0.2, 0.1, 0.0, -0.2, 0.1, 0.3], 3.0, 0.02),
+        (PENDULUM, [1.0, 0.5], [0.3, -0.4], 3.0, 0.15),
+    ],
+    ids=["matrix", "by operations", "variable accelerations"],
+)
+def test_the_tangent_vector_is_the_difference_of_runs(system, q, velocity, t_end, error, tolerance):
+    """Forces of time disable the projection on the energy surface. Derivatives are those of a matrix or of operations.
+
+    Iterations end at errors that are small beside an exponential growth.
+    """
+    stepper = stepper_of(system, **{system[0][0]: "0.1*cos(t)"})
+    first = stepper.integrate(q, velocity=velocity, t_end=t_end, tolerance=tolerance)
+    run = stepper.start(q, first.p[0], t_end=t_end, tolerance=tolerance)
+    run._memory.measures_growth = measured_growth(stepper, run._plan, None)
+    run._run_to_target()
+    i, change = np.arange(len(q)), first.q[1] - q
+    dq, dv = 1e-6 * (q + change) * np.cos(i), 1e-6 * (velocity + change / first.t[1]) * np.cos(i + 1)
+    after, before = (
+        stepper.integrate(q + sign * dq, velocity=velocity + sign * dv, t_end=t_end).q[-1] for sign in (1, -1)
+    )
+    expected = (after - before) / 2e-6
+    assert np.abs([row[0] for row in run._memory.tangent] - expected).max() < error * np.abs(expected).max()
 
 
 @pytest.mark.rotated

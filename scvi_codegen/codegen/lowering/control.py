@@ -30,7 +30,7 @@ from scvi_codegen.codegen.ir.equations import (
 )
 from scvi_codegen.codegen.ir.kernel import Expression, Kernel, Load, Number, NumberTable, Operation
 from scvi_codegen.codegen.ir.program import Program
-from scvi_codegen.codegen.lowering.derivatives import NOTHING, force_derivatives, vector_product
+from scvi_codegen.codegen.lowering.derivatives import NOTHING, force_derivatives, product_by_operations, vector_product
 from scvi_codegen.codegen.lowering.solvers.tables import DEGREE_OF_ONE, DEGREE_OF_TWO, INTERPOLATED, pad_vector
 from scvi_codegen.codegen.lowering.stage_groups import system_kernel
 from scvi_codegen.common.precision import Matrix, Vector, mp
@@ -173,7 +173,7 @@ def _padded(rows: list[list[float]], through: NumberTable, lanes: int) -> Number
     return (*wide, *(wide[-1],) * (lanes - count))
 
 
-MOST_COORDINATES, MOST_DERIVATIVES, MOST_OPERATIONS = 20, 180, 1500
+MOST_COORDINATES, MOST_DERIVATIVES, MOST_OPERATIONS = 24, 180, 1500
 """Largest numbers of coordinates, of distinct derivatives F_q and of operations in coupled equations (a chain of five
 links has 1200): their derivatives would take more than half of the time of compilation of larger systems."""
 
@@ -246,8 +246,15 @@ def _growth_tables(points: Vector, knots: Vector, *, of_velocities: bool) -> tup
 
 
 def _separable_growth(system: LagrangianSystem) -> tuple[Kernel, Kernel, None]:
-    partials, products = force_derivatives(system)
-    return partials, products[0], None
+    (partials, (product, _)), q = force_derivatives(system), system.coordinates
+    by_operations = product_by_operations(system, forms_of(system).force, q, u=q, purpose="L_q")
+    return *min((partials, product), by_operations, key=_operations), None
+
+
+def _operations(kernels: tuple[Kernel, Kernel]) -> int:
+    """Return the number of operations of a step with three iterations, as with a tolerance of 1e-9."""
+    partials, product = (sum(kernel.operation_counts().values()) for kernel in kernels)
+    return partials + 3 * product
 
 
 def _coupled_growth(system: LagrangianSystem) -> tuple[Kernel, Kernel, Kernel | None] | None:
@@ -258,11 +265,12 @@ def _coupled_growth(system: LagrangianSystem) -> tuple[Kernel, Kernel, Kernel | 
         return None
     entries = jacobian(residual, of) or NOTHING
     different = tuple(dict.fromkeys(entries.values()))
+    u = *of, *accelerations(system)
     partials = system_kernel(
         system,
         "point_derivatives",
         different,
-        u=(*of, *accelerations(system)),
+        u=u,
         partials=forms.mass_terms,
         purpose="The distinct entries of -E_q and -E_v, and terms of L_vv at all points.",
     )
@@ -274,6 +282,8 @@ def _coupled_growth(system: LagrangianSystem) -> tuple[Kernel, Kernel, Kernel | 
         shape=(system.dimension, len(of)),
         purpose="The matrix of derivatives times x, u = (x, its entries).",
     )
+    by_operations = product_by_operations(system, residual, of, u=u, partials=forms.mass_terms, purpose="-E")
+    partials, product = min((partials, product), by_operations, key=_operations)
     if system.changes_energy:
         return partials, product, None
     energy = system_kernel(

@@ -17,7 +17,8 @@ from scvi_codegen.codegen.lowering.stage_groups import system_kernel
 from scvi_codegen.common.precision import mp
 from scvi_codegen.methods.stage_system import StageGroup, StageSystem, Velocities
 from scvi_codegen.systems.derived_expressions import Entries, forms_of
-from scvi_codegen.systems.formulas.expressions import gradient, gradient_tuple, jacobian
+from scvi_codegen.systems.formulas.expressions import gradient, gradient_tuple, jacobian, node_derivative
+from scvi_codegen.systems.formulas.intermediates import Intermediate, intermediate
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 from scvi_codegen.systems.legendre.transform import equivalent_lagrangian
 from scvi_codegen.systems.system import MechanicalSystem
@@ -284,3 +285,50 @@ def vector_product(
     for (i, j), value in matrix.items():
         rows[i].append(Mul(values[number[value]], x[j]))
     return system_kernel(system, name, [Add(*row) for row in rows], u=(*x, *values), purpose=purpose)
+
+
+def product_by_operations(
+    system: LagrangianSystem,
+    results: Sequence[Expr],
+    of: Sequence[Symbol],
+    *,
+    u: Sequence[Symbol],
+    partials: Sequence[Expr] = (),
+    purpose: str,
+) -> tuple[Kernel, Kernel]:
+    """Return kernels like those of the matrix of derivatives ``purpose`` and of its product, but by operations.
+
+    The change of each operation is computed from those of its operands (forward mode: Griewank & Walther, Evaluating
+    Derivatives, ch. 3): two bodies share that of their force. Derivatives of operations without their constant factors,
+    and ``partials``, are numbers of a point ``u``.
+    """
+    x = [Symbol(f"x[{i}]", real=True) for i in range(len(of))]
+    changes: dict[Expr, Expr] = dict(zip(of, x, strict=True))
+    values: dict[Expr, Expr] = {}
+
+    def term(factor: Expr, change: Expr) -> Expr:
+        constant, rest = factor.as_independent(*u, system.time, as_Add=False)
+        number, rest = _number_and_rest(rest)
+        value = 1 if rest == 1 else values.setdefault(rest, Symbol(f"derivative[{len(values)}]", real=True))
+        return Mul(number, constant, value, change)
+
+    def change_of(node: Expr) -> Expr:
+        if node not in changes:
+            inner = {k: change_of(argument) for k, argument in enumerate(node.args)}
+            passed = isinstance(node, Intermediate)
+            terms = [dx if passed else term(node_derivative(node, k), dx) for k, dx in inner.items() if dx != 0]
+            number, rest = _number_and_rest(Add(*terms))
+            changes[node] = number * intermediate(rest)
+        return changes[node]
+
+    along, stored = [change_of(result) for result in results], [*values] or [S.Zero]
+    text = f"Derivatives of the operations of {purpose} at all points."
+    at_points = system_kernel(system, "point_derivatives", stored, u=u, partials=partials, purpose=text)
+    text = f"The matrix of derivatives of {purpose} times x, u = (x, derivatives of operations)."
+    return at_points, system_kernel(system, "derivative_product", along, u=(*x, *values.values()), purpose=text)
+
+
+def _number_and_rest(expression: Expr) -> tuple[Expr, Expr]:
+    """Return a rational factor of either sign, and the rest, which is the same for multiples of an expression."""
+    number, rest = expression.primitive()
+    return (-number, -rest) if rest.could_extract_minus_sign() else (number, rest)

@@ -426,7 +426,7 @@ class _Accumulation:
             [
                 (factor, derivatives)
                 for position, derivatives in enumerate(inner)
-                if derivatives and (factor := _partial(node, position)) is not S.Zero
+                if derivatives and (factor := node_derivative(node, position)) is not S.Zero
             ]
         )
 
@@ -441,7 +441,7 @@ def _combined(pairs: Sequence[tuple[Expr, Gradient]]) -> Gradient:
     return {index: entry for index, entry in entries.items() if entry is not S.Zero}
 
 
-def _partial(node: Expr, position: int) -> Expr:
+def node_derivative(node: Expr, position: int) -> Expr:
     """Return the derivative of a node with respect to its argument in ``position``."""
     if isinstance(node, Add):
         return S.One
