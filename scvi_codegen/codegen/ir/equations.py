@@ -468,10 +468,10 @@ class ErrorGrowth:
         energy: gradient of the energy at (q, v), on lanes; ``None`` of separable systems, and if it is not conserved.
         conserves_energy: false if forces act or the system depends on time.
         of_velocities: true if accelerations depend on velocities.
-        knots: number of times in a step at which the tangent vector is evaluated.
         end: extrapolation from the points to the end of a step.
-        tables: with eight columns, from values at the points to those at the knots, from accelerations there to tangent
-            vectors, and to Taylor's coefficients at the end of a step.
+        tables: by the number of knots, times at which the tangent vector is evaluated; the last for vectors of eight
+            lanes. With eight columns, from values at the points to those at the knots, from accelerations there to
+            tangent vectors, and to Taylor's coefficients at the end of a step.
     """
 
     partials: Kernel
@@ -479,9 +479,8 @@ class ErrorGrowth:
     energy: Kernel | None
     conserves_energy: bool
     of_velocities: bool
-    knots: int
     end: tuple[Number, ...]
-    tables: tuple[IterationTable, ...]
+    tables: Mapping[int, tuple[IterationTable, ...]]
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:

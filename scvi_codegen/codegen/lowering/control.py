@@ -194,24 +194,24 @@ def error_growth_of(system: MechanicalSystem, program: Program) -> ErrorGrowth |
     if kernels is None or kernels[0].values > MOST_DERIVATIVES:
         return None
     partials, product, energy = kernels
-    of_velocities, most = make is _coupled_growth, FEW_KNOTS if len(points) <= FEW_POINTS else COLUMNS
-    knots = gauss_legendre(min(len(points), most)).abscissae
+    of_velocities, least = make is _coupled_growth, FEW_KNOTS if len(points) <= FEW_POINTS else COLUMNS
+    knots = [gauss_legendre(count).abscissae for count in sorted({min(len(points), n) for n in (least, COLUMNS)})]
     return ErrorGrowth(
         partials=_with_common_roots(partials),
         product=product,
         energy=energy,
         conserves_energy=not system.changes_energy,
         of_velocities=of_velocities,
-        knots=len(knots),
         end=pad_vector(cardinal_values(points, (mp.one,))[0], fixed_point.lanes),
-        tables=_growth_tables(points, knots, of_velocities=of_velocities),
+        tables={len(of): _growth_tables(points, of, of_velocities=of_velocities) for of in knots},
     )
 
 
 COLUMNS, FEW_KNOTS, FEW_POINTS = 8, 4, 8
 """Columns of the tables of tangent vectors, one for each knot; numbers of knots and of points in short steps.
 
-Knots are Gauss points: other ones, as every second point of the step, and kicks at the points by Stoermer's method cost
+In vectors of eight lanes eight knots cost as much as four, in shorter ones twice as much.
+They are Gauss points: other ones, as every second point of the step, and kicks at the points by Stoermer's method cost
 less, but regular orbits of thousands of steps then show exponential growth.
 """
 

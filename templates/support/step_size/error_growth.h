@@ -4,14 +4,14 @@
  * distance from the start and the largest velocity, which depend neither on the origin nor on a gauge. It solves the
  * variational equations along each accepted step,
  *   dq'' = F_q dq / m,      or      L_vv dq'' = -E_q dq - E_v dv   (VARIABLE_ACCELERATIONS),
- * with E(q, v, a) the Euler-Lagrange residual at knots c_n h, which are Gauss points, about half as many as those of
- * the step; derivatives there are evaluated in SIMD lanes. The collocation equations
+ * with E(q, v, a) the Euler-Lagrange residual at knots c_n h, which are Gauss points, as many as those of the step in
+ * vectors of eight lanes, or half as many; derivatives there are evaluated in SIMD lanes. The collocation equations
  *   dq_n = dq + c_n h dv + h^2 sum_j P_nj dq''_j,      dv_n = dv + h sum_j Q_nj dq''_j
  * are solved by Picard iterations (Hairer, Norsett & Wanner, Solving ODEs I, sec. I.8) from Taylor's polynomial at the
- * end of the step before; in two halves of a step if all are measured. In one of `measures_growth` steps the vector is
- * projected on the energy surface (in the metric of the sizes of the motion): its part along the gradient of the
- * energy, which is conserved, grows by the error of the iterations only. Requires: the iteration, the tables, the
- * kernels point_derivatives and derivative_product; with VARIABLE_ACCELERATIONS energy_gradient. */
+ * end of the step before; with four knots in two halves of a step if all are measured. In one of `measures_growth`
+ * steps the vector is projected on the energy surface (in the metric of the sizes of the motion): its part along the
+ * gradient of the energy, which is conserved, grows by the error of the iterations only. Requires: the iteration, the
+ * tables, the kernels point_derivatives and derivative_product; with VARIABLE_ACCELERATIONS energy_gradient. */
 
 #define LEAST_GROWTH 9.9 /* logarithm: of less, the difference to the mean is not measured */
 #define LARGEST_GROWTH 100.0 /* logarithm: beyond it the growth is known; below the reciprocal numbers underflow */
@@ -50,6 +50,12 @@ enum { TAYLOR = 5,
 /* Tangent vectors at the knots of a group, and the derivatives by which they are multiplied. */
 typedef lanes tangent_at_knots[TANGENT + GROWTH_DERIVATIVES];
 
+#ifdef EIGHT_COORDINATES
+#define APART __attribute__((noinline)) /* of many numbers, which would take registers from the caller */
+#else
+#define APART inline
+#endif
+
 /* Lanes of a group of columns. */
 static inline lanes columns_of(const double *row, int group)
 {
@@ -77,7 +83,7 @@ typedef struct {
 } tangent_knots;
 
 /* Computes the derivatives of the accelerations at the knots of a part of a step, with the velocities of the run. */
-static inline void linearise_accelerations(const run_memory *run, const step_data *step, const iteration_data *data,
+static APART void linearise_accelerations(const run_memory *run, const step_data *step, const iteration_data *data,
     coordinates *X, int part, double h, tangent_knots *at)
 {
   const double inverse = 1.0 / step->h;
@@ -100,7 +106,7 @@ static inline void linearise_accelerations(const run_memory *run, const step_dat
 }
 
 /* Accelerations times h^2 of the tangent vectors at the knots of a group. */
-static inline void tangent_accelerations(const step_data *step, const tangent_knots *at, int n, lanes *a)
+static APART void tangent_accelerations(const step_data *step, const tangent_knots *at, int n, lanes *a)
 {
   derivative_product(at->u[n], lanes_of(step->t), step->parameters, a);
   solve_mass(at->mass[n], a);
@@ -113,7 +119,7 @@ typedef struct {
   double unit[M]; /* h^2 / m */
 } tangent_knots;
 
-static inline void linearise_accelerations(const run_memory *run, const step_data *step, const iteration_data *data,
+static APART void linearise_accelerations(const run_memory *run, const step_data *step, const iteration_data *data,
     coordinates *X, int part, double h, tangent_knots *at)
 {
   lanes u[M];
@@ -129,7 +135,7 @@ static inline void linearise_accelerations(const run_memory *run, const step_dat
     at->unit[i] = h * h * data->inverse_mass[i];
 }
 
-static inline void tangent_accelerations(const step_data *step, const tangent_knots *at, int n, lanes *a)
+static APART void tangent_accelerations(const step_data *step, const tangent_knots *at, int n, lanes *a)
 {
   derivative_product(at->u[n], lanes_of(step->t), step->parameters, a);
   for (int i = 0; i < M; i++)
@@ -349,7 +355,7 @@ static __attribute__((noinline)) void measure_growth(run_memory *run, const step
 #endif
     }
   }
-  if (run->measures_growth == 1) {
+  if (run->measures_growth == 1 && KNOTS <= 4) {
     advance_tangent(run, step, data, X, 1, 0.5 * step->h);
     advance_tangent(run, step, data, X, 2, 0.5 * step->h);
   } else
