@@ -115,7 +115,7 @@ def _limit(
     system: LagrangianSystem, slip: Sequence[Expr], directions: Sequence[Sequence[Expr]], pushes: Sequence[Expr]
 ) -> Expr | None:
     """Return F of forces -F T^T w/abs(w) if they are so, with one F >= 0 for the default parameters; else ``None``."""
-    from sympy import Add, S, cancel, solve
+    from sympy import Add, S, cancel
 
     from scvi_codegen.systems.formulas.kinks import switching_function, unit_step
 
@@ -124,12 +124,13 @@ def _limit(
     limit = cancel(next(-push / row for push, row in zip(pushes, rows, strict=True) if row))
     if not all(_vanishes(push + limit * row) for push, row in zip(pushes, rows, strict=True)):
         return None
-    velocities = [
-        rate for rate, column in zip(system.velocities, zip(*directions, strict=True), strict=True) if any(column)
-    ]
-    at_rest = solve(slip, velocities, dict=True)[0]
+    at_rest: list[tuple[Expr, Expr]] = []
+    for part in (each.subs(at_rest) for each in slip):  # linear: one rate of each, by the others
+        rates = [(rate, row) for rate in system.velocities if (row := part.diff(rate)) != 0]
+        at_rest += [(rate, rate - part / row) for rate, row in rates[:1]]
     own = [part for part in limit.atoms(unit_step) if switching_function(part.args[0])[0] in slip]
-    above, below = (limit.xreplace(dict.fromkeys(own, side)).subs(at_rest) for side in (S.One, S.Zero))
+    resting = dict.fromkeys(slip, S.Zero)
+    above, below = (limit.xreplace(dict.fromkeys(own, side) | resting).subs(at_rest) for side in (S.One, S.Zero))
     value = limit.subs(dict(zip(system.parameters, system.defaults, strict=True)))
     return limit if value.is_nonnegative and above != 0 and _vanishes(above - below) else None
 
