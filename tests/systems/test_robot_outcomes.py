@@ -24,6 +24,7 @@ MJCF = """<mujoco><compiler {compiler}/><option gravity="0 1 -9" {option}><flag 
 A, B = '<joint name="x" axis="1 2 3" {}/>', '<joint name="y" axis="0 1 0" {}/>'
 PATH = '<tendon><spatial name="t" stiffness="3"><site site="w"/>{}<site site="e"/></spatial></tendon>'
 MUSCLE, SERVO = '<actuator><muscle joint="x"/></actuator>', '<actuator><position name="u" joint="x" kv="1"/></actuator>'
+RATIOS = '<actuator><position joint="{}" kp="3" dampratio=".7" gear="2" inheritrange=".8"/></actuator>'
 ELLIPSOIDS = (
     '<geom type="{}" size="{}" pos=".1 0 .2" euler=".3 .2 .1" fluidshape="ellipsoid" fluidcoef=".3 .2 1 .7 .6"/>'
 )
@@ -50,6 +51,14 @@ ROWS: dict[str, tuple[dict[str, str], str | None]] = {
     "tendon through sites": ({"rest": PATH.format('<site site="s"/>')}, EQUAL),
     "gears": ({"rest": '<actuator><motor joint="x" gear="-20" armature=".01" damping=".1"/></actuator>'}, EQUAL),
     "servo": ({"rest": SERVO}, EQUAL),
+    "servos by damping ratios and ranges of joints": (
+        {
+            "a": A.format('range="-1 .5" ref=".3" armature=".2"'),
+            "b": B.format('type="slide" range="-.4 .1" ref="-.1"'),
+            "rest": RATIOS.format("x") + RATIOS.format("y"),
+        },
+        EQUAL,
+    ),
     "limits and dry friction": ({"a": A.format('range="-1 1" frictionloss=".1"')}, EQUAL),
     "ellipsoids in a medium": (
         FLUID | {"b": B + ELLIPSOIDS.format("sphere", ".1") + ELLIPSOIDS.format("ellipsoid", ".3 .1 .2")},

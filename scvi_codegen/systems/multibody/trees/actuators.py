@@ -22,18 +22,31 @@ from scvi_codegen.systems.multibody.trees.tree import Link, identifier, numbered
 Range = tuple[float, float] | None
 Actuator = tuple[str, str, Range, Expr]  # name in the file, name and range of the input, Rayleigh function
 NONE = (0.0, 0.0, 0.0)
-ABSENT = Kind(refused={"dyntype": "none", "timeconst": "0", "delay": "0", "dampratio": "0", "inheritrange": "0"})
+ABSENT = Kind(refused={"dyntype": "none", "timeconst": "0", "delay": "0"})
+OF_SERVOS = Kind(refused={"dampratio": "0", "inheritrange": "0"})
 
 
 def actuator_of(
-    links: Sequence[Link], element: Element, tendon: Tendon, others: Mapping[str, str], controls: Range, forces: Range
+    links: Sequence[Link],
+    element: Element,
+    tendon: Tendon,
+    others: Mapping[str, str],
+    controls: Range,
+    forces: Range,
+    inverse: float,
 ) -> Actuator:
     """Return the actuator of an element, with these ranges, on a tendon; a joint is a tendon with one factor, 1.
 
     ``others``: inputs of the actuators before it by name, and no text by the names of those after it.
+    ``inverse``: entry of M^-1 of the joint in the reference configuration, for the damping 2 z sqrt(g0/inverse)/gear of
+    a ratio z.
     """
     gear = float(element.vector("gear", (1,), range(1, 7))[0])
     gain, bias = _coefficients(element)
+    if ratio := element.number("dampratio", 0, 0):
+        if element.has("tendon") or element.has("kv") or gain[0] < 0 or gear == 0:
+            element.refuse("has a dampratio, which is read of joints with gear, kp >= 0 and without kv: give kv alone")
+        bias = (*bias[:2], -2 * ratio * (gain[0] / inverse) ** 0.5 / abs(gear))
     forces = _clamped(forces, tendon.pull, gear)
     if not (any(gain[1:]) or any(bias)):
         controls, forces = _clamped(controls, forces, gain[0]), None
@@ -75,6 +88,8 @@ def _clamped(inner: Range, outer: Range, factor: float) -> Range:
 def _coefficients(element: Element) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return the coefficients of 1, length and velocity of gain and bias."""
     element.check_neutral(ABSENT)
+    if element.tag != "position":
+        element.check_neutral(OF_SERVOS)
     if element.tag == "motor":
         return (1.0, 0.0, 0.0), NONE
     if element.text("kind", element.tag) != element.tag:

@@ -321,10 +321,10 @@ class _MujocoModel:
             element.refuse(f"has {PARTS[both[0]]}, which is read of joints only: write {both[0]}='ignore'")
         return limits if "limits" in self.parts else None, friction if "friction" in self.parts else 0.0
 
-    def bounds(self, element: Element, prefix: str = "") -> Range:
-        """Return the attribute ``range`` with a prefix, if it is in force."""
+    def bounds(self, element: Element, prefix: str = "", inherited: Sequence[float] = (0.0, 0.0)) -> Range:
+        """Return the attribute ``range`` with a prefix, by default the inherited one, if it is in force."""
         limited = element.choice(f"{prefix}limited", "auto", "true", "false")
-        low, high = map(float, element.vector(f"{prefix}range", (0, 0), (2,)))
+        low, high = map(float, element.vector(f"{prefix}range", inherited, (2,)))
         automatic = low < high and element.settings.choice("autolimits", "true", "false") == "true"
         return (low, high) if limited == "true" or (limited == "auto" and automatic) else None
 
@@ -337,16 +337,30 @@ class _MujocoModel:
             own = Tendon(((joint.name, 1.0),), pull=self.bounds(self.joints[label], "actuatorfrc"))
             parts |= {("joint", label): own, ("jointinparent", label): own}
         targets = [next(((x, element.text(x)) for x in ACTED if element.has(x)), ("", "")) for element in elements]
+        damped = {label for x, (_, label) in zip(elements, targets, strict=True) if x.number("dampratio", 0, 0)}
+        inverses = {self.links[k].joint.label: m for k, m in mean_inverses(self.completed() if damped else (), damped)}
         for element, target in zip(elements, targets, strict=True):
             if target not in parts:
                 element.refuse("acts on no hinge, slide or tendon of the model, which are the parts that are read")
             if any(part.pull for part in parts.values()) and (target[0] == "tendon" or targets.count(target) > 1):
                 element.refuse("is one of several on a part with actuatorfrcrange, which is read of single ones only")
-            controls = None if "clampctrl" in self.disabled else self.bounds(element, "ctrl")
+            inherited = self.inherited(element, target[1])
+            controls = None if "clampctrl" in self.disabled else self.bounds(element, "ctrl", inherited)
             ranges = controls, self.bounds(element, "force")
-            actuator = actuator_of(self.links, element, parts[target], names, *ranges)
+            actuator = actuator_of(self.links, element, parts[target], names, *ranges, inverses.get(target[1], 1.0))
             names[actuator[0]] = actuator[1]
             yield actuator
+
+    def inherited(self, element: Element, label: str) -> Sequence[float]:
+        """Return the range of a control by ``inheritrange``, this multiple of that of the joint; (0, 0) without."""
+        if not (share := element.number("inheritrange", 0, 0)):
+            return 0.0, 0.0
+        low, high = (0.0, 0.0) if element.has("tendon") else self.joints[label].vector("range", (0, 0), (2,))
+        if low == high or element.has("ctrlrange"):
+            element.refuse("has an inheritrange, which is read of joints with a range and without ctrlrange")
+        middle, radius = (low + high) / 2, (high - low) / 2 * share
+        unit = _unit(element) if self.singles[label].kind == "hinge" else 1.0
+        return (middle - radius) * unit, (middle + radius) * unit
 
     def keyframes(self, controls: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield names and numbers of keyframes; positions outside limits are listed."""
