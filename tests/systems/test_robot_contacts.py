@@ -60,6 +60,12 @@ def test_gaps_and_slips_are_those_of_points_of_bodies(tmp_path):
     assert slips == pytest.approx((at(touching, 1e-5) - at(touching, -1e-5)) @ floor[:, :2] / 2e-5, abs=1e-8)
 
 
+def test_spheres_that_reach_no_plane_are_no_contacts(tmp_path):
+    own = '<joint name="j" axis="0 1 0"/><geom size=".1"/><geom name="g" size=".1" pos=".3 0 0"/>'
+    contacts = robot(tmp_path, f'{GROUND}<body pos="0 0 .4">{own}</body>', contacts="planes").contacts
+    assert [contact.name[:8] for contact in contacts] == ["geom 'g'"]
+
+
 BALL = '<body name="b"><freejoint/><geom name="ball" size=".1" {}/></body>'
 PAIR = '<contact><pair geom1="ball" geom2="floor" {}/></contact>'
 

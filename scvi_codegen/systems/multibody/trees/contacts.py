@@ -43,19 +43,21 @@ class Touch:
 
 
 def contacts_of(links: Sequence[Link], touches: Iterable[Touch], law: Mapping[str, Any]) -> list[ContactLike]:
-    """Return the contacts of spheres with planes; ``law``: restitution and law of their impacts."""
-    return [_contact(links, touch, law) for touch in touches]
+    """Return the contacts of spheres with planes that they may reach; ``law``: restitution and law of their impacts."""
+    return [made for touch in touches for made in _contact(links, touch, law)]
 
 
-def _contact(links: Sequence[Link], touch: Touch, law: Mapping[str, Any]) -> ContactLike:
+def _contact(links: Sequence[Link], touch: Touch, law: Mapping[str, Any]) -> list[ContactLike]:
     ends = (touch.link, Pose(touch.center)), (-1, touch.plane)
     (position, axes), (origin, directions) = frames_in_common(links, ends)
     radius, normal = exact_number(touch.radius), directions[:, 2]
     gap = normal.dot(position - origin) - radius
+    if gap.is_number and gap > 0:
+        return []
     fixed = Matrix([symbol(f"{touch.name} {k}") for k in range(3)])
     arm = dict(zip(fixed, (-radius * axes.T * normal).applyfunc(intermediate), strict=True))
     rates = (rate_of(links, directions[:, k].dot(position + axes * fixed)) for k in range(2) if touch.friction)
     slips = [rate.xreplace(arm) for rate in rates if rate != 0]
     slip = slips[0] if len(slips) == 1 else slips or None
     mu = exact_number(touch.friction or 0) if slips else None
-    return contact(gap, slip=slip, friction=mu, name=touch.name, **law)
+    return [contact(gap, slip=slip, friction=mu, name=touch.name, **law)]
