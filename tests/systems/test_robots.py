@@ -208,8 +208,9 @@ def test_malformed_mjcf_is_refused_by_name(change, tmp_path):
     text = (ROBOTS / "figure.xml").read_text()
     file = tmp_path / "figure.xml"
     file.write_text(text.replace(old, new, 1))
-    with pytest.raises(SystemDefinitionError, match=re.escape(message)):
+    with pytest.raises(SystemDefinitionError, match=re.escape(message)) as caught:
         sc.LagrangianSystem.from_mjcf(file)
+    assert "is not XML" not in str(caught.value)
 
 
 def test_included_files_are_read_and_total_masses_scaled(tmp_path):

@@ -464,8 +464,7 @@ def errors_of_motion(system: Any, path: Path) -> list[float]:
     model = mujoco.MjModel.from_xml_path(str(path))
     model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
     data, draw = mujoco.MjData(model), np.random.default_rng(1)
-    labels = [model.joint(j).name or model.body(model.jnt_bodyid[j]).name for j in range(model.njnt)]
-    equations = equations_of(system, labels, model.jnt_type)
+    equations = equations_of(system, [*system.joint_names], model.jnt_type)
     controls = dict(zip(system.actuators.values(), draw.uniform(-2, 2, len(system.actuators)), strict=True))
     held = controls | {name: min(max(controls[name], low), high) for name, low, high in system.input_ranges}
     constants = [held.get(name.removesuffix("_0"), 0.0) for name in ("t", *map(str, system.parameters))]

@@ -227,8 +227,9 @@ def root_of(path: Path, *tags: str) -> Element:
         SystemDefinitionError: if the file cannot be read, is no regular file or larger than 32 MiB, is no XML, declares
             entities, or has another outermost element.
     """
+    data = bytes_of(path)
     try:
-        node, places = _parsed(bytes_of(path), str(path))
+        node, places = _parsed(data, str(path))
     except (expat.ExpatError, ValueError, LookupError) as error:
         raise SystemDefinitionError(f"{path} is not XML: {error}") from error
     if node.tag not in tags:
