@@ -25,7 +25,16 @@ from sympy import Expr, Matrix, Symbol
 from sympy.utilities.iterables import connected_components
 
 from scvi_codegen.common.precision import Number, mp
-from scvi_codegen.systems.formulas.expressions import NEGLIGIBLE, Tape, dot, gradient_tuple, hessian, jacobian, kinks_of
+from scvi_codegen.systems.formulas.expressions import (
+    NEGLIGIBLE,
+    Tape,
+    dot,
+    gradient_tuple,
+    hessian,
+    jacobian,
+    kinks_of,
+    tangents,
+)
 from scvi_codegen.systems.formulas.intermediates import separated
 from scvi_codegen.systems.system import MechanicalSystem
 
@@ -193,9 +202,9 @@ class Forms:
         variables = (*system.velocities, *system.coordinates, system.time, *system.auxiliaries)
         rates = (*accelerations(system), *system.velocities, sympy.S.One, *self.momentum_rate)
         if system.auxiliaries:
-            return _along(self.constitutive, variables, rates)
+            return tangents(self.constitutive, variables, rates)
         return tuple(
-            rate - f for rate, f in zip(_along(self.momentum, variables, rates), self.momentum_rate, strict=True)
+            rate - f for rate, f in zip(tangents(self.momentum, variables, rates), self.momentum_rate, strict=True)
         )
 
     @cached_property
@@ -231,11 +240,11 @@ class Forms:
         if not system.forces:
             return ()
         factors = multipliers(system)
-        by_position = _along(system.forces, system.coordinates, factors)
-        by_velocity = _along(system.forces, system.velocities, factors)
+        by_position = tangents(system.forces, system.coordinates, factors)
+        by_velocity = tangents(system.forces, system.velocities, factors)
         variables = (*system.velocities, *system.coordinates, system.time)
         rates = (*accelerations(system), *system.velocities, sympy.S.One)
-        rates_by_velocity = _along(by_velocity, variables, rates)
+        rates_by_velocity = tangents(by_velocity, variables, rates)
         still = (sympy.S.Zero,) * m
         return (
             tuple(x - y for x, y in zip(rates_by_velocity, by_position, strict=True)),
@@ -294,7 +303,7 @@ class Forms:
         rates = (*(symbol for group in curve[1:] for symbol in group), sympy.S.One)
         derivatives_of_l = [system.lagrangian]
         for _ in range(count):
-            derivatives_of_l.append(_along(derivatives_of_l[-1:], variables, rates)[0])
+            derivatives_of_l.append(tangents(derivatives_of_l[-1:], variables, rates)[0])
         return tuple(derivatives_of_l[1:])
 
 
@@ -302,14 +311,6 @@ class Forms:
 def forms_of(system: MechanicalSystem) -> Forms:
     """Return the :class:`Forms` of a system; equal systems share one."""
     return Forms(system)
-
-
-def _along(expressions: Sequence[Expr], variables: Sequence[Symbol], direction: Sequence[Expr]) -> tuple[Expr, ...]:
-    """Return directional derivatives; with the rates of the variables as direction, time derivatives."""
-    terms: list[list[Expr]] = [[] for _ in expressions]
-    for (i, j), derivative in jacobian(expressions, variables).items():
-        terms[i].append(derivative * direction[j])
-    return tuple(sympy.Add(*row) for row in terms)
 
 
 DEPENDENT = 1e-10

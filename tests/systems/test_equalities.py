@@ -197,3 +197,51 @@ def test_equations_across_the_plane_of_a_mechanism_are_omitted(tmp_path):
 def test_equalities_that_cannot_be_read_are_refused_by_name(equality, message, tmp_path):
     with pytest.raises(SystemDefinitionError, match=message):
         model(tmp_path, BARS, equality)
+
+
+def parallelograms(count):
+    """Return MJCF and URDF of a free body with cranks, whose couplers and rockers close loops or follow the cranks."""
+    masses = {"base": (9, 0, 0), "crank": (1, 0, -0.2), "coupler": (0.7, 0.2, 0), "rocker": (1.2, 0, -0.2)}
+    inertia = '<inertial pos="{1} 0 {2}" mass="{0}" diaginertia="0.3 0.2 0.1"/>'
+    origin = '<inertial><origin xyz="{1} 0 {2}"/><mass value="{0}"/><inertia ixx="0.3" iyy="0.2" izz="0.1" '
+    origin += 'ixy="0" ixz="0" iyz="0"/></inertial>'
+    body, link = ({name: text.format(*row) for name, row in masses.items()} for text in (inertia, origin))
+    bodies, loops, links = "", "", f'<link name="base">{link["base"]}</link>'
+    for k in range(count):
+        place = np.array([np.cos(k), np.sin(k), 0.1 * k])
+        beside = place + np.array([0.5, 0, 0])
+        parts = [("crank", "base", place), ("coupler", "crank", [0, 0, -0.4]), ("rocker", "base", beside)]
+        opened = [
+            f'<body name="{name}{k}" pos="{" ".join(map(str, at))}">{body[name]}<joint name="{name}{k}" axis="0 1 0"/>'
+            for name, _, at in parts
+        ]
+        bodies += f"{opened[0]}{opened[1]}</body></body>{opened[2]}</body>"
+        loops += f'<connect body1="coupler{k}" body2="rocker{k}" anchor="0.5 0 0"/>'
+        for (name, parent, at), turn in zip(parts, (None, -1, 1), strict=True):
+            mimic = f'<mimic joint="crank{k}" multiplier="{turn}"/>' if turn else ""
+            links += f'<link name="{name}{k}">{link[name]}</link><joint name="{name}{k}" type="continuous">{mimic}'
+            links += f'<parent link="{parent}{k if parent == "crank" else ""}"/><child link="{name}{k}"/>'
+            links += f'<axis xyz="0 1 0"/><origin xyz="{" ".join(map(str, at))}"/></joint>'
+    return f'<body name="base"><freejoint/>{body["base"]}{bodies}</body>', loops, f'<robot name="r">{links}</robot>'
+
+
+@pytest.mark.parametrize(("count", "solver"), [(3, "newton"), pytest.param(9, "auto", marks=pytest.mark.rotated)])
+def test_many_loops_on_a_free_base_move_as_the_tree_of_their_cranks(count, solver, tmp_path):
+    bodies, loops, robot = parallelograms(count)
+    (tmp_path / "robot.urdf").write_text(robot)
+    tree = sc.LagrangianSystem.from_urdf(tmp_path / "robot.urdf", floating=True)
+    closed = model(tmp_path, bodies, loops)
+    assert len(closed.constraints) == 2 * count
+    rates = {f"crank{k}": 1 + 0.3 * k for k in range(count)}
+    free = {f"{x}_base": 0.1 * n for n, x in enumerate("xyz")} | {"omega_base": OMEGA}
+    start = {f"{x}_base": 0.0 for x in "xyz"} | {"R_base": TURNED}
+    turns = {f"{name}{k}": turn for k in range(count) for name, turn in (("crank", 1), ("coupler", -1), ("rocker", 1))}
+    states = []
+    for system in (closed, tree):
+        angles = {name: 0.2 * turn for name, turn in turns.items() if name in map(str, system.coordinates)}
+        velocity = free | {name: np.sign(a) * rates["crank" + name[-1]] for name, a in angles.items()}
+        stepper = sc.compile_stepper(system, "svi:3", solver=solver if system is closed else "auto")
+        states.append(stepper.integrate(start | angles, velocity=velocity, h=0.01, steps=20))
+    assert np.ptp(states[0].energy()) < 1e-8
+    for name in (*rates, "x_base", "z_base", "R_base_w", "R_base_y"):
+        assert states[0][name][-1] == pytest.approx(states[1][name][-1], abs=1e-11)

@@ -136,7 +136,8 @@ class Derivatives:
             group.points
             * (
                 group.derivative.arguments
-                + len(group.derivative.results)
+                + group.derivative.values
+                + group.derivative.partials
                 + len(by_inputs.entries)
                 + damped * group.derivative.values
             )

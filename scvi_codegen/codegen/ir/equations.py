@@ -87,7 +87,7 @@ class LoweredStageGroup:
     @property
     def scratch(self) -> int:
         """Number of arguments, values and derivatives at all points."""
-        return self.points * (self.derivative.arguments + len(self.derivative.results))
+        return self.points * (self.derivative.arguments + self.derivative.values + self.derivative.partials)
 
 
 @dataclass(frozen=True, slots=True)

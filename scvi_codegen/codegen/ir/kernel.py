@@ -108,6 +108,9 @@ class Kernel:
         formulas: the results as expressions.
         purpose: one sentence on what it computes.
         sums: loops over constant tables that add to the values once all results are stored, in order.
+        tangents: if derivatives are along unit vectors, a linear kernel from directions of the arguments to changes of
+            values, by local derivatives: these are its parameters, and the results of this kernel after the values.
+        entries: change, argument and index of each such derivative, in the order of the arguments.
     """
 
     name: str
@@ -119,6 +122,8 @@ class Kernel:
     formulas: tuple[sympy.Expr, ...] = field(default=(), repr=False, compare=False)
     purpose: str = field(default="", repr=False, compare=False)
     sums: tuple[RolledKernel, ...] = ()
+    tangents: Kernel | None = None
+    entries: tuple[tuple[int, int, int], ...] = ()
 
     def __hash__(self) -> int:
         """Return a hash of the name and the sizes: that of all expressions takes long."""
@@ -135,7 +140,12 @@ class Kernel:
     @property
     def functions(self) -> tuple[Kernel, ...]:
         """The kernel and those of its loops."""
-        return (self, *(rolled.kernel for rolled in self.sums))
+        return (self, *(rolled.kernel for rolled in self.sums), *([self.tangents] if self.tangents else []))
+
+    @property
+    def partials(self) -> int:
+        """Number of derivatives of the values."""
+        return len(self.entries) or len(self.results) - self.values
 
     @property
     def uses_time(self) -> bool:

@@ -19,7 +19,7 @@ from scvi_codegen.codegen.ir.equations import (
     ShiftTables,
     Splitting,
 )
-from scvi_codegen.codegen.ir.kernel import Kernel, Number, NumberTable, RolledKernel
+from scvi_codegen.codegen.ir.kernel import Kernel, Number, NumberTable, RolledKernel, is_divided
 from scvi_codegen.codegen.variants import Sums
 from scvi_codegen.systems.formulas.indices import Array, ArrayDeclarations, ArrayMap, Convolution
 
@@ -333,6 +333,15 @@ class Program:
             ),
         )
         return tuple({kernel.name: kernel for kernel in kernels if kernel}.values())
+
+    @property
+    def masses_of_points(self) -> tuple[int, ...]:
+        """Index of each entry of L_vv among those that the kernel of RATTLE computes; empty if its own is shorter."""
+        legendre, lower = self.quantities.legendre, self.rattle.lower_masses if self.rattle else ()
+        if not (legendre and lower and is_divided([legendre])):
+            return ()
+        indices = {pair: e for e, (i, j) in enumerate(lower) for pair in ((i, j), (j, i))}
+        return tuple(indices[pair] for pair in self.quantities.mass_entries)
 
     @property
     def constraint_positions(self) -> tuple[int, ...]:

@@ -70,8 +70,8 @@ from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 from scvi_codegen.systems.system import MechanicalSystem
 
-MOST_COUPLED_MASSES = 32
-"""Coordinates that masses couple; with more, Newton's method solves for all unknowns."""
+MOST_COUPLED_MASSES = 48
+"""Coordinates that masses couple; with more, whose M^-1 exceeds the cache, Newton's method solves for all unknowns."""
 
 
 def rattle_of(system: MechanicalSystem, stages: StageSystem, predictor: NumberTable) -> Rattle | None:

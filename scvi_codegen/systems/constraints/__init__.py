@@ -15,7 +15,7 @@ from sympy.core.function import AppliedUndef
 
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.systems.constraints.kind import HOLONOMIC, NONHOLONOMIC, Constrained, ConstraintKind
-from scvi_codegen.systems.formulas.expressions import derivative_along, jacobian
+from scvi_codegen.systems.formulas.expressions import derivative_along, jacobian, tangents
 from scvi_codegen.systems.formulas.grammar import sides_of
 from scvi_codegen.systems.formulas.symbols import DOT, symbol
 
@@ -182,7 +182,7 @@ def rate_of_positions(function: Expr, coordinates: Sequence[Symbol], time: Symbo
 
 def time_derivatives(system: Constrained, functions: Sequence[Expr]) -> tuple[Expr, ...]:
     """Return df/dt of functions of (q, v, t), at constant v."""
-    return tuple(time_derivative(function, system.coordinates, system.time) for function in functions)
+    return tangents(functions, (*system.coordinates, system.time), (*system.velocities, sympy.S.One))
 
 
 def with_constraint_forces(system: Constrained, forces: Sequence[Expr]) -> tuple[Expr, ...]:

@@ -339,7 +339,26 @@ def gradient_tuple(expression: Expr, variables: Sequence[Symbol]) -> tuple[Expr,
 
 def derivative_along(expression: Expr, variables: Sequence[Symbol], direction: Sequence[Expr]) -> Expr:
     """Return the derivative along a direction; along the rates of the variables it is that in time."""
-    return Add(*(derivative * direction[i] for i, derivative in gradient(expression, variables).items()))
+    return tangents([expression], variables, direction)[0]
+
+
+def tangents(expressions: Sequence[Expr], variables: Sequence[Symbol], direction: Sequence[Expr]) -> tuple[Expr, ...]:
+    """Return the derivatives of several expressions along a direction, from the first quantity to the last.
+
+    This is forward accumulation: it takes a small multiple of the operations of the expressions.
+
+    >>> from sympy.abc import x, y, z
+    >>> tangents([x * y, y**2], [x, y], [z, x])
+    (x**2 + y*z, 2*x*y)
+    """
+    local, moved = _accumulation(tuple(variables)).of, dict[Any, Expr](enumerate(direction))
+
+    def along(expression: Expr) -> Expr:
+        return total([product(derivative, moved[key]) for key, derivative in local(expression).items()])
+
+    for quantity in intermediates(*expressions):
+        moved[quantity] = intermediate(along(quantity.definition))
+    return tuple(map(along, expressions))
 
 
 def dot(a: Sequence[Expr], b: Sequence[Expr]) -> Expr:

@@ -8,7 +8,7 @@ with 0 are omitted, products with 1 simplified.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import accumulate
 from typing import TypeAlias
@@ -24,7 +24,7 @@ from scvi_codegen.codegen.rendering.kernels.printer import (
     print_number,
     print_statements,
 )
-from scvi_codegen.codegen.rendering.kernels.simd import Lanes
+from scvi_codegen.codegen.rendering.kernels.simd import DIRECTIONS, Lanes
 from scvi_codegen.codegen.rendering.text import table, wrapped, wrapped_comment, wrapped_prototype
 from scvi_codegen.systems.formulas.indices import Access, Place
 
@@ -79,7 +79,7 @@ class _Statements:
         stage_groups = program.equations.stage_groups
         self.u = list(accumulate((group.points * group.value.arguments for group in stage_groups), initial=0))
         self.value = list(accumulate((group.points * group.value.values for group in stage_groups), initial=0))
-        self.partials = [len(group.derivative.results) - group.derivative.values for group in stage_groups]
+        self.partials = [group.derivative.partials for group in stage_groups]
         counts = (group.points * count for group, count in zip(stage_groups, self.partials, strict=True))
         self.derivative = list(accumulate(counts, initial=0))
 
@@ -251,7 +251,27 @@ Printed: TypeAlias = Callable[[Kernel | Part], list[str]]
 
 def kernel_text(kernel: Kernel, target: Target, *, partials: bool = False) -> str:
     """Return a function of numbers, with its comment; ``partials``: always with the argument for derivatives."""
-    return _text(kernel, target, None, partial(print_statements, target=target), partials=partials)
+    if kernel.tangents is None:
+        return _text(kernel, target, None, partial(print_statements, target=target), partials=partials)
+    name, along, real = kernel.name, kernel.tangents, target.scalar
+    purpose = f"Values of {name}, and their local derivatives."
+    local = replace(kernel, name=f"{name}_at", tangents=None, entries=(), purpose=purpose)
+    printed = partial(print_lane_statements, sources=DIRECTIONS.sources, number=target, vector_type=DIRECTIONS.vector)
+    arguments = f"const {real} *u", f"{real} t", f"const {real} *parameters", f"{real} *value", f"{real} *derivative"
+    statements = (
+        f"{real} local[{local.partials}];",
+        f"directions x[{along.arguments}], change[{along.values}];",
+        f"{local.name}(u, t, parameters, value, local);",
+        f"differentiate({along.name}, {along.arguments}, local, {name}_entry, {kernel.partials}, x, change, "
+        "derivative);",
+    )
+    texts = (
+        kernel_text(local, target),
+        _text(along, target, DIRECTIONS, printed),
+        table(f"static const int {name}_entry[{kernel.partials}][3]", [[*map(str, row)] for row in kernel.entries]),
+        f"{wrapped_comment(kernel.purpose)}\n{_function('static', kernel, arguments, statements)}",
+    )
+    return "\n\n".join(texts)
 
 
 def lane_kernel_text(kernel: Kernel, fixed_point: FixedPointIteration | None, lanes: Lanes, target: Target) -> str:
@@ -262,7 +282,7 @@ def lane_kernel_text(kernel: Kernel, fixed_point: FixedPointIteration | None, la
 
 def _text(kernel: Kernel, target: Target, lanes: Lanes | None, printed: Printed, *, partials: bool = False) -> str:
     """Return a function of numbers or lanes, after its parts and the terms of its loops with their tables."""
-    real = "lanes" if lanes else target.scalar
+    real = lanes.vector if lanes else target.scalar
     time, parameter = (lanes.type_of(name, target.scalar) if lanes else real for name in ("t", "parameters"))
     declared = {name: f"{real} *{name}" for name in ARRAYS} | {"u": f"const {real} *u", "t": f"{time} t"}
     declared |= {"parameters": f"const {parameter} *parameters", "kept": f"{real} *restrict kept"}

@@ -204,7 +204,12 @@ def print_statements(code: Kernel | Part, target: Target = DOUBLE) -> list[str]:
 
 
 def print_lane_statements(
-    code: Kernel | Part, fixed_point: FixedPointIteration | None, sources: Sources, number: Target = DOUBLE
+    code: Kernel | Part,
+    fixed_point: FixedPointIteration | None = None,
+    *,
+    sources: Sources,
+    number: Target = DOUBLE,
+    vector_type: str = "lanes",
 ) -> list[str]:
     """Return the statements of a kernel of vectors, or of one of its parts.
 
@@ -213,16 +218,16 @@ def print_lane_statements(
     """
     cut = parts(code) if isinstance(code, Kernel) else (code,)
     if len(cut) > 1:
-        return [f"lanes kept[{kept_length(cut)}];", *map(_call, cut)]
+        return [f"{vector_type} kept[{kept_length(cut)}];", *map(_call, cut)]
     vectors = _Vectors(cut[0], sources)
     statements = []
     for kind, k, expression in cut[0].statements:
         text, vector = print_expression(_with_lane_calls(expression, vectors), number), vectors.has(expression)
         if kind == "w":
-            statements.append(f"const {'lanes' if vector else number.scalar} w{k} = {text};")
+            statements.append(f"const {vector_type if vector else number.scalar} w{k} = {text};")
         else:
             target = _mass_element(fixed_point, k) if kind == "derivative" else f"{kind}[{k}]"
-            statements.append(f"{target} = {text};" if vector else f"{target} = lanes_of({text});")
+            statements.append(f"{target} = {text};" if vector else f"{target} = {vector_type}_of({text});")
     return statements
 
 

@@ -151,11 +151,13 @@ class Lanes:
         sources: loads of a kernel that differ between lanes.
         meaning: its support header, before the tables.
         memory: further headers, after the tables.
+        vector: its type in C.
     """
 
     sources: Sources
     meaning: str
-    memory: tuple[str, ...]
+    memory: tuple[str, ...] = ()
+    vector: str = "lanes"
 
     @property
     def are_points(self) -> bool:
@@ -164,11 +166,12 @@ class Lanes:
 
     def type_of(self, source: str, scalar: str) -> str:
         """Return the C type of the time or of a parameter; ``scalar``: that of numbers."""
-        return "lanes" if source in self.sources else scalar
+        return self.vector if source in self.sources else scalar
 
 
 POINTS = Lanes(("u", "t"), "points", ("core/progress", "iteration/one_trajectory"))
 TRAJECTORIES = Lanes(("u", "parameters"), "trajectories", ("iteration/many_trajectories",))
+DIRECTIONS = Lanes(("u",), "directions", vector="directions")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
