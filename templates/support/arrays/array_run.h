@@ -66,10 +66,7 @@ static int run_workers(run_memory *run, const job *way, solver_report *report)
   return status;
 }
 #else
-static int run_workers(run_memory *run, const job *way, solver_report *report)
-{
-  return way->go(run, way, report);
-}
+#define run_workers(run, way, report) (way)->go(run, way, report)
 #endif
 
 /* Runs of array systems. Requires: bind_work_arrays, perform_step of a solver, or perform_steps and TOGETHER,

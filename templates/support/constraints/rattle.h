@@ -100,16 +100,7 @@ static void prepare_rattle(const step_data *step, rattle_data *data)
 
 #include "iterate.h"
 
-#ifdef VELOCITY_FORCES
-/* Forces at the point of a lane. */
-LANE_FUNCTION void force_of_lane(const step_data *step, const rattle_step *now, int n, number *force)
-{
-  number u[2 * M];
-  TAKE_LANE(u, M, now->at, n);
-  TAKE_LANE(u + M, M, now->v, n);
-  constrained_force(u, step->t + RATTLE_ABSCISSA[n] * step->h, step->parameters, force);
-}
-#else
+#ifndef VELOCITY_FORCES
 #define move_points(step, now) (void)0
 #endif
 
@@ -142,7 +133,10 @@ static __attribute__((flatten)) void evaluate_points(const step_data *step, ratt
     const real t = step->t + RATTLE_ABSCISSA[n + 1] * step->h;
     TAKE_LANE(u, M, now->u, n);
 #ifdef VELOCITY_FORCES
-    force_of_lane(step, now, n, force);
+    number moving[2 * M];
+    TAKE_LANE(moving, M, now->at, n);
+    TAKE_LANE(moving + M, M, now->v, n);
+    constrained_force(moving, step->t + RATTLE_ABSCISSA[n] * step->h, step->parameters, force);
 #else
     constrained_force(u, t, step->parameters, force);
 #endif

@@ -60,7 +60,7 @@ static int newton_from_line(const step_data *step, newton_data *data, real *dp, 
   return is_near ? OK : follow_branch(step, data, dp, keep, options, report);
 }
 
-#ifdef SPURIOUS_TESTED
+#if defined(SPURIOUS_TESTED) && defined(STAGE_POWER)
 /* Detection of spurious solutions of Newton's method. Requires: stage_error.h if the stages have an error estimate. */
 
 #define MOST_ERROR 1.0 /* of a step, relative to the state: beyond it the solution may be a spurious one */
@@ -69,12 +69,10 @@ static int newton_from_line(const step_data *step, newton_data *data, real *dp, 
 /* Returns 1 if converged stages, after so many iterations, have an inadmissible error estimate. */
 static SELDOM int is_spurious(const step_data *step, const real *z, const real *dq, long long iterations)
 {
-#ifdef STAGE_POWER
   if (iterations <= NEARLY_LINEAR)
     return 0;
   return !(MATH(pow)(stage_error(step, z, dq, ALL, DECAY, 0, 0), STAGE_POWER) <= MOST_ERROR);
-#else
-  return 0;
-#endif
 }
+#else
+#define is_spurious(step, z, dq, iterations) ((void)(iterations), 0)
 #endif
