@@ -359,7 +359,7 @@ def _derivative_kernel(
     """Return the kernel of the results and of their derivatives, which :func:`_derivatives` returns.
 
     Local derivatives, of each intermediate quantity by those that it depends on, are evaluated once, and their products
-    with unit vectors in a loop: as many operations as those of the formulas of all entries, in a quarter of the code.
+    with unit vectors in a loop: as many operations as those of the formulas of all entries, in a third of the code.
     """
     name, kernel = f"{group.name}_derivatives", partial(system_kernel, system, u=group.arguments, purpose=purpose)
     if not x:
