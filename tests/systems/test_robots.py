@@ -551,16 +551,25 @@ def test_robots_of_a_folder_are_listed_with_their_outcome(tmp_path):
 
 @pytest.mark.rotated
 def test_trials_and_last_steps_continue_curves_at_sizes_off_the_grid(tmp_path):
-    """From straight lines the iterations until the first step are 12 and 15, and those of the last step 5 and 7."""
+    """The last steps take 5 iterations from straight lines, and a search by larger factors than two up to 64."""
     rod = '<joint name="q{0}" axis="{1}"/><inertial pos="0 0 -.5" mass="1" diaginertia=".0833 .0833 .01"/>'
     axes = ("1 0 0", "0 1 0") * 6
     bodies = "".join(f'<body pos="0 0 {-min(k, 1)}">{rod.format(k, axis)}' for k, axis in enumerate(axes))
     (tmp_path / "chain.xml").write_text(f"<mujoco><worldbody>{bodies}{'</body>' * 12}</worldbody></mujoco>")
     stepper = sc.compile_stepper(sc.LagrangianSystem.from_mjcf(tmp_path / "chain.xml"), "svi:4")
-    start = {"q": np.linspace(0.4, 0.6, 12), "velocity": np.zeros(12), "t_end": 1.0}
-    exact = stepper.integrate(**start, tolerance=1e-11)
-    for tolerance, first, last in ((1e-2, 10, 3), (1e-5, 13, 5)):
-        run = stepper.integrate(**start, tolerance=tolerance)
+    start = {"q": np.linspace(0.4, 0.6, 12), "t_end": 1.0}
+    bounds = (
+        (0.0, 1e-2, 10, 5),
+        (0.0, 1e-5, 13, 5),
+        (-0.3, 1e-2, 6, 3),
+        (-0.3, 1e-5, 7, 3),
+        (1, 1e-2, 14, 5),
+        (1, 1e-5, 20, 8),
+    )
+    for speed, tolerance, first, last in bounds:
+        velocity = np.linspace(speed, speed / 2, 12)
+        exact = stepper.integrate(**start, velocity=velocity, tolerance=1e-11)
+        run = stepper.integrate(**start, velocity=velocity, tolerance=tolerance)
         assert run.iterations[1] <= first
         assert run.iterations[-1] <= last
         assert abs(run.q[-1] - exact.q[-1]).max() < tolerance

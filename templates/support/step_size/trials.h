@@ -16,6 +16,16 @@
 #define SMALL_PART REAL(0.1) /* of the largest momentum: smaller changes count as little */
 #define NEVER_FAILED (1 << 16) /* level beyond all exponents of a number: the iteration failed at no size yet */
 #define SHORT_PART REAL(0.125) /* of the time in which a state changes by its size, or of the span: early trial */
+#ifdef COSTLY_POINTS
+#define LEVELS_OUTSIDE MOST_UP /* by which the curve of a pilot is extrapolated */
+#define GROWTH_OF_PILOTS (GROWTH * REAL(0.84)) /* of their errors, which grow with a lower power of the step size, .. */
+#define LEAST_RISE 4 /* .. or, divided by as much, until they are rounding */
+#else
+#define LEVELS_OUTSIDE 0
+#define GROWTH_OF_PILOTS GROWTH
+#define LEAST_RISE 2
+#endif
+#define AT_START (-NEVER_FAILED) /* trial->inside of the shortest one, whose increments are the rates at its start */
 #define RISING REAL(4.0) /* velocities from rest are larger by this factor in a trial that is much longer */
 #define FEW_ITERATIONS 3 /* of a trial that is much shorter than the time in which forces change */
 #define SUSPENDED 8 /* steps without this rule after one that needed as many iterations as a larger one */
@@ -56,7 +66,6 @@ step_control NAME(default_step_control)(void)
 #define HOT static
 #define AMPLIFIED 1e-14 /* last update beyond which unknowns do not resolve errors in two words */
 #define SHORT_STEPS_FAIL 0
-#define LEVELS_OUTSIDE 0
 #define LEVELS_INSIDE 0 /* no predictor from a rejected step */
 
 /* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
@@ -87,24 +96,38 @@ static real attempt(run_memory *run, step_data *step, const solver_data *data, i
 #define LEVELS_INSIDE INSIDE
 #endif
 #define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */
-#ifdef COSTLY_POINTS
-#define LEVELS_OUTSIDE MOST_UP /* by which the curve of a pilot is extrapolated */
-#else
-#define LEVELS_OUTSIDE 0
-#endif
 
 #ifdef COSTLY_POINTS
 /* Table of the last step of a run, whose size is not on the grid, from the curve of the step before; or, if inside < 0,
- * of a trial in the search for the first step, from that of one that was shorter by -inside levels. Returns 0 without a
- * curve. */
+ * of a trial in the search for the first step, from that of one that was shorter by -inside levels, of a much shorter
+ * one from the velocity at the start. Returns 0 without a curve. */
 static SELDOM int tables_off_grid(const run_memory *run, const step_data *step, int inside, lanes *table)
 {
   const int begins_there = inside < 0;
   const long long level = run->grid_level + (begins_there ? inside : -run->change);
   if (!begins_there && run->guess <= 0)
     return 0;
-  tabulate(begins_there ? 0.0 : 1.0, fabs(step->h) / size_of_level(level), table);
+  tabulate(begins_there ? 0.0 : 1.0, inside < -MOST_UP ? 0.0 : fabs(step->h) / size_of_level(level), table);
   return 1;
+}
+
+/* Increments of a very short step, and its curve, by the rates at the start; returns 0, or infinity from rest, where
+ * they do not show how the motion begins. */
+static SELDOM double step_by_rates(const step_data *step, history memory, double *dq, double *dp)
+{
+  lanes z[GROUPS][M], u[2 * M], rates[2 * M];
+  double moved = 0.0;
+  if (start_velocities(step, z) != OK)
+    return INFINITY;
+  for (int i = 0; i < M; i++)
+    u[i] = lanes_of(step->q0[i]), u[M + i] = z[0][i];
+  value_lanes(u, lanes_of(step->t), step->parameters, rates);
+  for (int i = 0; i < M; i++) {
+    dq[i] = step->h * at_first(&z[0][i]), dp[i] = step->h * at_first(&rates[i]);
+    moved = larger(moved, fabs(dq[i]));
+  }
+  remember_curve(z, memory);
+  return moved > 0.0 && reaches(step, dq, dp) ? 0.0 : INFINITY;
 }
 #endif
 
@@ -119,6 +142,8 @@ static inline __attribute__((always_inline)) double attempt_at(run_memory *run, 
   int status;
 #ifdef COSTLY_POINTS
   lanes table[POINTS * GROUPS];
+  if (inside == AT_START)
+    return step_by_rates(step, STORED(run, step), dq, dp);
 #endif
   step->tables = &tables;
   if (inside > 0) {
@@ -214,6 +239,9 @@ typedef struct {
   long long fallbacks; /* 1 if Newton's method solved it */
 #endif
   int status; /* other than OK if no smaller step can succeed */
+#ifdef COSTLY_POINTS
+  real half_length, half[M * (2 + POINTS)]; /* largest pilot but one, or 0: increments and curve */
+#endif
   real length; /* step size; 0 before the first trial */
   real pilot; /* that of the largest trial so far, in the search for the first step, that was solved */
   int last; /* 1 if the step ends at t_end */
@@ -319,10 +347,17 @@ static SELDOM int moves_little(const run_memory *run, const trial *now)
   return moved < SHORT_MOTION * run->path && moved < SHORT_BY_TOLERANCE * tolerance * run->path;
 }
 
-/* Compares a trial with two half steps, in momenta too if requested. */
-static inline int compare_trial(const trial *now, int momenta, const solver_options *options, real *apart)
+/* Compares a trial with two half steps, in momenta too if requested. The first one may be a pilot. */
+static inline int compare_trial(const run_memory *run, const trial *now, int momenta, const solver_options *options,
+    real *apart)
 {
-  return compare_with_halves(&now->step, now->dq, momenta ? now->dp : NULL, options, apart);
+  const real *known = NULL;
+#ifdef COSTLY_POINTS
+  if (run->error_before == 0 && MATH(fabs)(now->step.h) == 2 * now->half_length)
+    known = now->half;
+#endif
+  (void)run;
+  return compare_with_halves(&now->step, now->dq, momenta ? now->dp : NULL, known, options, apart);
 }
 
 /* Number of levels, at most `most`, by which the step size may be increased without exceeding the largest one. */
@@ -339,8 +374,8 @@ static int levels_up(const run_memory *run, const trial *now)
   real error = now->error;
   int up = 0;
   if (error < now->limits.fewer)
-    for (; up < most && error * GROWTH <= now->limits.most; up++)
-      error *= GROWTH;
+    for (; up < most && error * GROWTH_OF_PILOTS <= now->limits.most; up++)
+      error *= GROWTH_OF_PILOTS;
   return up;
 }
 
@@ -370,12 +405,17 @@ static SELDOM int levels_of_first(const trial *now, real h, real span)
  * relative to V and A of a trial a little larger, so that each smaller one would be rejected, too. */
 static inline void try_pilot(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
+  const int inside = now->inside;
+#ifdef COSTLY_POINTS
+  now->half_length = now->length == now->pilot && !by_newton(now) ? now->pilot : 0;
+  memcpy(now->half, now->dq, sizeof(real) * M);
+  memcpy(now->half + M, now->dp, sizeof(real) * M);
+  memcpy(now->half + 2 * M, run->memory, sizeof(real) * M * POINTS);
+#endif
   try_step(run, now, 0, options, report);
-  if (now->inside < 0) {
-    now->inside = 0;
-    if (!(now->error < INFINITY))
-      try_step(run, now, 0, options, report);
-  }
+  now->inside = 0;
+  if (!(now->error < INFINITY) && (inside == AT_START || (inside < 0 && inside >= -LEVELS_OUTSIDE)))
+    try_step(run, now, 0, options, report);
   if (now->error < INFINITY && now->length > now->pilot) {
     now->pilot = now->length;
     begin_motion(run);
@@ -416,9 +456,11 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
   }
   run->grid_level = level_below(span * FIRST_STEP);
   run->grid_level += levels_within(run, now, 0);
+  now->inside = LEVELS_OUTSIDE ? AT_START : 0;
   try_pilot(run, now, options, report);
   early = levels_within(run, now, levels_of_first(now, now->length, span));
   highest = run->grid_level + levels_within(run, now, (int)(level_below(SHORT_PART * span) - run->grid_level));
+  now->inside = LEVELS_OUTSIDE && now->error < INFINITY ? -early : 0;
   while (early > 0) {
     int more;
     memcpy(v, run->largest_v, sizeof v);
@@ -435,10 +477,14 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
   }
   while (!now->last && up > 0) {
     const int failed = !(now->error < INFINITY), small = now->error <= now->limits.most;
-    const int as_expected = now->error > error_at(shorter, up / 2) && now->error < error_at(shorter, up + up / 2 + 1);
+    const real least = error_at(shorter, up / LEAST_RISE), most = error_at(shorter, up + up / 2 + 1);
+    const int as_expected = now->error > least && now->error < most;
     const int rises = failed ? !SHORT_STEPS_FAIL : as_expected;
     found = found || small;
     up = small ? levels_up(run, now) : 0;
+    if (LEVELS_OUTSIDE && up > 0 && up < LEVELS_PER_BINADE)
+      return;
+    up -= LEVELS_OUTSIDE ? up % LEVELS_PER_BINADE : 0; /* then the last pilot but one is the first half of the last */
     if (up == 0)
       up = found && rises ? levels_from_rest(run, now, v, (int)(highest - run->grid_level))
                           : levels_within(run, now, MOST_UP);
@@ -752,7 +798,7 @@ static SELDOM int compare_step(run_memory *run, trial *now, int steps_to_compare
       ONE_COEFFICIENT || steps_to_compare ? ROUNDOFF_LEVEL : SPURIOUS);
   for (;;) {
     real apart;
-    const int status = compare_trial(now, steps_to_compare, options, &apart);
+    const int status = compare_trial(run, now, steps_to_compare, options, &apart);
     if (status > STATUS(SPURIOUS_SOLUTION))
       return status;
     if (status == OK && apart <= allowed &&
