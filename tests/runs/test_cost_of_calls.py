@@ -21,7 +21,10 @@ def stepper():
 
 
 @pytest.mark.parametrize("convert", [list, tuple, np.array])
-@pytest.mark.parametrize(("plan", "calls"), [(FIXED, 40), (ADAPTIVE, 62)])
+@pytest.mark.parametrize(
+    ("plan", "calls"),
+    [(FIXED, 40), (ADAPTIVE, 62), ({"h": 0.05, "steps": 900}, 40), ({"t_end": 200.0, "tolerance": 1e-10}, 62)],
+)
 def test_a_call_takes_few_function_calls(stepper, convert, plan, calls):
     """The limit is a tenth above the present number, and does not depend on the machine."""
     q, p = convert(Q.tolist()), convert(P.tolist())
@@ -54,7 +57,7 @@ def numbers(found):
 
 
 @pytest.mark.tiers(0, 1)
-@pytest.mark.parametrize("plan", [{"h": 0.05, "steps": 400}, {"t_end": 9.0}])
+@pytest.mark.parametrize("plan", [{"h": 0.05, "steps": 400}, {"h": 0.05, "steps": 1100}, {"t_end": 9.0}])
 def test_memory_of_earlier_calls_does_not_matter(stepper, plan):
     first = stepper.integrate(Q, P, **plan)
     saved = numbers(first)

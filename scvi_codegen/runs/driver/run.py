@@ -19,7 +19,7 @@ from scvi_codegen.runs.states.layout import InitialData
 from scvi_codegen.runs.states.validation import Array, Parameters, States
 from scvi_codegen.runs.states.words import scalar
 from scvi_codegen.runs.stepping.integrator import Integrator
-from scvi_codegen.runs.stepping.memory import FIRST_STEPS, Memory, alone
+from scvi_codegen.runs.stepping.memory import Memory, alone
 from scvi_codegen.runs.stepping.noise import BathReport, report_of
 from scvi_codegen.runs.stepping.projection import constraint_values, multipliers
 from scvi_codegen.runs.stepping.step_plan import Fixed, StepPlan, Until
@@ -43,7 +43,7 @@ class Run(Memory, AttitudeHistory):
     def _reusable(cls, stepper: Integrator) -> Self:
         """Return a run to be started that has memory for short runs, if later calls may use it again."""
         run, binding = cls(stepper), stepper.binding
-        size = binding._workspace + FIRST_STEPS * len(run._q)
+        size = binding._workspace + run._first_saved * len(run._q)
         is_plain = binding.reusable and not run._sums_action and stepper.interface.words == 1
         if is_plain and size <= MOST_KEPT:
             run._rows = ShortRuns(run)
@@ -97,12 +97,12 @@ class Run(Memory, AttitudeHistory):
         return record(self, steps, save_every=output.save_every, progress=output.progress, stop=stop)
 
     def _integrated(self, initial: InitialData, growth: int, steps: int | None, output: Output) -> Trajectory:
-        """Start a run that is set up and record it: by one C call if it ends within ``FIRST_STEPS`` saved states.
+        """Start a run that is set up and record it: by one C call if it ends within its number of states.
 
         ``growth``: value of ``measures_growth`` in C.
         """
         plan, h, save_every, short = self._plan, self._h, output.save_every, self._rows
-        most = FIRST_STEPS if save_every == 1 else self._first_steps(save_every)
+        most = self._first_steps(save_every)
         fits = steps is None if h is None else steps is not None and steps <= most
         special = self._takes_noise or short is None or self._has_tau or self._unset_inputs or self.stepper.searched
         is_plain = output is ALL_STATES or output.has_states_alone

@@ -19,7 +19,7 @@ from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import BINARY64, FEW, NUMBERS, SEQUENCES, Array, evaluation
 from scvi_codegen.runs.states.words import block_of, from_block
 from scvi_codegen.runs.stepping.chunks import drive
-from scvi_codegen.runs.stepping.memory import FIRST_STEPS, Memory
+from scvi_codegen.runs.stepping.memory import Memory
 from scvi_codegen.runs.stepping.noise import report_of
 from scvi_codegen.runs.stepping.step_plan import Adaptive, FixedSteps, InTau, ending_at
 from scvi_codegen.runs.trajectory import Trajectory
@@ -169,14 +169,15 @@ class StateRows:
 
 
 class ShortRuns(StateRows):
-    """Memory of runs of at most ``FIRST_STEPS`` saved states by the plan of a run, each recorded by one C call."""
+    """Memory of runs of few saved states by the plan of a run, each recorded by one C call."""
 
     def __init__(self, memory: Memory) -> None:
-        super().__init__(memory, FIRST_STEPS + 3)
+        rows = memory._first_saved + 3
+        super().__init__(memory, rows)
         stepper, m = memory.stepper, len(memory._q)
         self._states, self._kind = stepper._states, (0, cast("float | None", None))
         self.shape = (m,) if m <= FEW else None  # of vectors that are checked as lists, faster than as arrays
-        self._start, self._sizes = np.empty(1 + 2 * m), np.full(FIRST_STEPS + 3, math.nan)
+        self._start, self._sizes = np.empty(1 + 2 * m), np.full(rows, math.nan)
         self._pack = partial(struct.Struct(f"{1 + 2 * m}d").pack_into, cast(Any, self._start), 0)
         self.call = memory._new_call(*self.starts)
         self.call.start, self.call.sizes = stepper.binding.pointers(self._start, self._sizes)
@@ -246,7 +247,7 @@ class _StateRecorder:
             assert steps is not None  # by the caller
             rows = (first + steps) // save_every - first // save_every + 1
         else:
-            rows = min(FIRST_STEPS, (self.first_size if steps is None else steps) // save_every) + 3
+            rows = min(memory._first_saved, (self.first_size if steps is None else steps) // save_every) + 3
         kept: StateRows | None = memory._rows
         self.rows = kept if kept is not None and rows <= len(kept.states[0]) else StateRows(memory, rows)
         if not filled:

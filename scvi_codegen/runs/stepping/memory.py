@@ -50,8 +50,8 @@ from scvi_codegen.runs.stepping.step_plan import (
     step_control,
 )
 
-FIRST_STEPS = 256
-"""Number of saved states of the first C call, before the speed of the steps is known."""
+FIRST_STEPS, MOST_FIRST = 256, 1024
+"""Number of saved states of the first C call, before the speed of the steps is known; the same for few positions."""
 LONGEST_FIRST, FIRST_NUMBERS = 4096, 2**14
 """Largest number of steps of the first C call, times positions: few saved states must not delay Ctrl-C."""
 STEPS_PER_CALL, MOST_UNTIMED = 10**5, 2**10
@@ -128,6 +128,7 @@ class Memory:
             values = np.concatenate([values, np.zeros(len(values))])
             self._parameters = stepper._states.numbers(values)
         self._longest_first = max(FIRST_STEPS, min(LONGEST_FIRST, FIRST_NUMBERS // len(self._q)))
+        self._first_saved = min(MOST_FIRST, self._longest_first)
         self._arguments = binding.pointer(values), binding.null
         self._control = binding.null  # of steps in C that are not fixed
         self._control_data: Sequence[Any] = ()  # that it refers to
@@ -159,7 +160,7 @@ class Memory:
 
     def _first_steps(self, save_every: int) -> int:
         """Return the largest number of steps of the first C call, of a run that saves every ``save_every``-th state."""
-        steps, most = FIRST_STEPS * save_every, self._longest_first
+        steps, most = self._first_saved * save_every, self._longest_first
         return steps if steps < most else most
 
     def _new_call(self, t: Any, q: Any, p: Any, iterations: Any) -> Any:
