@@ -452,6 +452,24 @@ def test_equations_of_motion_are_those_of_mujoco(case, tmp_path):
     assert max(errors_of_motion(sc.LagrangianSystem.from_mjcf(file, actuators=True), file)) < 1e-12
 
 
+LEG = """<body pos="0 0 -.2"><joint name="hip{0}"/><geom pos="0 0 -.225" size=".05 .225"/><body pos="0 0 -.7">
+<joint name="knee{0}" pos="0 0 .25"/><geom size=".04 .25"/><body pos=".2 0 -.35"><joint name="ankle{0}" pos="-.2 0 .1"/>
+<geom pos="-.1 0 .1" size=".06 .1" zaxis="1 0 0"/></body></body></body>"""
+DROPPED = f"""<mujoco><option><flag contact="disable"/></option><default><geom type="capsule"/><joint axis="0 -1 0"
+armature=".01" damping=".1"/></default><worldbody><body pos="0 0 1.25"><joint name="x" type="slide" axis="1 0 0"
+armature="0" damping="0"/><joint name="z" type="slide" axis="0 0 1" armature="0" damping="0" ref="1.25"/>
+<joint name="pitch" axis="0 1 0" armature="0" damping="0"/><geom size=".05 .2"/>{LEG.format(1)}{LEG.format(2)}</body>
+</worldbody></mujoco>"""
+
+
+@pytest.mark.second
+def test_joints_of_a_robot_that_is_dropped_stay_at_rest(tmp_path):
+    (tmp_path / "robot.xml").write_text(DROPPED)
+    robot = sc.LagrangianSystem.from_mjcf(tmp_path / "robot.xml")
+    run = sc.compile_stepper(robot, "svi:3").integrate(**robot.keyframes["qpos0"], h=0.001, t_end=0.5)
+    assert run.velocity[-1] == pytest.approx([0, -9.81 / 2, *[0] * 7], abs=1e-11)
+
+
 PLANAR = """<joint name="slab" type="planar"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
 <dynamics damping=".3"/></joint><drake:joint name="socket" type="ball"><parent link="b"/><child link="c"/></drake:joint>
 <joint name="knee" type="revolute"><parent link="c"/><child link="d"/><axis xyz="0 1 0"/>

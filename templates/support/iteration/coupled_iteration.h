@@ -146,7 +146,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
       measure_by_largest(stagnant(&now), inverse_size);
 #ifdef SUPPORT_SECANTS_H
     if (k >= FIRST_ITERATIONS && begins(&before, undecided(&now, ACCELERATED_LEVEL)))
-      accelerate(&before, k, k % MASS_AGE == 0, inverse_size, before.begun * undecided(&now, 0.0), r, z);
+      accelerate(&before, k, k % MASS_AGE == 0, inverse_size, before.begun * undecided(&now, CERTAIN_ROUNDING), r, z);
 #endif
     if (must_amplify(&now, options, k))
       for (int n = 0; n < GROUPS; n++)

@@ -86,7 +86,8 @@ static inline int begins(secants *past, number slow)
 }
 
 /* Replaces z = g by the accelerated iterate of iteration k, and stores r and g; restart: whether earlier ones are
- * forgotten; share: 1, or 0 for trajectories that have converged, which the iterations of others do not move. */
+ * forgotten; share: 1, or 0 for trajectories that have converged, which the iterations of others do not move, and whose
+ * changes are rounding errors: the quotients of their differences are of any size. */
 static inline void accelerate(secants *past, int k, int restart, const number *unit, number share, lanes (*r)[M],
     lanes (*z)[M])
 {
