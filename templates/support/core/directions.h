@@ -1,7 +1,5 @@
 #include "numbers.h"
 
-#include <string.h>
-
 /* Derivatives of a kernel along unit vectors, as many at a time as a register has numbers. */
 
 #ifdef __GNUC__
