@@ -393,6 +393,23 @@ def test_slip_in_space_begins_without_a_jump_of_friction(steps: dict[str, float]
     assert np.abs(run.q[:, 2]).max() < 1e-14
 
 
+@pytest.mark.second
+def test_a_slow_slip_in_space_brakes_to_its_stop() -> None:
+    """Friction that nearly balances a turning force: w = r/3 sin(3 t) along it, within w' m/F, which ends at pi/3."""
+    force = "(1000 + cos(3*t))"
+    pushed = sc.LagrangianSystem.from_text(
+        "pushed", ["x", "y"], "(x_dot**2 + y_dot**2)/2", forces={"x": f"{force}*cos(t/20)", "y": f"{force}*sin(t/20)"}
+    )
+    stepper = sc.compile_stepper(pushed, "svi:2", contacts=[sc.friction(["x_dot", "y_dot"], limit=1000)])
+    run = stepper.integrate([0.0, 0.0], velocity=[0.0, 0.0], h=0.05, t_end=1.3)
+    assert run.contact_modes[1] == (pytest.approx(np.pi / 3, abs=1e-6), ("stick",))
+    t, weights = np.polynomial.legendre.leggauss(20)
+    t = (t + 1) * np.pi / 6
+    path = [(np.pi / 6 * weights * np.sin(3 * t) / 3) @ along for along in (np.cos(t / 20), np.sin(t / 20))]
+    assert run.q[-1] == pytest.approx(path, abs=2e-5)
+    assert not run.velocity[-1].any()
+
+
 def test_two_slips_in_space_begin_one_after_another() -> None:
     """Each as it does alone, while the other one slides."""
     blocks = [sc.contact(z, slip=[f"{x}_dot", f"{y}_dot"], friction=0.3) for x, y, z in ("xyz", "abc")]

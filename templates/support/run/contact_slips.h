@@ -9,6 +9,7 @@ enum {
 #define CONTACT_BRAKES 0.25 /* longest parts relative to the time to its stop .. */
 #define CONTACT_GROWS 0.2 /* .. to that from its beginning .. */
 #define CONTACT_RELAXES 2.0 /* .. and to the relaxation of its direction, for which iterations on stages converge .. */
+#define CONTACT_BRAKING 4.0 /* .. and of slips that brake */
 #define CONTACT_SHORT 3e-4 /* .. once that is longer than this part of a step */
 /* Least size of an adaptive step for this, relative to the largest so far: the energy of a stool that falls on its feet
  * grows without bound for 0, and by 1e-8, 7e-11, 3e-12, 8e-13, 8e-13 for 2^-12, 2^-9, 2^-6, 2^-3, 1. */
@@ -20,7 +21,7 @@ enum {
 /* Whether the stage equations of a step were not solved, those of a shorter one may be. */
 static int is_unsolved(int status)
 {
-  return status == NOT_CONVERGED || status == STATUS(SPURIOUS_SOLUTION);
+  return status == NOT_CONVERGED || status == SINGULAR || status == STATUS(SPURIOUS_SOLUTION);
 }
 
 /* Adds a change of the modes at a state to the crossings. */
@@ -133,7 +134,7 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
     if (keeps[k] && !stops)
       *longest = fmin(*longest, fmax(CONTACT_BEGIN * whole, CONTACT_GROWS * age));
     else if (!keeps[k])
-      *longest = fmin(*longest, stops ? part : fmin(part, relaxes));
+      *longest = fmin(*longest, fmin(part, stops ? CONTACT_BRAKING * relaxes : relaxes));
     turns |= begins[k];
     changes |= begins[k] || keeps[k] != kept || (!kept && ahead[0] * w[0] + ahead[1] * w[1] < CONTACT_TURN * size);
     for (int i = 0; i < 2; i++)

@@ -336,10 +336,11 @@ static int shorten_part(const event_step *step, event_sample *left, event_sample
     is_taken &= step->own[MODE_PLACE[k]] == step->watch->mode[k];
   put_modes(step->watch->mode, step->own);
   real by_slips = longest;
-  TRY(renew_slips(step, left, &by_slips));
-  longest = fmin(longest, by_slips);
   if (longest < fabs(whole))
     *part = copysign(longest, whole);
+  TRY(renew_slips(step, left, &by_slips));
+  if (by_slips < longest)
+    *part = copysign(by_slips, whole);
   if (!(*part == whole && is_taken)) {
     TRY(step_from_left(step, left, *part, right));
     right->t = *part == whole ? end : left->t + *part;
@@ -402,6 +403,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       continue;
     }
     longest = INFINITY;
+    halvings = 0;
 #endif
 #ifdef EVENT_KINKS
     if (status == OK && !far)
