@@ -410,10 +410,20 @@ class MechanicalSystem(Deferred, ABC):
 
     @property
     def constraint_texts(self) -> tuple[str, ...]:
-        """Constraints g as text, without modes, in the names of the rotations and directions of a Lagrangian."""
+        """Constraints g as text, without modes, in the names of the rotations and directions of a Lagrangian.
+
+        Of those of contacts that would exceed ``LONGEST_SHOWN`` the text is a number.
+        """
+        from scvi_codegen.systems.formulas.intermediates import LONGEST_SHOWN, written_size
         from scvi_codegen.systems.formulas.kinks import without_modes
 
-        return tuple(self.text_of(without_modes(g)) for g in (self.reduced or self).constraints)
+        formulas = (self.reduced or self).constraints
+        first = len(formulas) - len(self.reactions)
+        sizes = [written_size(g) if k >= first else 0 for k, g in enumerate(formulas)]
+        return tuple(
+            self.text_of(without_modes(g)) if size <= LONGEST_SHOWN else f"g_{k}, of {size} terms and factors"
+            for k, (g, size) in enumerate(zip(formulas, sizes, strict=True), 1)
+        )
 
     def with_parameters(self, **values: float) -> Self:
         """Return a copy of the system with other default values for the named parameters."""

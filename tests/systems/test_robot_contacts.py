@@ -8,7 +8,10 @@ from scipy.spatial.transform import Rotation
 import scvi_codegen as sc
 from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning
 from scvi_codegen.interfaces.models.model_files.model_file import parse_model
-from scvi_codegen.systems.formulas.expressions import evaluate
+from scvi_codegen.systems.contacts.modes import bound_contacts
+from scvi_codegen.systems.formulas.expressions import Tape, evaluate
+from scvi_codegen.systems.formulas.intermediates import LONGEST_WRITTEN, written_size
+from scvi_codegen.systems.formulas.rotations import RotationNames
 
 FLOOR = '<geom name="floor" type="plane" size="1 1 1" pos=".1 .2 .3" euler="10 20 30" friction=".3"/>'
 ALL = {"limits": "contact", "friction": "contact", "contacts": "planes"}
@@ -68,6 +71,30 @@ def test_spheres_that_reach_no_plane_are_no_contacts(tmp_path):
 
 BALL = '<body name="b"><freejoint/><geom name="ball" size=".1" {}/></body>'
 PAIR = '<contact><pair geom1="ball" geom2="floor" {}/></contact>'
+
+
+def test_transitions_behind_many_hinges_have_intermediate_quantities(tmp_path):
+    """Their formulas in joint coordinates would be too long to write."""
+    arm = '<geom name="hand" size=".1" pos="0 0 -.3"/>'
+    for k in range(5):
+        joint = f'<joint name="j{k}" axis="{k % 2} {(k + 1) % 2} .{k}"/><geom size=".1" contype="0" conaffinity="0"/>'
+        arm = f'<body pos=".1 .2 -.3">{joint}{arm}</body>'
+    base = '<freejoint name="f"/><geom size=".2" contype="0" conaffinity="0"/>'
+    system = robot(tmp_path, f"{FLOOR}<body>{base}{arm}</body>")
+    (contact,), (row,) = system.contacts, bound_contacts(system, system.contacts).rows
+    assert min(map(written_size, contact.slip)) > LONGEST_WRITTEN
+    random, matrix = np.random.default_rng(3), Rotation.from_rotvec([0.1, 0.5, -0.3]).as_matrix()
+    values = {f"R_f_{i + 1}{k + 1}": matrix[i, k] for i in range(3) for k in range(3)}
+    symbols = sorted(contact.gap.free_symbols | contact.slip[0].free_symbols, key=str)
+    values |= {x.name: random.uniform(-1, 1) for x in symbols if x.name not in values}
+    formulas = Tape([contact.gap, contact.slip[0]], symbols)
+    gap, slip = map(float, formulas([values[x.name] for x in symbols]))
+    values |= dict.fromkeys(row.masks, 0.0) | dict.fromkeys((row.directions[0], row.directions[3]), 1.0)
+    functions = {kind: formula for kind, formula, *_ in row.transitions}
+    for name, formula in (*row.quantities, *functions.items()):
+        if name in (*dict(row.quantities), "closes", "stops"):
+            values[name] = eval(formula, {"sin": np.sin, "cos": np.cos}, values)
+    assert (values["closes"], values["stops"]) == pytest.approx((gap, slip), rel=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -318,3 +345,37 @@ def test_rebounds_of_a_joint_above_feet_that_rest_end(tmp_path):
     )
     assert np.diff(run.energy()).max() < 1e-12
     assert len(run.contact_modes) < len(run)
+
+
+THIGH = '<geom type="capsule" fromto="0 0 0 -.12 0 -.16" size=".03" mass="1"/>'
+SHIN = '<geom type="capsule" fromto="0 0 0 .12 0 -.16" size=".02" mass=".4"/><geom class="foot" pos=".12 0 -.18"/>'
+QUADRUPED = "".join(f"""<body pos="{x} {y} 0"><joint name="a{i}" axis="1 0 0" range="-45 45"/>
+<joint name="h{i}" axis="0 1 0" range="-60 60"/>{THIGH}
+<body pos="-.12 0 -.16"><joint name="k{i}" axis="0 1 0" range="-60 30"/>{SHIN}</body></body>"""
+for i, (x, y) in enumerate([(0.2, 0.12), (0.2, -0.12), (-0.2, 0.12), (-0.2, -0.12)]))  # fmt: skip
+QUADRUPED = f"""<mujoco><default><geom contype="0" conaffinity="0"/><joint damping="3" stiffness="80" armature=".005"/>
+<default class="foot"><geom type="sphere" size=".03" mass=".1" contype="1"/></default></default><worldbody>
+<geom type="plane" size="5 5 1" conaffinity="1" friction=".8"/><body><freejoint name="f"/>
+<geom type="box" size=".25 .1 .06" mass="10"/>{QUADRUPED}</body></worldbody></mujoco>"""
+
+
+@pytest.mark.filterwarnings("ignore:a transition has several motions")
+@pytest.mark.filterwarnings("ignore:the contacts depend")
+@pytest.mark.rotated
+def test_a_quadruped_in_space_bounces_on_its_feet_and_comes_to_rest(tmp_path):
+    """Nothing supplies energy, and no foot is below the floor."""
+    (tmp_path / "quadruped.xml").write_text(QUADRUPED)
+    arguments = {"limits": "contact", "contacts": "planes", "restitution": 0.3}
+    system = sc.LagrangianSystem.from_mjcf(tmp_path / "quadruped.xml", **arguments)
+    stepper = sc.compile_stepper(system, "svi:2")
+    start = {x.name: 0.0 for x in system.coordinates[:-4]} | {"z_f": 0.75, "R_f": [0.98, 0.06, 0.08, np.sqrt(0.0296)]}
+    velocity = {x.name: 0.0 for x in system.coordinates[:-4]} | {"x_f": 0.3, "y_f": 0.1, "omega_f": [0.2, -0.3, 0.1]}
+    run = stepper.integrate(start, velocity=velocity, h=0.005, t_end=4.0)
+    energy, names = run.energy(), [x.name for x in system.coordinates]
+    assert np.diff(energy).max() < 1e-9 * np.ptp(energy)
+    gaps = [RotationNames(system.rotations).in_coordinates(contact.gap) for contact in system.contacts[-4:]]
+    feet = Tape(gaps, system.coordinates)
+    assert min(min(map(float, feet(q.tolist()))) for q in run.q[::20]) > -1e-9
+    assert run.contact_modes[-1][1][-4:] == ("stick",) * 4
+    assert np.abs(run.velocity[-1]).max() < 0.01
+    assert 0.33 < run.q[-1, names.index("z_f")] < 0.37

@@ -57,6 +57,7 @@ from scvi_codegen.systems.formulas.arrays import ArrayTerm, parse_coordinate, pa
 from scvi_codegen.systems.formulas.expressions import evaluated, parts_of_type, unsupported_part
 from scvi_codegen.systems.formulas.grammar import named_tables
 from scvi_codegen.systems.formulas.indices import Access, Array, Loop, Size
+from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.formulas.kinks import rint, steps_on_sides, unit_step
 from scvi_codegen.systems.formulas.rotations import RotationNames, entries_in_formulas
 from scvi_codegen.systems.formulas.symbols import DOT, TIME, identifier, input_formulas, symbol
@@ -118,6 +119,8 @@ class EventFormulas:
         self._turning = RotationNames.of_states(interface.rotations, _names(interface))
         self._known = self._turning.symbols | _names(interface)
         self._grammar = _Grammar(interface, self._turning)
+        for name, formula in (pair for contact in interface.contacts for pair in contact.quantities):
+            self._known[name] = intermediate(self._read(formula, f"quantity '{name}'"))
         elements = [self._elements(event) for event in events]
         self.elements = [*map(len, elements)]
         self.events = [element for of_event in elements for element in of_event]

@@ -63,7 +63,7 @@ def _contact_of(row: Sequence[Any]) -> ContactRows:
         all(number is None or KINDS["int"](number) for number in (contact.normal, contact.tangential, contact.slips))
         and all(map(KINDS["str | None"], (contact.closed, contact.held)))
         and all(map(KINDS["tuple[str, ...]"], (contact.sticks, (*contact.directions, contact.title))))
-        and KINDS["tuple[tuple[str, ...], ...]"](contact.transitions)
+        and all(map(KINDS["tuple[tuple[str, ...], ...]"], (contact.transitions, contact.quantities)))
         and contact.impacts in [*Impacts]
     ):
         raise ValueError(f"contacts contain {contact!r:.60}: these are not the places of a contact")

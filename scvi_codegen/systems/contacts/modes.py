@@ -28,6 +28,7 @@ from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.event import LOOPS, Formula
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
 from scvi_codegen.systems.formulas.indices import Array, Size
+from scvi_codegen.systems.formulas.intermediates import intermediates, parts
 from scvi_codegen.systems.formulas.symbols import DOT
 
 if TYPE_CHECKING:
@@ -103,6 +104,7 @@ class _Binding:
         self.functions = named_tables(system.functions)
         self.driven = input_formulas(system.inputs, system.time)
         self.masks: list[Symbol] = []
+        self.quantities: dict[Expr, Symbol] = {}
         self.constraints: list[Expr] = []
         self.reactions: list[Any] = []
         self.forces = [*(system.forces or (sympy.S.Zero,) * system.dimension)]
@@ -189,7 +191,9 @@ class _Binding:
         if isinstance(formula, str):
             expression = self.turning.read(formula, self.names | self.functions)
         else:
-            expression = self.sympy.nsimplify(self.sympy.sympify(formula), rational=True)
+            expression = self.sympy.sympify(formula)
+            decimals = [part for part in parts(expression) if part.is_Float]  # each once, unlike nsimplify
+            expression = expression.xreplace({x: self.sympy.nsimplify(x, rational=True) for x in decimals})
             expression = expression.xreplace({x: self.names.get(x.name, x) for x in expression.free_symbols})
         if unknown := sorted(x.name for x in expression.free_symbols - {*self.names.values()}):
             raise SystemDefinitionError(
@@ -198,12 +202,27 @@ class _Binding:
             )
         return cast("Expr", expression.xreplace(self.driven))
 
-    def _mask(self, number: int, role: str) -> Symbol:
+    def _named(self, number: int, role: str) -> Symbol:
         name = f"contact_{number}_{role}"
         if name in self.names:
             raise SystemDefinitionError(f"the name '{name}' of '{self.system.name}' is that of a contact: rename it")
-        self.masks.append(self.symbol(name))
+        return self.symbol(name)
+
+    def _mask(self, number: int, role: str) -> Symbol:
+        self.masks.append(self._named(number, role))
         return self.masks[-1]
+
+    def _add_quantities(self, number: int, formulas: Sequence[Expr]) -> tuple[tuple[str, str], ...]:
+        """Name the intermediate quantities in formulas; return the names and formulas of new ones."""
+        first = len(self.quantities)
+        of_tables = {quantity for quantity in intermediates(*formulas) if quantity.arguments}
+        new = [part for part in intermediates(*formulas, without=of_tables) if part not in self.quantities]
+        self.quantities |= {part: self._named(number, f"quantity_{k}") for k, part in enumerate(new, first + 1)}
+        return tuple((self.quantities[part].name, self._text_of(part.definition)) for part in new)
+
+    def _text_of(self, formula: Expr) -> str:
+        """Return a formula in the names of quantities."""
+        return self.system.text_of(formula.xreplace(self.quantities))
 
     def _row(self, formula: Expr, active: Symbol, direction: Sequence[Expr]) -> int:
         """Add a masked constraint; return its number among them."""
@@ -222,7 +241,7 @@ class _Binding:
         gradient = [*gradient_tuple(in_coordinates, variables)]
         moving = formula.free_symbols & self.moving
         if role == "slip":
-            moving &= {x for rate in moving for x in formula.diff(rate).free_symbols}
+            moving &= {x for slope in gradient_tuple(formula, [*moving]) for x in slope.free_symbols}
         if moving or not any(gradient):
             form = "a function of positions and time" if role == "gap" else "linear in velocities, and contain one"
             raise SystemDefinitionError(
@@ -293,15 +312,16 @@ class _Binding:
                 transitions["begins"] = sticks[0] * (limit**2 - tau[0] ** 2 - tau[1] ** 2) + 1 - sticks[0]
         names = closed and closed.name, tuple(mask.name for mask in sticks), moving.names if moving else (), held.name
         leaves = [("leaves", closed * u + (1 - closed) ** 2) for u in conditions if closed is not None]  # u if closed
-        where = [f"{self.system.text_of(u)} >= 0" for u in conditions]
+        quantities = self._add_quantities(number, [*transitions.values(), *conditions])
+        where = [f"{self._text_of(u)} >= 0" for u in conditions]
         functions = tuple(
-            (kind, self.system.text_of(function), *(where if kind == "closes" else ()))
+            (kind, self._text_of(function), *(where if kind == "closes" else ()))
             for kind, function in (*transitions.items(), *leaves)
         )
-        shown = " and ".join(map(self.system.text_of, (item.gap,) if of_gap else slips))
-        title = item.name or f"{'gap' if of_gap else 'slip'} '{shown}'"
+        shown = () if item.name else (item.gap,) if of_gap else slips
+        title = item.name or f"{'gap' if of_gap else 'slip'} '{' and '.join(map(self.system.text_of, shown))}'"
         law = getattr(item, "impacts", Impacts.SEQUENTIAL)
-        return ContactRows(normal, tangential, len(slips), *names, title, functions, law)
+        return ContactRows(normal, tangential, len(slips), *names, title, functions, law, quantities)
 
     def _slipping(self, number: int, slips: Sequence[Expr]) -> Slipping:
         """Return the direction of a slip w: a parameter d in a plane, else that of (ahead.w) w + start."""

@@ -38,6 +38,8 @@ class ContactRows(NamedTuple):
         transitions: kinds, functions and conditions of its transitions
             (:class:`~scvi_codegen.systems.event.Transition`).
         impacts: their law.
+        quantities: names and formulas of the intermediate quantities in its transitions that no contact before it has,
+            each after those in its formula: the velocity of a body is one of that of the body before it.
     """
 
     normal: int | None
@@ -50,6 +52,7 @@ class ContactRows(NamedTuple):
     title: str
     transitions: tuple[tuple[str, ...], ...]
     impacts: str = Impacts.SEQUENTIAL
+    quantities: tuple[tuple[str, str], ...] = ()
 
     def mode(self, parameters: Mapping[str, float]) -> ContactMode:
         """Return its mode by the values of its masks."""

@@ -26,6 +26,9 @@ from scvi_codegen.systems.formulas.kinks import absolute, rint, unit_step
 LONGEST_WRITTEN = 20_000
 """Largest number of nodes of a formula that is displayed or stored as text."""
 
+LONGEST_SHOWN = 1_000
+"""That of formulas of contacts in messages and comments."""
+
 _NUMBERS = count()
 _KNOWN: WeakValueDictionary[Expr, Intermediate] = WeakValueDictionary()
 
