@@ -65,7 +65,7 @@ FAULTS = {
         *("double/svi", stage_groups, "_derivative_blocks"),
         of_result(lambda blocks: ((blocks[0][0] * sympy.Rational(21, 20), *blocks[0][1:]), blocks[1])),
     ),
-    "L_vq v left out": ("double/sc", derived_expressions, "_along", without_velocities),
+    "L_vq v left out": ("double/sc", derived_expressions, "tangents", without_velocities),
     "momentum by A in place of its transpose": (
         *("kepler/sc-phase-space", stage_system.Table, "transposed"),
         lambda own: property(lambda table: own.fget(table) if len(table.entries[0]) == 1 else table),
