@@ -118,6 +118,18 @@ def test_independent_contacts_have_their_own_scales() -> None:
     assert run.contact_modes[-1] == (pytest.approx(1 / 0.3), ("stick", "stick"))
 
 
+@pytest.mark.parametrize("start", [0.0, 0.123])
+def test_a_limit_lifts_by_a_small_force_in_free_fall(start: float) -> None:
+    """A force of 1e-6 of the weight that changes its sign at the start, and s'' = f (1/m + 1/M) after it."""
+    text = "(z_dot**2 + 2*(z_dot + s_dot)**2)/2 - 10*(z + 2*(z + s)) + 2e-5*(t - T)*s"
+    stepper = sc.compile_stepper(lagrange("limit", "z s", text, T=start), "svi:2", contacts=[sc.contact("s")])
+    for steps in ({"h": 0.05}, {"tolerance": 1e-8}):
+        run = stepper.integrate([0.0] * 2, velocity=[0.0] * 2, t_end=0.5, **steps)
+        assert [len(each.t) for each in run.transitions] == [0, 1]
+        assert run.transitions[1].t[0] == pytest.approx(start, abs=1e-8)
+        assert run.q[-1, 1] == pytest.approx(2e-5 * (0.5 - start) ** 3 / 6 * (1 + 1 / 2), rel=1e-7)
+
+
 @pytest.mark.second
 @pytest.mark.parametrize("height", [0.0, 0.2])
 def test_a_straight_leg_lands_at_the_limit_of_its_joint(height: float) -> None:

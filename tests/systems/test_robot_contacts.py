@@ -379,3 +379,25 @@ def test_a_quadruped_in_space_bounces_on_its_feet_and_comes_to_rest(tmp_path):
     assert run.contact_modes[-1][1][-4:] == ("stick",) * 4
     assert np.abs(run.velocity[-1]).max() < 0.01
     assert 0.33 < run.q[-1, names.index("z_f")] < 0.37
+
+
+LEGS = """<body><joint name="z" type="slide" axis="0 0 1"/><joint name="x" type="slide" axis="1 0 0"/>
+<joint name="p" axis="0 1 0"/>{}<body pos="0 0 {}"><joint name="hip" axis="0 1 0" range="-150 0"/>{}
+<body pos="0 0 {}"><joint name="knee" axis="0 1 0" range="-150 0"/>{}</body></body></body>"""
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize(("length", "mass"), [(1.0, 1.0), (1e3, 1e-3)])
+def test_joints_at_their_limits_stay_there_in_free_fall(length, mass, tmp_path):
+    """Forces of these joints are 0: what remains of the weights of their bodies is rounding."""
+    form = (
+        f'<geom type="capsule" size="{0.05 * length}" density="{1e3 * mass / length**3}" fromto="0 0 0 {{}} 0 {{}}"/>'
+    )
+    thigh, shin, foot = (form.format(x * length, z * length) for x, z in ((0, -0.4), (0, -0.5), (0.3, 0)))
+    bodies, weight = LEGS.format(thigh, -0.4 * length, shin, -0.5 * length, foot), 9.81 * length
+    legs = robot(tmp_path, bodies, f'<option gravity="0 0 {-weight}"/>', limits="contact")
+    stepper = sc.compile_stepper(legs, "svi:2")
+    for steps in ({"h": 0.005}, {"tolerance": 1e-6}):
+        run = stepper.integrate([0.0] * 5, velocity=[0.0] * 5, t_end=0.2, **steps)
+        assert sum(len(each.t) for each in run.transitions) == 0
+        assert run.q[-1] == pytest.approx([-weight * 0.2**2 / 2, 0, 0, 0, 0], rel=1e-13, abs=1e-13)

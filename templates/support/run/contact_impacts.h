@@ -217,7 +217,7 @@ static int collide(const event_step *step, event_sample *at, contact_terms *of, 
  * T+ - T- = Lambda r+ - Lambda W Lambda / 2 < 0. Returns whether there are any. */
 static int jump(const event_step *step, event_sample *at, contact_terms *of, contact_change *now)
 {
-  contact_problem in = {.of = of};
+  contact_problem in = {.of = of, .lifts = 1};
   contact_mode mode[EVENT_CONTACTS];
   real right[CONTACT_ROWS], after[CONTACT_ROWS], impulse[CONTACT_ROWS] = {0.0};
   real speed = 0.0, approach = 0.0, largest = 0.0;

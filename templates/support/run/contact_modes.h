@@ -20,6 +20,7 @@ typedef struct {
   const real *right;
   const real *scale; /* of the rates of impulses, which may vanish at closed contacts; NULL: of forces */
   int is_strict; /* slips that begin have a rate */
+  int lifts; /* contacts without force are open, else closed */
   int is_relaxed; /* contacts at their limit do not stick */
   int is_free[EVENT_CONTACTS], rests[EVENT_CONTACTS], begins[EVENT_CONTACTS], limit[EVENT_CONTACTS];
   contact_mode role[EVENT_CONTACTS]; /* whether it may be closed, and its friction any (sticks) or in its direction */
@@ -47,10 +48,11 @@ static void allow_modes(contact_problem *in, int k, const contact_change *now, r
     in->role[k].direction[i] = w[i] / length_of(w, at->slips);
 }
 
-/* Effect of rounding on the rates of a row, by their sizes in all rows on whose forces it depends. */
+/* Effect of rounding on the rates of a row, by their sizes in all rows on whose forces it depends, and by the terms of
+ * a second rate: in free fall those of joints cancel. */
 static real rounding_at_row(const contact_problem *in, const real *after, int row)
 {
-  real size = 0.0;
+  real size = in->scale ? 0.0 : in->of->second_terms[row];
   for (int r = 0; r < CONTACT_ROWS; r++)
     if (in->of->W[row * CONTACT_ROWS + r] != 0.0)
       size = fmax(size, fmax(in->scale ? in->scale[r] : 0.0, fmax(fabs(in->right[r]), fabs(after[r]))));
@@ -71,7 +73,7 @@ static int is_consistent(const contact_problem *in, const contact_mode *mode, re
     if (in->is_free[k])
       continue;
     if (normal >= 0 && mode[k].closed &&
-        !(force[normal] * of->W[normal * (CONTACT_ROWS + 1)] > (in->scale ? -small : small)))
+        !(force[normal] * of->W[normal * (CONTACT_ROWS + 1)] > (in->lifts ? small : -small)))
       return 0;
     if (normal >= 0 && !mode[k].closed && after[normal] < -small)
       return 0;
@@ -271,7 +273,7 @@ static int enumerate_modes(contact_problem *in, const contact_mode *best, const 
     if (!is_consistent(in, mode, force, after))
       continue;
     for (int r = 0; r < CONTACT_ROWS && best; r++)
-      differs |= fabs(after[r] - rates[r]) > CONTACT_APART * fmax(size, fabs(after[r]));
+      differs |= fabs(after[r] - rates[r]) > CONTACT_APART * fmax(size, fabs(after[r])) + rounding_at_row(in, after, r);
     if (differs)
       return 1;
   }
@@ -348,7 +350,7 @@ static int is_impossible(const contact_terms *of, int k, real *number)
 /* Sets the consistent modes at a state that stick most, of redundant contacts those near given forces. */
 static int choose_modes(const event_step *step, const contact_terms *of, const contact_change *now, real *force)
 {
-  contact_problem in = {.of = of, .right = of->second, .is_strict = 1};
+  contact_problem in = {.of = of, .right = of->second, .is_strict = 1, .lifts = now->lifts};
   contact_mode best[EVENT_CONTACTS], other[EVENT_CONTACTS];
   real second[CONTACT_ROWS];
   int imposed[CONTACT_ROWS] = {0};

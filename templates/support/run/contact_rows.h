@@ -38,21 +38,21 @@ static const contact_mode CONTACT_IS_OPEN = {0, 0, 0, {0.0, 0.0}};
 static const contact_mode CONTACT_STICKS = {1, 3, 0, {0.0, 0.0}};
 static const contact_mode CONTACT_SLIPS = {1, 0, 0, {0.0, 0.0}};
 
-/* Rows at a state: values and rates, second rates b, the terms of values by whose rounding these differ, W and G by
- * rows, coefficients (mu, mu_s, e; limits of friction without gap), the sizes of values and rates, the rounding of
+/* Rows at a state: values and rates, second rates b, the terms of values and of b by whose rounding these differ, W and
+ * G by rows, coefficients (mu, mu_s, e; limits of friction without gap), the sizes of values and rates, the rounding of
  * values, and rates at rest. */
 typedef struct {
   real numbers[CONTACT_NUMBERS];
-  const real *value, *rate, *second, *terms, *W, *G, *coefficient;
+  const real *value, *rate, *second, *terms, *second_terms, *W, *G, *coefficient;
   real size[CONTACT_ROWS], speed[CONTACT_ROWS], rounding[CONTACT_ROWS], drift[CONTACT_ROWS];
   int absent[EVENT_CONTACTS]; /* whether a condition of the contact fails, or the state is behind it */
 } contact_terms;
 
 /* Transitions that end a mode together, and their consequences: contacts that close, or whose conditions fail, slips
- * that stop, directions of slips that begin; contacts with g = g' = 0, and with w = 0. */
+ * that stop, directions of slips that begin, whether contacts lift; contacts with g = g' = 0, and with w = 0. */
 typedef struct {
   int closes[EVENT_CONTACTS], leaves[EVENT_CONTACTS], stops[EVENT_CONTACTS], begins[EVENT_CONTACTS];
-  int touches[EVENT_CONTACTS], rests[EVENT_CONTACTS];
+  int lifts, touches[EVENT_CONTACTS], rests[EVENT_CONTACTS];
 } contact_change;
 
 static real length_of(const real *x, int count)
@@ -134,7 +134,8 @@ static int rows_at(real t, const real *q, const real *p, const real *parameters,
   of->rate = of->value + CONTACT_ROWS;
   of->second = of->rate + CONTACT_ROWS;
   of->terms = of->second + CONTACT_ROWS;
-  of->W = of->terms + CONTACT_ROWS;
+  of->second_terms = of->terms + CONTACT_ROWS;
+  of->W = of->second_terms + CONTACT_ROWS;
   of->G = of->W + CONTACT_ROWS * CONTACT_ROWS;
   of->coefficient = of->G + CONTACT_ROWS * M;
   return NAME(contact_terms)(t, q, p, idle, imposed, of->numbers, workspace);

@@ -180,6 +180,7 @@ static int change_contacts(const event_step *step, long long first, event_sample
       const int *const transition = TRANSITION[step->found[i].function - FIRST_TRANSITION];
       const int k = transition[0];
       now.closes[k] |= transition[1] == CONTACT_CLOSES;
+      now.lifts |= transition[1] == CONTACT_LIFTS;
       now.leaves[k] |= transition[1] == CONTACT_LEAVES || (transition[1] == CONTACT_CLOSES && has_just_left(step, k));
       now.stops[k] |= transition[1] == CONTACT_STOPS;
       now.begins[k] += (transition[1] == CONTACT_FORWARD || transition[1] == CONTACT_BEGINS) -
@@ -217,6 +218,31 @@ static int is_kept(int transition)
 {
   const int kind = TRANSITION[transition][1];
   return kind == CONTACT_LEAVES || (kind == CONTACT_CLOSES && !IS_CONDITIONAL[FIRST_TRANSITION + transition]);
+}
+
+/* Effect of rounding on the gap or the normal force of a transition, by their terms: of forces f = -W^-1 b by those of
+ * b, with W of the closed contacts and sticking slips. 0 for others. */
+static int rounding_of_contact(const event_step *step, int event, const event_sample *at, real *rounding)
+{
+  const int kind = TRANSITION[event - FIRST_TRANSITION][1];
+  const int row = CONTACTS[TRANSITION[event - FIRST_TRANSITION][0]].normal;
+  contact_terms of;
+  contact_mode mode[EVENT_CONTACTS];
+  real right[CONTACT_ROWS] = {0.0}, force[CONTACT_ROWS] = {0.0}, after[CONTACT_ROWS];
+  *rounding = 0.0;
+  if (kind != CONTACT_CLOSES && kind != CONTACT_LIFTS)
+    return OK;
+  TRY(terms_at(step, at, &of));
+  modes_at(&of, step->watch->mode, mode);
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    mode[k] = CONTACTS[k].normal < 0 && !mode[k].sticks ? CONTACT_IS_OPEN : mode[k]; /* of constant friction */
+  right[row] = 1.0;
+  if (kind == CONTACT_LIFTS)
+    solve_contacts(&of, mode, right, force, after, NULL);
+  *rounding = kind == CONTACT_CLOSES ? DBL_EPSILON * of.size[row] : 0.0;
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    *rounding += DBL_EPSILON * fabs(force[r]) * of.second_terms[r];
+  return OK;
 }
 
 /* Whether the function of a transition is that of forces in their cone. */

@@ -93,6 +93,10 @@ typedef struct {
   real *own; /* the parameters, with the modes of kinks */
 } event_step;
 
+#ifdef EVENT_CONTACTS
+static int rounding_of_contact(const event_step *step, int event, const event_sample *at, real *rounding);
+#endif
+
 /* Values of all functions at a node, at a state (EVENT_DEGREE + 1), and the effect of rounding (EVENT_DEGREE + 2). */
 static real *values_at(const event_step *step, int row)
 {
@@ -505,28 +509,41 @@ static int first_to_change(const event_step *step, const real *far)
 static int search_function(const event_step *step, int e, const event_sample *left, const event_sample *right)
 {
   event_sample start = *left, from, to = *right;
+  int starts = !step->watch->started;
   real inner[EVENT_DEGREE - 1], middle = values_at(step, EVENT_DEGREE / 2)[e], range = 0.0, largest = 0.0;
+  real least = INFINITY;
   start.g = values_at(step, 0)[e];
   to.g = values_at(step, EVENT_DEGREE)[e];
   for (int j = 1; j < EVENT_DEGREE; j++)
     inner[j - 1] = values_at(step, j)[e];
   for (int j = 0; j <= EVENT_DEGREE; j++)
     range = fmax(range, fabs(values_at(step, j)[e] - middle));
-  for (int j = 0; j <= EVENT_DEGREE; j++)
+  for (int j = 0; j <= EVENT_DEGREE; j++) {
     largest = fmax(largest, fabs(values_at(step, j)[e]));
-  if (fabs(middle) > EVENT_FAR * range ||
-      (!step->watch->started && is_transition(EVENT_OF(e)) && largest <= 8.0 * values_at(step, EVENT_DEGREE + 2)[e]))
-    return OK; /* far from zero, or at zero, as the gap of bodies that rest side by side */
+    least = fmin(least, values_at(step, j)[e]);
+  }
+  if (fabs(middle) > EVENT_FAR * range)
+    return OK; /* far from zero */
+#ifdef EVENT_CONTACTS
+  if (is_transition(EVENT_OF(e)) && (starts || least <= 0.0)) {
+    real *const noise = values_at(step, EVENT_DEGREE + 2) + e, rounding;
+    TRY(rounding_of_contact(step, EVENT_OF(e), left, &rounding));
+    *noise = step->watch->started ? rounding : fmax(*noise, rounding);
+    if (largest <= 8.0 * *noise)
+      return OK; /* at zero, as the gap of bodies that rest side by side, or forces of joints in free fall */
+    starts |= rounding > 0.0 && start.g <= 0.0 && -start.g <= 8.0 * rounding;
+  }
+#endif
   from = start;
-  if (!step->watch->started && side_at_start(step->watch, e) != 0.0) {
+  if (starts && side_at_start(step->watch, e) != 0.0) {
     TRY(leave_to_side(step, e, &start, &from));
-  } else if (!step->watch->started) {
+  } else if (starts) {
     range = fabs(to.g - from.g);
     for (int j = 1; j < EVENT_DEGREE; j++)
       range = fmax(range, fabs(inner[j - 1] - from.g));
     TRY(leave_zero(step, e, &start, range, &from));
   }
-  if (!step->watch->started && !is_transition(EVENT_OF(e)) && side_at_start(step->watch, e) != 0.0)
+  if (starts && !is_transition(EVENT_OF(e)) && side_at_start(step->watch, e) != 0.0)
     return search_octaves(step, e, &from, &to);
   return search_part(step, e, &from, &to, from.fraction > 0.0 ? NULL : inner, EVENT_SPLITS);
 }
