@@ -470,6 +470,31 @@ def test_joints_of_a_robot_that_is_dropped_stay_at_rest(tmp_path):
     assert run.velocity[-1] == pytest.approx([0, -9.81 / 2, *[0] * 7], abs=1e-11)
 
 
+@pytest.mark.rotated
+@pytest.mark.parametrize("unit", [1.0, 1e3])
+@pytest.mark.parametrize("method", ["svi:2", "svi:4", "svi:6"])
+def test_dropped_robot_takes_no_more_adaptive_steps_than_one_whose_joints_turn(method, unit, tmp_path):
+    """Joints at rest move by rounding alone, also where lengths and masses are numbers 1e3 times as large."""
+    powers = {"pos": unit, "size": unit, "ref": unit, "armature": unit**3, "damping": unit**3}
+    text = DROPPED.replace("<option", f'<option gravity="0 0 {-9.81 * unit}"').replace(
+        '"capsule"', f'"capsule" density="{1000 / unit**2}"'
+    )
+    text = re.sub(
+        r' (pos|size|ref|armature|damping)="(.*?)"',
+        lambda m: f' {m[1]}="{" ".join(str(powers[m[1]] * float(x)) for x in m[2].split())}"',
+        text,
+    )
+    (tmp_path / "robot.xml").write_text(text)
+    robot = sc.LagrangianSystem.from_mjcf(tmp_path / "robot.xml")
+    stepper, start = sc.compile_stepper(robot, method), robot.keyframes["qpos0"]["q"]
+    for tolerance in (1e-6, 1e-10):
+        rest, turning = (
+            stepper.integrate(start, velocity=[0, 0, 0, *[v] * 6], t_end=0.1, tolerance=tolerance) for v in (0, 1e-3)
+        )
+        assert rest.steps <= 2 * turning.steps
+        assert rest.q[-1] == pytest.approx([0, unit * (1.25 - 9.81 / 200), *[0] * 7], abs=1e-12 * unit)
+
+
 PLANAR = """<joint name="slab" type="planar"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
 <dynamics damping=".3"/></joint><drake:joint name="socket" type="ball"><parent link="b"/><child link="c"/></drake:joint>
 <joint name="knee" type="revolute"><parent link="c"/><child link="d"/><axis xyz="0 1 0"/>

@@ -173,7 +173,7 @@ static inline __attribute__((always_inline)) double attempt_at(run_memory *run, 
   find_displacements(step, data, STORED(run, step), dq);
 #endif
   step->noise = report->noise;
-  return curve_error(step, data, STORED(run, step), dq, EACH, limits->decay, least);
+  return curve_error(step, data, STORED(run, step), dq, EACH, limits->decay, least, limits->most);
 }
 
 /* Out of line, one copy compiles faster than two. Steps without low words have one of their own, so that others take no
@@ -568,7 +568,7 @@ static SELDOM int may_grow(const run_memory *run, const trial *now, int levels)
   prepare(&before, &data);
   for (int i = 0; i < M; i++)
     moved[i] = before.h * run->largest_v[i];
-  return curve_error(&before, &data, STORED(run, &before), moved, EACH, now->limits.decay, 0) <=
+  return curve_error(&before, &data, STORED(run, &before), moved, EACH, now->limits.decay, 0, now->limits.most) <=
       GROWTH * larger(rounding, most);
 }
 #endif
