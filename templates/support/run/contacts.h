@@ -241,7 +241,7 @@ static int rounding_of_contact(const event_step *step, int event, const event_sa
     solve_contacts(&of, mode, right, force, after, NULL);
   *rounding = kind == CONTACT_CLOSES ? DBL_EPSILON * of.size[row] : 0.0;
   for (int r = 0; r < CONTACT_ROWS; r++)
-    *rounding += DBL_EPSILON * fabs(force[r]) * of.second_terms[r];
+    *rounding += 8.0 * DBL_EPSILON * fabs(force[r]) * of.second_terms[r];
   return OK;
 }
 

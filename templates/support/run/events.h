@@ -511,21 +511,18 @@ static int search_function(const event_step *step, int e, const event_sample *le
   event_sample start = *left, from, to = *right;
   int starts = !step->watch->started;
   real inner[EVENT_DEGREE - 1], middle = values_at(step, EVENT_DEGREE / 2)[e], range = 0.0, largest = 0.0;
-  real least = INFINITY;
   start.g = values_at(step, 0)[e];
   to.g = values_at(step, EVENT_DEGREE)[e];
   for (int j = 1; j < EVENT_DEGREE; j++)
     inner[j - 1] = values_at(step, j)[e];
   for (int j = 0; j <= EVENT_DEGREE; j++)
     range = fmax(range, fabs(values_at(step, j)[e] - middle));
-  for (int j = 0; j <= EVENT_DEGREE; j++) {
+  for (int j = 0; j <= EVENT_DEGREE; j++)
     largest = fmax(largest, fabs(values_at(step, j)[e]));
-    least = fmin(least, values_at(step, j)[e]);
-  }
   if (fabs(middle) > EVENT_FAR * range)
     return OK; /* far from zero */
 #ifdef EVENT_CONTACTS
-  if (is_transition(EVENT_OF(e)) && (starts || least <= 0.0)) {
+  if (is_transition(EVENT_OF(e))) {
     real *const noise = values_at(step, EVENT_DEGREE + 2) + e, rounding;
     TRY(rounding_of_contact(step, EVENT_OF(e), left, &rounding));
     *noise = step->watch->started ? rounding : fmax(*noise, rounding);
