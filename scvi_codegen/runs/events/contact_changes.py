@@ -105,7 +105,13 @@ class Response:
 
 
 def change_at(
-    stepper: Integrator, event: Transition, before: Array, after: Array, t: float, modes: tuple[Array, Array]
+    stepper: Integrator,
+    event: Transition,
+    before: Array,
+    after: Array,
+    t: float,
+    modes: tuple[Array, Array],
+    largest: Array,
 ) -> Change:
     """Return the state after a transition as a function of that before, in the modes of the run.
 
@@ -113,6 +119,7 @@ def change_at(
         stepper, event, t: of the transition.
         before, after: (2m,) states of the run.
         modes: parameters with the modes before and after.
+        largest: (m,) largest momenta of the run, whose rounding is no impulse.
 
     Raises:
         StateError: if the impulses are those of impacts of several contacts.
@@ -154,7 +161,7 @@ def change_at(
     differences = (
         *(change(q, p, t, modes[0])[len(q) :] - after[len(q) :] for change in changes),
         after[len(q) :] - p,
-        p,
+        largest,
     )
     *errors, impulse, momentum = (float(np.abs(difference / roots).max()) for difference in differences)
     if not min(errors) <= SAME_IMPULSE * (impulse if closes else momentum) + SAME_MOMENTUM * momentum:

@@ -448,7 +448,8 @@ def _at_transition(here: Place, event: Transition, ends: tuple[Array, Array], ne
         gradient = slip(q, p, here.t, here.parameters) @ _differences(slip, here, q, p)
         return Values(gradient, np.eye(len(ends[0]), len(gradient)), ends[0])
     number = _number(stepper, event)
-    change = change_at(stepper, event, *ends, here.t, (here.parameters, new_parameters))
+    largest = np.abs(np.asarray(here.states.p)).max(axis=0)
+    change = change_at(stepper, event, *ends, here.t, (here.parameters, new_parameters), largest)
 
     def mapped(q: Array, p: Array, t: float, parameters: Array) -> Array:
         """Return the function of the transition, and the state after it."""

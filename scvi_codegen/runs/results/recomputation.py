@@ -25,6 +25,8 @@ from scvi_codegen.systems.event import Crossings, Transition
 
 SAME_STEP_SIZE = 1e-9
 """Largest relative difference of step sizes that are equal."""
+SAME_TIME = 4 * float(np.finfo(float).eps)
+"""Largest difference of times that are equal, relative to the largest one."""
 SAME_STATE = 1e-6
 """Largest deviation of a recomputed state, relative to its largest entry; other roots are further away."""
 
@@ -59,7 +61,7 @@ def changes_by_events(states: SavedStates) -> Iterator[tuple[Crossings, NDArray[
     if states.stepper.interface.contacts and not transitions:
         raise StateError("this requires the transitions of contacts, which only integrate(..) stores")
     for crossings in (*getattr(states, "events", ()), *transitions):
-        times = states.forward * crossings.t
+        times = _times_of_rows(t, states.forward * crossings.t)
         here = (t[0] <= times) & (times <= t[-1])
         rows = np.searchsorted(t, times[here])
         inside = crossings.chosen(here)
@@ -73,6 +75,14 @@ def changes_by_events(states: SavedStates) -> Iterator[tuple[Crossings, NDArray[
             if np.isnan(np.asarray(inside.q)).any():
                 raise StateError("this requires the states of crossings, which exceed 1 GiB: integrate in parts")
             yield inside, rows
+
+
+def _times_of_rows(t: Array, times: Array) -> Array:
+    """Return times of crossings, those that differ by rounding from the end of a step as that of its row."""
+    row = np.searchsorted(t, times)
+    before, after = t[np.maximum(row - 1, 0)], t[np.minimum(row, len(t) - 1)]
+    nearest = np.where(np.abs(before - times) < np.abs(after - times), before, after)
+    return np.where(np.abs(nearest - times) <= SAME_TIME * np.abs(t).max(), nearest, times)
 
 
 def steps_after(states: SavedStates, first: int, last: int) -> Array:
