@@ -125,7 +125,8 @@ def _limit(
     if not all(_vanishes(push + limit * row) for push, row in zip(pushes, rows, strict=True)):
         return None
     at_rest: list[tuple[Expr, Expr]] = []
-    for part in (each.subs(at_rest) for each in slip):  # linear: one rate of each, by the others
+    for component in slip:  # linear: one rate of each, by the others
+        part = component.subs(at_rest)
         rates = [(rate, row) for rate in system.velocities if (row := part.diff(rate)) != 0]
         at_rest += [(rate, rate - part / row) for rate, row in rates[:1]]
     own = [part for part in limit.atoms(unit_step) if switching_function(part.args[0])[0] in slip]

@@ -410,8 +410,8 @@ int NAME(contact_terms)(real t, const real *q, const real *p, const real *idle, 
 {
   enum { FIRST = CONSTRAINTS - MASKED };
   saddle *at = saddle_in(workspace);
-  real *rate = terms + MASKED, *second = rate + MASKED, *size = second + MASKED, *sum_of = size + MASKED;
-  real *W = sum_of + MASKED, *G = W + MASKED * MASKED;
+  real *rate = terms + MASKED, *second = rate + MASKED, *size = second + MASKED, *second_terms = size + MASKED;
+  real *W = second_terms + MASKED, *G = W + MASKED * MASKED;
   real u[2 * M], g[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES], value[M + 2 * CONSTRAINTS], right[CONSTRAINTS] = {0};
   real x[M], y[CONSTRAINTS];
   TRY(find_velocity(t, q, p, idle, u + M, workspace));
@@ -430,13 +430,13 @@ int NAME(contact_terms)(real t, const real *q, const real *p, const real *idle, 
   for (int k = 0; k < FIRST; k++)
     right[k] = value[M + CONSTRAINTS + k];
   constrained_motion(u, t, idle, value);
-  memset(sum_of, 0, sizeof(real) * MASKED);
+  memset(second_terms, 0, sizeof(real) * MASKED);
   for (int column = 0; column <= MASKED; column++) { /* the last one: free motion */
     const int is_free = column == MASKED;
     const real none[CONSTRAINTS] = {0};
     solve_saddle(at, is_free ? value : G + column * M, is_free ? right : none, x, y);
     for (int i = 0; i < M && !is_free; i++)
-      sum_of[column] += MATH(fabs)(x[i] * value[i]);
+      second_terms[column] += MATH(fabs)(x[i] * value[i]);
     for (int row = 0; row < MASKED; row++) {
       real sum = 0;
       for (int i = 0; i < M; i++)
@@ -450,7 +450,7 @@ int NAME(contact_terms)(real t, const real *q, const real *p, const real *idle, 
   constrained_motion(u, t, imposed, value);
   for (int k = 0; k < MASKED; k++) {
     second[k] += value[M + CONSTRAINTS + FIRST + k];
-    sum_of[k] += MATH(fabs)(value[M + CONSTRAINTS + FIRST + k]);
+    second_terms[k] += MATH(fabs)(value[M + CONSTRAINTS + FIRST + k]);
   }
   contact_coefficients(u, t, imposed, G + MASKED * M);
   return all_finite(terms, MASKED * (5 + MASKED + M)) ? OK : NOT_FINITE;

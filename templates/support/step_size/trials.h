@@ -351,13 +351,13 @@ static SELDOM int moves_little(const run_memory *run, const trial *now)
 static inline int compare_trial(const run_memory *run, const trial *now, int momenta, const solver_options *options,
     real *apart)
 {
-  const real *known = NULL;
+  const real *half = NULL;
 #ifdef COSTLY_POINTS
   if (run->error_before == 0 && MATH(fabs)(now->step.h) == 2 * now->half_length)
-    known = now->half;
+    half = now->half;
 #endif
   (void)run;
-  return compare_with_halves(&now->step, now->dq, momenta ? now->dp : NULL, known, options, apart);
+  return compare_with_halves(&now->step, now->dq, momenta ? now->dp : NULL, half, options, apart);
 }
 
 /* Number of levels, at most `most`, by which the step size may be increased without exceeding the largest one. */
