@@ -124,9 +124,15 @@ def test_terms_of_the_first_index_are_computed_once_per_pair() -> None:
 
 def test_explicit_steps_on_lattices_call_functions_of_elements_in_loops_of_their_own() -> None:
     """Not those of time alone, or of longer arguments than sums and products."""
-    called = re.compile(r"called\[\d\]\[at\] = (\w+)\(called")
+    called = re.compile(r"called\[\d\]\[\w+ - chunk\] = (\w+)\(value")
     assert sorted(called.findall(rendered("calls", "stoermer-verlet").code)) == ["cos", "cos", "exp", "sin"]
     assert not called.findall(rendered("calls", "svi:4").code + rendered("all forms", "stoermer-verlet").code)
+
+
+def test_explicit_steps_on_lattices_add_the_value_of_another_row_at_once() -> None:
+    """Others wait until all of a part are computed, as their targets are elements of the same row."""
+    at_once = re.compile(r"F\[.*index_i \+ 1.*index_j\] \+= -?by \* value\[")
+    assert len(at_once.findall(rendered("calls", "stoermer-verlet").code)) == 1
 
 
 @pytest.mark.parametrize(("mass", "is_equal"), [("g", 1), ("m[i]", 0)])

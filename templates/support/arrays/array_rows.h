@@ -9,8 +9,7 @@
  * add others before and behind. */
 enum {
   MOST_ADDENDS = 4, /* values that complete_sums adds to a coordinate */
-  ALIGNED = 4, /* numbers in a SIMD register */
-  BORDER = (REACH + ALIGNED - 1) / ALIGNED * ALIGNED /* at least REACH */
+  BORDER = (REACH + ALIGNED_NUMBERS - 1) / ALIGNED_NUMBERS * ALIGNED_NUMBERS /* at least REACH */
 };
 
 typedef struct {
@@ -72,8 +71,8 @@ static inline __attribute__((always_inline)) void complete_sums(sweep *of, doubl
   addend moved[MOST_ADDENDS];
   if (of && (of->then->starts || !of->then->ends || !ends_with_a_kick())) { /* else the forces are stored */
     inside = overlap(here, of->own);
-    inside.first = (inside.first + ALIGNED - 1) / ALIGNED * ALIGNED;
-    inside.end = between(inside.first, inside.end / ALIGNED * ALIGNED, inside.end);
+    inside.first = (inside.first + ALIGNED_NUMBERS - 1) / ALIGNED_NUMBERS * ALIGNED_NUMBERS;
+    inside.end = between(inside.first, inside.end / ALIGNED_NUMBERS * ALIGNED_NUMBERS, inside.end);
   }
   for (long long i = 0; i < between(here.first, inside.first, here.end) - here.first; i++)
     row[i] = plus(row[i], added, addends, i);

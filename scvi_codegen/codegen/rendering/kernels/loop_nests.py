@@ -250,7 +250,7 @@ class Nest:
         if loop.near:
             lines += _loop(loop, "begin", "end", [line for of_target in behind for line in of_target])
         else:
-            for targets in self._targets_by_rows(loop):
+            for targets in self._targets_by_rows(loop)[self.adds_at_once :]:
                 together = len(targets) > 1
                 lines += (
                     self._sums_of_row(loop, targets) if together else _loop(loop, "begin", "end", behind[targets[0]])
@@ -286,12 +286,18 @@ class Nest:
         lines = [self.read(k, slot) for k, slot in enumerate(self.rolled.reads) if k in used]
         lines += [self.constant(k, each) for k, each in enumerate(self.rolled.constants) if self.is_innermost(each)]
         lines.append(f"{apart.arguments.name}(u, t, parameters, value);")
-        lines += [f"called[{k}][{counter(loop)} - chunk] = value[{k}];" for k in range(len(apart.functions))]
+        calls = [f"{name}(value[{k}]);" for k, name in enumerate(apart.functions)]
+        lines += [f"called[{k}][{counter(loop)} - chunk] = {call}" for k, call in enumerate(calls)]
         lines = self._divided("chunk", "past", _loop(loop, "begin", "end", lines))
-        for k, name in enumerate(apart.functions):
-            head = f"for (long long at = 0, all = whole_registers(called[{k}], past - chunk); at < all; at++)"
-            lines += [head, f"  called[{k}][at] = {name}(called[{k}][at]);"]
         return [f"lanes called[{len(apart.functions)}][CHUNK];", *lines]
+
+    @property
+    def adds_at_once(self) -> bool:
+        """Whether the first value is added where it is computed: only its target is in that row, at the same index."""
+        loop, target, numbers = self.rolled.loops[-1], self.rolled.writes[0], [number for _, number in self.signed]
+        rows = [] if loop.near or self.sharing is not Sharing.IN_TURN else self._targets_by_rows(loop)
+        alone = len(rows) > 1 and len(rows[0]) == 1 and numbers.count(numbers[0]) == 1
+        return alone and not target.sums and target.places[-1:] == (Place(index=loop.index),)
 
     def _targets_by_rows(self, loop: Loop) -> list[list[int]]:
         """Return the targets in turn; together those that differ in the innermost index alone, if tasks add to all."""
