@@ -110,6 +110,14 @@ def test_calls_of_arrays_take_few_function_calls(chains):
         run.momentum_maps()
 
 
+def test_later_calls_of_a_large_run_need_no_short_chunks(chains):
+    """The first one begins with a step, as its time is unknown; then 16 steps are one call of C."""
+    run = chains[0].start({"x": np.arange(600.0), "y": np.zeros(600)}, np.zeros(1200), h=0.05)
+    run.advance(31)
+    with at_most(25):
+        run.advance(16)
+
+
 @pytest.mark.parametrize("constrained", [False, True])
 def test_runs_of_arrays_are_reused_bitwise_equally(chains, constrained):
     angles = np.arange(3.0)

@@ -1,6 +1,5 @@
 """Loop that advances runs in chunks of bounded duration; the only one that looks at the clock."""
 
-import math
 import time
 from collections.abc import Callable
 
@@ -19,8 +18,8 @@ def drive(
     seconds: float | None = None,
     ended: Callable[[], bool],
     progress: Callable[[int], None] | None = None,
-) -> None:
-    """Take steps in chunks of bounded duration, so that Python regains control regularly.
+) -> int:
+    """Take steps in chunks of bounded duration, so that Python regains control regularly; return the size of the next.
 
     Args:
         advance: function that takes a number of steps and returns how many it took.
@@ -31,13 +30,13 @@ def drive(
         ended: function that returns whether the run has ended; called before each chunk.
         progress: called with the number of steps after each chunk.
     """
-    done, size, began, target = 0, first, -math.inf, CALL_SECONDS if seconds is None else seconds
+    done, size, target = 0, first, CALL_SECONDS if seconds is None else seconds
     while done < steps and not ended():
-        now = time.perf_counter()
-        if done:
-            faster = min(growth, target / max(now - began, 1e-6))
-            size = max(1, int(min(size * faster, most)))
-        size, began = int(min(size, steps - done)), now
-        done += advance(size)
+        began, count = time.perf_counter(), int(min(size, steps - done))
+        done += advance(count)
         if progress is not None:
             progress(done)
+        if count == size:
+            faster = min(growth, target / max(time.perf_counter() - began, 1e-6))
+            size = max(1, int(min(size * faster, most)))
+    return size

@@ -148,6 +148,7 @@ class Memory:
         self._call = self._new_call(*self._discarded)
         self._take = binding.call("advance", self._call)  # function of numbers of steps and of those between states
         self._untimed = len(self._q) <= MOST_UNTIMED  # whether ``advance`` takes steps without looking at the clock
+        self._chunk = 1  # steps of the next C call otherwise
         self._start_function = binding.function("start", memory)
         self._step_error = binding.function("step_error", memory) if binding.has("step_error") else None
         self._plan: StepPlan = NO_PLAN
@@ -527,7 +528,8 @@ class Memory:
 
     def _advance_timed(self, steps: int, progress: Callable[[int], None] | None, stop: Callable[[], bool]) -> None:
         """Advance as :meth:`advance` in C calls of bounded duration."""
-        drive(self._taken, steps, ended=lambda: self.arrived or stop(), progress=progress)
+        first, ended = self._chunk, lambda: self.arrived or stop()
+        self._chunk = drive(self._taken, steps, first=first, ended=ended, progress=progress)
 
     def _failure(self, status: int) -> StepFailedError:
         remark, stepper, here = "", self.stepper, (self._parameters, self._q)
