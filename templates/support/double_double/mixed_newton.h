@@ -67,11 +67,8 @@ static int refine_unknowns(const step_data *step, double *memory, double t_low, 
   }
 #ifdef FIRST_ORDER_SYSTEM
   double theta[M];
-  dd u[2 * M];
   step_data with_momenta = *step;
-  memcpy(u, at.q0, sizeof at.q0);
-  memcpy(u + M, at.p0, sizeof at.p0);
-  transform_of_pairs(at.t, u, at.parameters, at.p0, NULL);
+  TRY(transform_of(at.t, at.q0, at.p0, at.parameters, at.p0));
   for (int i = 0; i < M; i++)
     theta[i] = at.p0[i].high;
   with_momenta.theta0 = theta;

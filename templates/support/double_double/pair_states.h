@@ -1,26 +1,16 @@
+#include "../core/scalars.h"
 #include "../core/status_codes.h"
 
 /* Momenta and velocities of states in pairs. Requires: of separable systems the kernel mass_pairs, of others
  * legendre.h and the kernels legendre_pairs, y at u = (q, x), or inverse_legendre_pairs. */
 
-static inline void load_pairs(const double *words, dd *x)
-{
-  for (int i = 0; i < M; i++)
-    x[i] = dd_of(words[i], words[M + i]);
-}
-
-static inline int store_pairs(const dd *x, double *words)
-{
-  for (int i = 0; i < M; i++)
-    words[i] = x[i].high, words[M + i] = x[i].low;
-  return all_finite(words, 2 * M) ? OK : NOT_FINITE;
-}
-
 #ifdef NEWTON_IN_PAIRS
-/* y at u = (q, x). */
-static inline int transform_of_pairs(dd t, dd *u, const double *parameters, dd *y, double *workspace)
+/* y at (q, x). */
+static inline int transform_of(dd t, const dd *q, const dd *x, const double *parameters, dd *y)
 {
-  dd value[M + MASS_ENTRIES];
+  dd u[2 * M], value[M + MASS_ENTRIES];
+  memcpy(u, q, sizeof(dd) * M);
+  memcpy(u + M, x, sizeof(dd) * M);
   legendre_pairs(u, t, parameters, value);
   memcpy(y, value, sizeof(dd) * M);
   return OK;
@@ -39,7 +29,7 @@ static inline int correct_transform(dd t, dd *u, const dd *y, const double *para
   TRY(factorise(workspace, &shape, pivot) ? OK : SINGULAR);
   for (int k = 0; k < CORRECTIONS; k++) {
     dd now[M];
-    transform_of_pairs(t, u, parameters, now, NULL);
+    transform_of(t, u, u + M, parameters, now);
     for (int i = 0; i < M; i++)
       value[MASS_POSITION[i]] = dd_subtract(y[i], now[i]).high;
     back_substitute(workspace, &shape, pivot, value);
@@ -50,52 +40,35 @@ static inline int correct_transform(dd t, dd *u, const dd *y, const double *para
 }
 #endif
 
-/* Replaces x in u = (q, x) by that with the given y. */
-static inline int invert_pairs(dd t, dd *u, const dd *y, const double *parameters, double *workspace)
-{
-#ifdef INVERSE_LEGENDRE
-  dd x[M];
-  memcpy(u + M, y, sizeof(dd) * M);
-  inverse_legendre_pairs(u, t, parameters, x);
-  memcpy(u + M, x, sizeof x);
-  return OK;
-#else
-  double q[M], high[M], value[M];
-  for (int i = 0; i < M; i++)
-    q[i] = u[i].high, high[i] = y[i].high;
-  TRY(inverse_transform(t.high, q, high, parameters, value, workspace));
-  for (int i = 0; i < M; i++)
-    u[M + i] = dd_word(value[i]);
-  return correct_transform(t, u, y, parameters, workspace);
-#endif
-}
-
-#ifdef HAMILTONIAN_SYSTEM
-#define MOMENTA_INVERTED 1
-#else
-#define MOMENTA_INVERTED 0
-#endif
-
-static inline int state_transform(int inverse, dd t, const dd *q, const dd *x, const double *parameters, dd *y,
-    double *workspace)
+/* The x with the given y. */
+static inline int inverse_of(dd t, const dd *q, const dd *y, const double *parameters, dd *x, double *workspace)
 {
   dd u[2 * M];
   memcpy(u, q, sizeof(dd) * M);
-  if (inverse) {
-    TRY(MASS_ENTRIES || !MOMENTA_INVERTED ? invert_pairs(t, u, x, parameters, workspace) : SINGULAR);
-    memcpy(y, u + M, sizeof(dd) * M);
-    return OK;
-  }
-  memcpy(u + M, x, sizeof(dd) * M);
-  return transform_of_pairs(t, u, parameters, y, workspace);
+#ifdef INVERSE_LEGENDRE
+  memcpy(u + M, y, sizeof(dd) * M);
+  inverse_legendre_pairs(u, t, parameters, x);
+#else
+  double high[2 * M], value[M];
+  for (int i = 0; i < M; i++)
+    high[i] = q[i].high, high[M + i] = y[i].high;
+  TRY(inverse_transform(t.high, high, high + M, parameters, value, workspace));
+  for (int i = 0; i < M; i++)
+    u[M + i] = dd_word(value[i]);
+  TRY(correct_transform(t, u, y, parameters, workspace));
+  memcpy(x, u + M, sizeof(dd) * M);
+#endif
+  return OK;
 }
 
 static inline int momenta_of(dd t, const dd *q, const dd *v, const double *parameters, dd *p, double *workspace)
 {
 #ifdef FIRST_ORDER_SYSTEM
   return SINGULAR;
+#elif defined(HAMILTONIAN_SYSTEM)
+  return MASS_ENTRIES ? inverse_of(t, q, v, parameters, p, workspace) : SINGULAR;
 #else
-  return state_transform(MOMENTA_INVERTED, t, q, v, parameters, p, workspace);
+  return transform_of(t, q, v, parameters, p);
 #endif
 }
 
@@ -129,8 +102,10 @@ static inline int velocities_of(dd t, const dd *q, const dd *p, const double *pa
       v[i] = dd_add(v[i], dd_word(right[MASS_POSITION[i]]));
   }
   return OK;
+#elif defined(HAMILTONIAN_SYSTEM)
+  return transform_of(t, q, p, parameters, v);
 #else
-  return state_transform(!MOMENTA_INVERTED, t, q, p, parameters, v, workspace);
+  return inverse_of(t, q, p, parameters, v, workspace);
 #endif
 }
 #else
