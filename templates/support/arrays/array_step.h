@@ -35,7 +35,7 @@ static int perform_step(run_memory *run, const problem *arrays, const work_array
   prepare(&step, &data);
   TRY(solve(&step, &data, history_in(&step), &run->guess, work->dq, work->dp, options, report, NULL));
   if (run->error < INFINITY) /* else a partial step, of a search for events */
-    status = observe_error(run, &step, &data, work->dq, work->dp, options, NULL);
+    status = observe_error(run, &step, &data, work->dq, options, NULL);
   if (status == OK)
     continue_steps(run, &step, work->dq, work->dp);
   else

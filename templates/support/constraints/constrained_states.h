@@ -71,14 +71,14 @@ static int finish_position(scalar t, real *u, const real *parameters, saddle *at
     moved[i] = ADD(q[i], dd_two_sum(u[i], -HIGH_WORD(q[i])));
   if (misfit_at(t, moved, parameters, values, g) < misfit_at(t, q, parameters, values, g))
     memcpy(q, moved, sizeof moved);
-  for (int k = 0; k < MOST_REFINED_POSITIONS && size > SETTLED_MOMENTUM * largest_of(u); k++) {
+  for (int k = 0; k < MOST_REFINED_POSITIONS && size > SETTLED_MOMENTUM * largest_magnitude(u, M); k++) {
     high_words(q, M, u);
     TRY(factorise_saddle(IDEAL_FORCES, HIGH_WORD(t), u, parameters, at, g));
     misfit_at(t, q, parameters, values, g);
     solve_saddle(at, NULL, g, update, y);
     for (int i = 0; i < M; i++)
       q[i] = ADD(q[i], SCALAR(update[i]));
-    size = largest_of(update);
+    size = largest_magnitude(update, M);
   }
   return OK;
 }
@@ -119,8 +119,8 @@ static int project_momentum(scalar t, const scalar *q, scalar *p, const real *pa
       scalar *momentum = p + CONSTRAINT_ENTRY[e][1];
       *momentum = SUBTRACT(*momentum, MULTIPLY(values[CONSTRAINTS + e], SCALAR(y[CONSTRAINT_ENTRY[e][0]])));
     }
-    fastest = larger(fastest, largest_of(high + M));
-    if (k + 1 >= MOMENTUM_PROJECTIONS && !(largest_of(update) > SETTLED_MOMENTUM * fastest))
+    fastest = larger(fastest, largest_magnitude(high + M, M));
+    if (k + 1 >= MOMENTUM_PROJECTIONS && !(largest_magnitude(update, M) > SETTLED_MOMENTUM * fastest))
       break;
   }
   high_words(p, M, high);
@@ -183,7 +183,7 @@ int NAME(apart)(instant time, const real *q0, const real *p0, const real *q1, co
     u[i] = q1[i], u[M + i] = HIGH_WORD(velocity[1][i]);
   }
   apart[1] = relative_size(d, e, larger(product_of_vectors(p0, v[0]), product_of_vectors(p1, v[1])));
-  if (largest_of(e) <= ROUNDED_UPDATE && apart[1] > ACCEPTED_UPDATE)
+  if (largest_magnitude(e, M) <= ROUNDED_UPDATE && apart[1] > ACCEPTED_UPDATE)
     apart[1] = ACCEPTED_UPDATE;
   legendre(u, HIGH_WORD(t), parameters, momentum, mass);
   for (int i = 0; i < M; i++)

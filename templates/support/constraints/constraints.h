@@ -92,14 +92,6 @@ static void solve_saddle(saddle *at, const real *a, const real *b, real *x, real
     y[k] = at->x[POSITION_IN_MATRIX[M + k]];
 }
 
-static real largest_of(const real *x)
-{
-  real largest = 0;
-  for (int i = 0; i < M; i++)
-    largest = larger(largest, MATH(fabs)(x[i]));
-  return largest;
-}
-
 /* Adds to the sizes of positions the displacements for which constraints change by the sizes of their terms: rounding
  * leaves g_k = O(u r_k), with the rounding size r of constraint_rounding, and positions q + X_k g_k, X = M^-1 G^T (G
  * M^-1 G^T)^-1, whatever |q| is. Nothing is added where the constraints are dependent. */
@@ -125,7 +117,6 @@ static SELDOM void add_constraint_sizes(real t, const real *q, const real *param
 static SELDOM real displacement_by_reactions(const step_data *step, const real *z)
 {
   real u[2 * M] = {0}, p[M], mass[MASS_ENTRIES], g[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES], force[M] = {0};
-  real heaviest = 0;
   if (!z)
     return 0;
   memcpy(u, step->q0, sizeof(real) * M);
@@ -137,9 +128,8 @@ static SELDOM real displacement_by_reactions(const step_data *step, const real *
       strongest = larger(strongest, MATH(fabs)(z[(M + CONSTRAINT_ENTRY[e][0]) * B + b]));
     force[CONSTRAINT_ENTRY[e][1]] += MATH(fabs)(derivative[e]) * strongest;
   }
-  for (int e = 0; e < MASS_ENTRIES; e++)
-    heaviest = larger(heaviest, MATH(fabs)(mass[e]));
-  return heaviest > 0 ? step->h * step->h * largest_of(force) / heaviest : 0;
+  const real heaviest = largest_magnitude(mass, MASS_ENTRIES);
+  return heaviest > 0 ? step->h * step->h * largest_magnitude(force, M) / heaviest : 0;
 }
 
 #ifndef BARE_STEPS
@@ -154,7 +144,7 @@ static SELDOM real size_by_constraints(const step_data *step)
 {
   real size[M] = {0};
   add_constraint_sizes(step->t, step->q0, step->parameters, saddle_in(step->scratch), size);
-  return largest_of(size) + displacement_by_reactions(step, last_unknowns(step));
+  return largest_magnitude(size, M) + displacement_by_reactions(step, last_unknowns(step));
 }
 
 /* Displacements relative to which positions on constraints are rounded, whatever they are: those by reactions, the
@@ -180,7 +170,7 @@ static SELDOM void lengths_of_constraints(const step_data *step, real *lengths)
       length = larger(length, rounding[k] / steepest[k]);
   add_constraint_sizes(step->t, step->q0, step->parameters, saddle_in(step->scratch), yields);
   for (int i = 0; i < M; i++) {
-    const real most = length * MATH(sqrt)(largest_of(lightest) / lightest[i]); /* infinite without a mass */
+    const real most = length * MATH(sqrt)(largest_magnitude(lightest, M) / lightest[i]); /* infinite without a mass */
     lengths[i] = by_reactions + larger(length, yields[i] < most ? yields[i] : most);
   }
 }

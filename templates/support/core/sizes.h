@@ -101,10 +101,7 @@ static inline void begin_motion(run_memory *run)
 /* The largest V, and the largest mu_i of a step of h of the run so far. */
 static inline real largest_velocity(const run_memory *run)
 {
-  real largest = 0;
-  for (int k = 0; k < MOTIONS; k++)
-    largest = larger(largest, run->largest_v[k]);
-  return largest;
+  return largest_magnitude(run->largest_v, MOTIONS);
 }
 
 static inline real motion_of_run(const run_memory *run, real h)

@@ -25,7 +25,7 @@ typedef struct {
   real p1[M];
 #ifdef FIRST_ORDER_SYSTEM
   step_data with_momenta;
-  momentum_factors momenta;
+  momentum_factors *momenta;
 #endif
 } linearised_step;
 
@@ -107,7 +107,7 @@ static linearised_step linearised_in(const step_data *step, real *workspace)
   at.grown = NULL;
 #endif
 #ifdef FIRST_ORDER_SYSTEM
-  at.momenta = momentum_factors_in((real *)at.v - MOMENTUM_NUMBERS);
+  at.momenta = (momentum_factors *)((real *)at.v - MOMENTUM_NUMBERS);
 #endif
   return at;
 }
@@ -116,11 +116,11 @@ static linearised_step linearised_in(const step_data *step, real *workspace)
 static int linearise_step(linearised_step *at, const solver_options *options, real *q1, real *p1, solver_report *report)
 {
 #ifdef FIRST_ORDER_SYSTEM
-  const int known = transform(at->step->t, at->step->q0, at->step->p0, at->step->parameters, at->momenta.theta,
+  const int known = transform(at->step->t, at->step->q0, at->step->p0, at->step->parameters, at->momenta->theta,
       at->step->scratch);
   const step_data *step = &at->with_momenta;
   at->with_momenta = *at->step;
-  at->with_momenta.theta0 = at->momenta.theta;
+  at->with_momenta.theta0 = at->momenta->theta;
   at->step = step;
   if (known != OK)
     return known;
@@ -146,7 +146,7 @@ static int linearise_step(linearised_step *at, const solver_options *options, re
     at->p1[i] = step->p0[i] + (dp[i] + dp[M + i]);
   }
 #ifdef FIRST_ORDER_SYSTEM
-  TRY(linearise_momenta(step, dq, at->p1, &at->momenta));
+  TRY(linearise_momenta(step, dq, at->p1, at->momenta));
 #endif
   for (int i = 0; q1 && i < M; i++) {
     q1[i] = dq[i];
@@ -237,7 +237,7 @@ static void jvp_step(const linearised_step *at)
   growth_wide(at->step, 0, at->v, at->grown);
 #endif
 #ifdef FIRST_ORDER_SYSTEM
-  momenta_wide(&at->momenta, 0, at->v);
+  momenta_wide(at->momenta, 0, at->v);
 #endif
   momentum_rows(at, 0);
   through_points(at, 0, at->v, NULL);
@@ -247,7 +247,7 @@ static void jvp_step(const linearised_step *at)
   end_position(at, 0);
   end_momentum(at, 0);
 #ifdef FIRST_ORDER_SYSTEM
-  variables_wide(&at->momenta, 0, at->v);
+  variables_wide(at->momenta, 0, at->v);
 #endif
 }
 
@@ -260,7 +260,7 @@ static void vjp_with_unknowns(const linearised_step *at)
   memset(at->grown, 0, sizeof(wide));
 #endif
 #ifdef FIRST_ORDER_SYSTEM
-  variables_wide(&at->momenta, 1, at->v);
+  variables_wide(at->momenta, 1, at->v);
 #endif
   end_momentum(at, 1);
   end_position(at, 1);
@@ -270,7 +270,7 @@ static void vjp_with_unknowns(const linearised_step *at)
   through_points(at, 1, at->v, NULL);
   momentum_rows(at, 1);
 #ifdef FIRST_ORDER_SYSTEM
-  momenta_wide(&at->momenta, 1, at->v);
+  momenta_wide(at->momenta, 1, at->v);
 #endif
 #ifdef DAMPED
   growth_wide(at->step, 1, at->v, at->grown);

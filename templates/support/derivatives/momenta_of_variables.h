@@ -6,22 +6,13 @@
 
 /* Derivatives at the start and at the end of a step; factors of theta_y at the end and pivots; theta at the start. */
 typedef struct {
-  real *start, *end, *factors, *pivot, *theta;
+  real start[THETA_DERIVATIVES], end[THETA_DERIVATIVES], factors[M * M], pivot[M], theta[M];
 } momentum_factors;
-
-static momentum_factors momentum_factors_in(real *memory)
-{
-  momentum_factors in = {.start = memory, .end = memory + THETA_DERIVATIVES};
-  in.factors = in.end + THETA_DERIVATIVES;
-  in.pivot = in.factors + M * M;
-  in.theta = in.pivot + M;
-  return in;
-}
 
 static const band ALL_MOMENTA = {.rows = M, .reach = M - 1, .stride = M, .first = 0};
 
 /* Computes the derivatives at the ends of the step, and the factors. */
-static int linearise_momenta(const step_data *step, const real *q1, const real *y1, const momentum_factors *in)
+static int linearise_momenta(const step_data *step, const real *q1, const real *y1, momentum_factors *in)
 {
   real u[2 * M];
   memcpy(u, step->q0, sizeof(real) * M);

@@ -10,26 +10,10 @@
  * with respect to inputs (by_given) and unknowns (by_dz); at the points of a stage group, arguments and results:
  * tangents, adjoint variables, and tangents of these. Last, the arguments u. */
 typedef struct {
-  wide *change, *dz, *input_adjoints, *adjoint_tangents, *by_given, *by_dz;
-  wide *tangents, *adjoints, *tangents_of_adjoints;
-  real *u;
+  wide change[STEP_INPUTS], input_adjoints[STEP_INPUTS], adjoint_tangents[STEP_INPUTS], by_given[STEP_INPUTS];
+  wide dz[N], by_dz[N], tangents[MOST_AT_POINTS], adjoints[MOST_AT_POINTS], tangents_of_adjoints[MOST_AT_POINTS];
+  real u[];
 } second_order_memory;
-
-static second_order_memory second_order_in(const linearised_step *at)
-{
-  second_order_memory to;
-  to.change = at->points + MOST_AT_POINTS;
-  to.input_adjoints = to.change + STEP_INPUTS;
-  to.adjoint_tangents = to.input_adjoints + STEP_INPUTS;
-  to.by_given = to.adjoint_tangents + STEP_INPUTS;
-  to.dz = to.by_given + STEP_INPUTS;
-  to.by_dz = to.dz + N;
-  to.tangents = to.by_dz + N;
-  to.adjoints = to.tangents + MOST_AT_POINTS;
-  to.tangents_of_adjoints = to.adjoints + MOST_AT_POINTS;
-  to.u = (real *)(to.tangents_of_adjoints + MOST_AT_POINTS);
-  return to;
-}
 
 /* sum += factor x y, lane by lane. */
 static inline void add_product(wide *sum, real factor, const wide *x, const wide *y)
@@ -40,7 +24,7 @@ static inline void add_product(wide *sum, real factor, const wide *x, const wide
 
 /* Second derivatives of the kernel at a point for lane j: tangents of the adjoint variables of arguments, and of
  * parameters and time. */
-static void add_kernel_hessian(const stage_group *f, const step_data *step, const second_order_memory *to, int n, int j)
+static void add_kernel_hessian(const stage_group *f, const step_data *step, second_order_memory *to, int n, int j)
 {
   const int arguments = f->arguments, results = f->results, parameters = STEP_INPUTS - 2 * M - 2;
   const wide *tangents = to->tangents + n * arguments, *adjoints = to->adjoints + f->points * arguments + n * results;
@@ -65,7 +49,7 @@ static void add_kernel_hessian(const stage_group *f, const step_data *step, cons
 
 /* Contributions of the factor h^power of the results to the tangents of the adjoint variables of the results and of
  * h. */
-static void add_result_hessian(const stage_group *f, real h, const second_order_memory *to, const real *by_h)
+static void add_result_hessian(const stage_group *f, real h, second_order_memory *to, const real *by_h)
 {
   const int first = f->points * f->arguments;
   for (int s = 0; s < f->scatters; s++) {
@@ -83,7 +67,7 @@ static void add_result_hessian(const stage_group *f, real h, const second_order_
 
 /* Contributions of arguments, q0 plus h^power times unknowns, to the tangents of the adjoint variables of h and of the
  * arguments. */
-static void add_argument_hessian(const stage_group *f, real h, const second_order_memory *to, const real *by_h)
+static void add_argument_hessian(const stage_group *f, real h, second_order_memory *to, const real *by_h)
 {
   const wide *dh = to->change + INPUT_H;
   wide *by = to->by_given + INPUT_H;
@@ -103,13 +87,15 @@ static void add_argument_hessian(const stage_group *f, real h, const second_orde
 }
 
 /* Contributions of a stage group. Returns the end of its derivatives. */
-static const real *add_group_hessian(const stage_group *f, const linearised_step *at, const second_order_memory *to,
+static const real *add_group_hessian(const stage_group *f, const linearised_step *at, second_order_memory *to,
     const real *partials)
 {
   const real h = at->step->h, *by_h = partials + f->points * f->arguments, *derivative = by_h + f->points * f->results;
   const real *by_inputs = derivative + f->points * f->partials;
   const int first = f->points * f->arguments;
-  memset(to->tangents, 0, sizeof(wide) * 3 * MOST_AT_POINTS);
+  memset(to->tangents, 0, sizeof to->tangents);
+  memset(to->adjoints, 0, sizeof to->adjoints);
+  memset(to->tangents_of_adjoints, 0, sizeof to->tangents_of_adjoints);
   arguments_wide(f, h, 0, partials, to->change, to->dz, to->tangents);
   multiply_wide(f, 0, derivative, to->tangents, to->tangents + first);
   inputs_wide(f, 0, by_h, by_inputs, to->change, to->tangents + first);
@@ -130,7 +116,7 @@ static const real *add_group_hessian(const stage_group *f, const linearised_step
 }
 
 /* Contributions of q1 = q0 + h (sum of unknowns). */
-static void add_end_hessian(const second_order_memory *to)
+static void add_end_hessian(second_order_memory *to)
 {
   for (int i = 0; i < M; i++)
     for (int b = 0; b < B; b++) {
@@ -141,7 +127,7 @@ static void add_end_hessian(const second_order_memory *to)
 
 /* Replaces input_adjoints and adjoint_tangents, of (q1, p1, parameters, t + h, h), by those of (q0, p0, parameters, t,
  * h). */
-static void hessian_of_step(const linearised_step *at, const second_order_memory *to)
+static void hessian_of_step(const linearised_step *at, second_order_memory *to)
 {
   const real *partials = at->partials;
   memcpy(at->v, to->change, sizeof(wide) * STEP_INPUTS);
@@ -167,15 +153,15 @@ static void hessian_of_step(const linearised_step *at, const second_order_memory
  * time. */
 static int hessian_of_vectors(const linearised_step *at, int count, const real *changes, const real *from, real *to)
 {
-  const second_order_memory of = second_order_in(at);
+  second_order_memory *of = (second_order_memory *)(at->points + MOST_AT_POINTS);
   for (int first = 0; first < count; first += WIDTH) {
     const int own = least(WIDTH, count - first), here = first * STEP_INPUTS, beside = (count + first) * STEP_INPUTS;
-    read_lanes(of.change, own, changes + here);
-    read_lanes(of.input_adjoints, own, from + here);
-    read_lanes(of.adjoint_tangents, own, from + beside);
-    hessian_of_step(at, &of);
-    add_lanes(of.input_adjoints, own, to + here);
-    add_lanes(of.adjoint_tangents, own, to + beside);
+    read_lanes(of->change, own, changes + here);
+    read_lanes(of->input_adjoints, own, from + here);
+    read_lanes(of->adjoint_tangents, own, from + beside);
+    hessian_of_step(at, of);
+    add_lanes(of->input_adjoints, own, to + here);
+    add_lanes(of->adjoint_tangents, own, to + beside);
   }
   return all_finite(to, 2 * count * STEP_INPUTS) ? OK : NOT_FINITE;
 }

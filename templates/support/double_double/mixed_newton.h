@@ -59,7 +59,7 @@ static int refine_unknowns(const step_data *step, double *memory, double t_low, 
   newton_data *data = newton_in(workspace);
   const band shape = band_of(SITES, B);
   pair_equations at = {.t = dd_of(step->t, t_low), .h = dd_of(step->h, h_low), .parameters = step->parameters};
-  double size_p[SITES], size_q[M], inverse_size[M], last = INFINITY, largest = 0.0;
+  double size_p[SITES], size_q[M], inverse_size[M], last = INFINITY;
   int widened = 0;
   for (int i = 0; i < M; i++) {
     at.q0[i] = dd_of(step->q0[i], step->carry_q[i]);
@@ -79,8 +79,7 @@ static int refine_unknowns(const step_data *step, double *memory, double t_low, 
   TRY(all_finite(data->rows, N + SITES) && all_finite(size_q, M) ? OK : NOT_FINITE);
   TRY(linearise(step, data, &shape) ? OK : SINGULAR);
   memcpy(memory + N, data->point, sizeof(double) * POINT);
-  for (int i = 0; i < M; i++)
-    largest = larger(largest, size_q[i]);
+  const double largest = largest_magnitude(size_q, M);
   for (int i = 0; i < M; i++)
     inverse_size[i] = 1.0 / (size_q[i] + 1e-3 * largest + DBL_MIN);
   for (int k = 0; k < N; k++)

@@ -27,6 +27,7 @@ typedef ddl weight_pair;
 #define WEIGHT_OF(x) lanes_of(x)
 #define CHOSEN(wanted, x, y) (x) /* y for trajectories where `wanted` is 0 */
 #define SUM_OF_POINTS(x) points_total(x)
+#define AT_POINT(x, i, j, word) lanes_of(lane_of(&(x)[(j) / LANES][i].word, (j) % LANES))
 #else
 typedef ddl number_pair;
 typedef dd weight_pair;
@@ -37,6 +38,8 @@ typedef dd weight_pair;
 #define WEIGHT_OF(x) (x)
 #define CHOSEN(wanted, x, y) lanes_selected(wanted, x, y)
 #define SUM_OF_POINTS(x) sum_of_points(x)
+#define AT_POINT(x, i, j, word) (x)[j][i].word
+#define COLUMNS S
 #endif
 
 enum { TRAJECTORIES = sizeof(number) / sizeof(double) };
@@ -67,6 +70,37 @@ static inline ddl lanes_of_pair(number_pair x)
   return ddl_of_words(lanes_of_number(x.high), lanes_of_number(x.low));
 }
 
+/* sum_j table_gj x_j of a coordinate, with the rest of x_j. The sum begins with a large number, the anchor, so that all
+ * partial sums have the same unit and are exact, and so is the sum of what they omit of the products (Rump, Ogita &
+ * Oishi 2008). Tables have three words: those of two are of another method, which is not symplectic, so that the energy
+ * would drift by 3e-35 a step, more in a million steps than the random walk of rounding errors. The third word is added
+ * to a product: in a sum it would be less than half a unit of the others. */
+static inline __attribute__((always_inline)) ddl sum_with_rest(const point_table table, const point_table low,
+    const point_table lowest, int g, const ddl (*x)[M], lanes (*f)[M], int i, number anchor)
+{
+  lanes sum = lanes_of_number(anchor), omitted = lanes_of(0.0), low_sum = omitted, lower_sum = omitted;
+#pragma GCC unroll 32
+  for (int j = 0; j < COLUMNS; j++) {
+    const lanes a = LANES_OF_WEIGHT(TABLE_ENTRY(table, g, j)), high = AT_POINT(x, i, j, high);
+    const lanes rest = f ? AT_POINT(x, i, j, low) + f[j][i] : AT_POINT(x, i, j, low);
+    const ddl product = ddl_two_product(a, high);
+    const lanes next = sum + product.high;
+    omitted += product.high - (next - sum);
+    low_sum += product.low;
+    lower_sum += multiply_add(a, rest,
+        multiply_add(LANES_OF_WEIGHT(TABLE_ENTRY(low, g, j)), high, TABLE_ENTRY(lowest, g, j) * high));
+    sum = next;
+  }
+  const ddl exact = ddl_two_sum(sum - anchor, omitted);
+  return ddl_fast_two_sum(exact.high, exact.low + (low_sum + lower_sum));
+}
+
+static inline ddl sum_of_pairs(const point_table table, const point_table low, const point_table lowest, int g,
+    const ddl (*x)[M], int i, number anchor)
+{
+  return sum_with_rest(table, low, lowest, g, x, NULL, i, anchor);
+}
+
 #ifdef POINTS
 /* Largest absolute value at the points. */
 static inline double largest_at_points(const ddl (*x)[M], int i)
@@ -78,31 +112,6 @@ static inline double largest_at_points(const ddl (*x)[M], int i)
     for (int j = 0; j < half; j++)
       largest.lane[j] = larger(largest.lane[j], largest.lane[j + half]);
   return largest.lane[0];
-}
-
-/* sum_j table_gj x_j of a coordinate. The sum begins with a large number, the anchor, so that all partial sums have the
- * same unit and are exact, and so is the sum of what they omit of the products (Rump, Ogita & Oishi 2008). Tables have
- * three words: those of two are of another method, which is not symplectic, so that the energy would drift by 3e-35 a
- * step, more in a million steps than the random walk of rounding errors. The third word is added to a product: in a sum
- * it would be less than half a unit of the others. */
-static inline ddl sum_of_pairs(const lanes *table, const lanes *low, const lanes *lowest, int g, const ddl (*x)[M],
-    int i, double anchor)
-{
-  lanes sum = lanes_of(anchor), omitted = lanes_of(0.0), low_sum = omitted, lower_sum = omitted;
-#pragma GCC unroll 32
-  for (int j = 0; j < COLUMNS; j++) {
-    const ddl *at = &x[j / LANES][i];
-    const lanes a = table[j * GROUPS + g], high = lanes_of(lane_of(&at->high, j % LANES));
-    const ddl product = ddl_two_product(a, high);
-    const lanes next = sum + product.high;
-    omitted += product.high - (next - sum);
-    low_sum += product.low;
-    lower_sum += multiply_add(a, lanes_of(lane_of(&at->low, j % LANES)),
-        multiply_add(low[j * GROUPS + g], high, lowest[j * GROUPS + g] * high));
-    sum = next;
-  }
-  const ddl exact = ddl_two_sum(sum - anchor, omitted);
-  return ddl_fast_two_sum(exact.high, exact.low + (low_sum + lower_sum));
 }
 
 /* sum_n weights_n (x_n + f_n) of a coordinate in the same way; the order does not depend on the vector length. */
@@ -120,7 +129,6 @@ static inline dd weighted_total(const lanes *weights, const lanes *low, const la
   const dd exact = dd_two_sum(points_total(part), points_total(omitted));
   return dd_fast_two_sum(exact.high, exact.low + points_total(rest));
 }
-
 #else
 static inline number largest_at_points(const ddl (*x)[M], int i)
 {
@@ -138,30 +146,8 @@ static inline number sum_of_points(const lanes *x)
   return sum;
 }
 
-/* sum_n weights_n (x_n + f_n) of a coordinate as above. */
-static inline ddl weighted_total(const double *weights, const double *low, const double *lowest, const ddl (*x)[M],
-    lanes (*f)[M], int i, number anchor)
-{
-  lanes sum = anchor, omitted = lanes_of(0.0), low_sum = omitted, lower_sum = omitted;
-#pragma GCC unroll 16
-  for (int n = 0; n < S; n++) {
-    const lanes a = lanes_of(weights[n]), high = x[n][i].high, rest = f ? x[n][i].low + f[n][i] : x[n][i].low;
-    const ddl product = ddl_two_product(a, high);
-    const lanes next = sum + product.high;
-    omitted += product.high - (next - sum);
-    low_sum += product.low;
-    lower_sum += multiply_add(a, rest, multiply_add(lanes_of(low[n]), high, lowest[n] * high));
-    sum = next;
-  }
-  const ddl exact = ddl_two_sum(sum - anchor, omitted);
-  return ddl_fast_two_sum(exact.high, exact.low + (low_sum + lower_sum));
-}
-
-static inline ddl sum_of_pairs(const double (*table)[S], const double (*low)[S], const double (*lowest)[S], int g,
-    const ddl (*x)[M], int i, number anchor)
-{
-  return weighted_total(table[g], low[g], lowest[g], x, NULL, i, anchor);
-}
+#define weighted_total(weights, low, lowest, x, f, i, anchor) \
+  sum_with_rest(&(weights), &(low), &(lowest), 0, x, f, i, anchor)
 #endif
 
 static inline void begin_pairs(pair_step *w, const step_data *step, double t_low, double h_low)

@@ -84,14 +84,6 @@ static int follow(const flow_call *way, const real *x, long long every, real *st
   return OK;
 }
 
-static real largest(const real *x, int n)
-{
-  real found = 0;
-  for (int i = 0; i < n; i++)
-    found = larger(found, fabs(x[i]));
-  return found;
-}
-
 /* Index of the first step of a chunk whose recomputation does not reproduce its end, or the number of steps. */
 static int first_mismatch(const flow_call *way, const real *states, int length)
 {
@@ -101,7 +93,7 @@ static int first_mismatch(const flow_call *way, const real *states, int length)
       off[i] = way->q1[k * M + i] - states[FLOW_STATE + i];
       off[M + i] = way->p1[k * M + i] - states[FLOW_STATE + M + i];
     }
-    if (!(largest(off, FLOW_STATE) <= FLOW_SAME_STATE * largest(states, 2 * FLOW_STATE)))
+    if (!(largest_magnitude(off, FLOW_STATE) <= FLOW_SAME_STATE * largest_magnitude(states, 2 * FLOW_STATE)))
       return k;
   }
   return length;

@@ -41,7 +41,6 @@ static void forget_curve(block_memory *block, const state *now, lanes (*memory)[
 #ifndef SPLITTING
   block->guess = 0;
 #endif
-  (void)now, (void)memory;
 #ifdef LINE_VELOCITIES
   for (int j = 0; j < LANES; j++) {
     double q[M], p[M], v[M], parameters[P + 1], scratch[SCRATCH];

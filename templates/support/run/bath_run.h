@@ -169,9 +169,7 @@ int NAME(advance)(run_memory *run, long long steps, long long every, const real 
     total.steps++;
     if (run->step % every == 0) {
       memcpy(&now, run, sizeof now);
-      store_row(&now, stored, t, q, p);
-      iterations[stored++] = (int)run->iterations;
-      run->iterations = 0;
+      store_row(run, &now, stored++, t, q, p, iterations);
     }
   }
   if (report)

@@ -1,19 +1,14 @@
+#include "../core/scalars.h"
 #include "../core/trajectories.h"
 
 /* Ensemble runs with compensated sums; trajectories are SIMD lanes. Requires: trajectories.h, numbers.h, and
  * prepare_iteration and fixed_point of a solver, which compute the increments of a step; EXPLICIT_STEPS if it does not
  * repeat a failed step. */
 
-#ifdef DOUBLE_DOUBLE
-#define WORDS 2 /* of a number of a state, high words of a vector before low words */
-#define LOW_WORD(of, name) (of)->name##_low
-#else
-#define WORDS 1
-#ifdef SINGLE_PRECISION
+#if defined(DOUBLE_DOUBLE) || defined(SINGLE_PRECISION)
 #define LOW_WORD(of, name) (of)->name##_low
 #else
 #define LOW_WORD(of, name) 0
-#endif
 #endif
 
 #if defined(DOUBLE_DOUBLE) && !defined(EXPLICIT_STEPS)
@@ -88,7 +83,6 @@ static inline int is_out_of_range(const lanes *dq, const lanes *dp, int first)
 static void drop_infinite(const state *now, const lanes *dq, const lanes *dp, int first, real *active)
 {
   lane_view sum = {lanes_of(0.0)};
-  (void)first;
 #ifdef SINGLE_PRECISION
   if (is_out_of_range(dq, dp, first))
     sum.all += REAL(1.0);
@@ -262,7 +256,6 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
 #endif
 #ifdef TANGENTS
   tangent_growth growth;
-  (void)p;
   memcpy(&growth, block->growth, sizeof growth);
 #endif
 #ifdef MIXED_POINTS

@@ -55,7 +55,6 @@ static inline int is_transition(int event)
 #ifdef EVENT_CONTACTS
   return event >= FIRST_TRANSITION && event < FIRST_TRANSITION + TRANSITIONS;
 #else
-  (void)event;
   return 0;
 #endif
 }
@@ -67,7 +66,6 @@ static inline real side_at_start(const event_watch *watch, int e)
   if (EVENT_OF(e) >= FIRST_KINK)
     return SIDE_OF(watch, EVENT_OF(e) - FIRST_KINK);
 #endif
-  (void)watch;
   return is_transition(EVENT_OF(e)) ? 1.0 : 0.0;
 }
 

@@ -20,8 +20,6 @@ static int satisfy_constraints(const event_step *step, real t, real *q, real *p,
   memcpy(p, p1, BYTES(M));
   if (moves)
     memcpy(q, q1, BYTES(M));
-#else
-  (void)step, (void)t, (void)q, (void)p, (void)moves;
 #endif
   return OK;
 }

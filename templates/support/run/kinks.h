@@ -8,7 +8,6 @@ static int is_kink(int event)
 #ifdef EVENT_KINKS
   return event >= FIRST_KINK;
 #else
-  (void)event;
   return 0;
 #endif
 }

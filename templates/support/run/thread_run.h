@@ -44,7 +44,6 @@ static inline void transfer_all(int writes, thread_memory *own, double *memory, 
 static inline int starts_again(thread_memory *own, long long *guess, long long step)
 {
 #ifdef EXPLICIT_STEPS
-  (void)own, (void)guess, (void)step;
   return 0;
 #else
   for (int n = 0; n < S; n++)

@@ -2,40 +2,23 @@
 
 /* Reversible step-size control by an integrated step density; HAMILTONIAN_SYSTEM: the density depends on momenta,
  * not on velocities. */
-#ifdef DOUBLE_DOUBLE
-/* Arguments of the step density, one word of each: positions, momenta or velocities. Requires: pair_states.h. */
-static int density_arguments(const step_data *step, double *u)
+/* Arguments of the step density, one word of each: positions, momenta or velocities. Requires: energies.h. */
+static int density_arguments(const step_data *step, real *u)
 {
-  dd q[M], p[M];
-  for (int i = 0; i < M; i++) {
-    q[i] = dd_word(step->q0[i]);
-    p[i] = dd_word(step->p0[i]);
-  }
+  scalar moving[M];
+  for (int i = 0; i < M; i++)
+    moving[i] = SCALAR(step->p0[i]);
 #ifndef HAMILTONIAN_SYSTEM
-  dd v[M];
-  TRY(velocities_of(dd_word(step->t), q, p, step->parameters, v, step->scratch));
-  memcpy(p, v, sizeof p);
+  scalar q[M], p[M];
+  memcpy(p, moving, sizeof p);
+  for (int i = 0; i < M; i++)
+    q[i] = SCALAR(step->q0[i]);
+  TRY(velocities_of(SCALAR(step->t), q, p, step->parameters, moving, step->scratch));
 #endif
   for (int i = 0; i < M; i++)
-    u[i] = q[i].high, u[M + i] = p[i].high;
+    u[i] = step->q0[i], u[M + i] = HIGH_WORD(moving[i]);
   return OK;
 }
-#elif defined(HAMILTONIAN_SYSTEM)
-/* Arguments of the step density: positions and momenta. Requires: step.h. */
-static int density_arguments(const step_data *step, real *u)
-{
-  memcpy(u, step->q0, sizeof(real) * M);
-  memcpy(u + M, step->p0, sizeof(real) * M);
-  return OK;
-}
-#else
-/* Arguments of the step density: positions and velocities. Requires: legendre.h. */
-static int density_arguments(const step_data *step, real *u)
-{
-  memcpy(u, step->q0, sizeof(real) * M);
-  return find_velocity(step->t, step->q0, step->p0, step->parameters, u + M, step->scratch);
-}
-#endif
 
 /* Fixed steps tau in a transformed time dt = g dtau, h = tau / rho. The step density rho = 1/g is integrated by its own
  * equation drho/dtau = -d(log g)/dt from the middle of one step to that of the next, so that the step sequence is
@@ -62,7 +45,6 @@ typedef struct {
 
 static void begin_trials(run_memory *run, trial *now, const step_control *control, solver_options *standard)
 {
-  (void)standard;
   now->tau = control->tau;
   now->turned = (real)run->direction * ((now->t_end - run->t) - run->t_low) < 0;
 }
@@ -104,8 +86,7 @@ static int find_step(run_memory *run, trial *now, const solver_options *options,
 
 static int confirm_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
-  (void)report;
-  return examine_error(run, &now->step, &now->data, now->dq, now->dp, options, now->step.scratch + SCRATCH);
+  return examine_error(run, &now->step, &now->data, now->dq, options, now->step.scratch + SCRATCH);
 }
 
 /* Adds the increments to the state. */

@@ -9,7 +9,6 @@ static int next_change(run_memory *run, real error, real before, const error_lim
   const real expected =
       before > 0 && error > before ? error * (error / before) : larger(error, before / (GROWTH * GROWTH));
   int change = expected < limits->fewer ? 2 : expected < limits->few;
-  (void)run;
   while (change > -LEVELS_PER_BINADE && error_at(expected, change) > limits->most)
     change--;
   return change;

@@ -62,146 +62,6 @@ step_control NAME(default_step_control)(void)
   return (step_control){.max_step = INFINITY};
 }
 
-#ifdef NEWTON_ALONE
-#define HOT static
-#define AMPLIFIED 1e-14 /* last update beyond which unknowns do not resolve errors in two words */
-#define SHORT_STEPS_FAIL 0
-#define LEVELS_INSIDE 0 /* no predictor from a rejected step */
-
-/* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
- * failed. afresh: without the predictor, which requires the step size of the previous step. */
-static real attempt(run_memory *run, step_data *step, const solver_data *data, int afresh, int inside, long long *guess,
-    real *dq, real *dp, const error_limits *limits, real least, const solver_options *options, solver_report *report)
-{
-  (void)inside;
-  *guess = !afresh && run->change == 0 && run->guess > 0;
-  if (solve(step, data, run->memory, guess, dq, dp, options, report, step->scratch + SCRATCH) != OK)
-    return INFINITY;
-#ifdef DOUBLE_DOUBLE
-  step->noise = report->change > AMPLIFIED ? report->change : 0;
-  if (step->noise > 0) {
-    real passed[2], both[2 * M], changes[2 * M];
-    memcpy(both, dq, sizeof(real) * M), memcpy(changes, dp, sizeof(real) * M);
-    if (refine_increments(step, run->memory, run->t_low, 0, both, changes, passed, step->scratch + SCRATCH) != OK)
-      return INFINITY;
-  }
-#endif
-  *guess = 1;
-  return stage_error(step, run->memory, dq, EACH, limits->decay, least, limits->most);
-}
-#else
-#ifdef ARRAYS
-#define LEVELS_INSIDE 0 /* the stored curves are those of accepted steps */
-#else
-#define LEVELS_INSIDE INSIDE
-#endif
-#define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */
-
-#ifdef COSTLY_POINTS
-/* Table of the last step of a run, whose size is not on the grid, from the curve of the step before; or, if inside < 0,
- * of a trial in the search for the first step, from that of one that was shorter by -inside levels, of a much shorter
- * one from the velocity at the start. Returns 0 without a curve. */
-static SELDOM int tables_off_grid(const run_memory *run, const step_data *step, int inside, lanes *table)
-{
-  const int begins_there = inside < 0;
-  const long long level = run->grid_level + (begins_there ? inside : -run->change);
-  if (!begins_there && run->guess <= 0)
-    return 0;
-  tabulate(begins_there ? 0.0 : 1.0, inside < -MOST_UP ? 0.0 : fabs(step->h) / size_of_level(level), table);
-  return 1;
-}
-
-/* Increments of a very short step, and its curve, by the rates at the start; returns 0, or infinity from rest, where
- * they do not show how the motion begins. */
-static SELDOM double step_by_rates(const step_data *step, history memory, double *dq, double *dp)
-{
-  lanes z[GROUPS][M], u[2 * M], rates[2 * M];
-  double moved = 0.0;
-  if (start_velocities(step, z) != OK)
-    return INFINITY;
-  for (int i = 0; i < M; i++)
-    u[i] = lanes_of(step->q0[i]), u[M + i] = z[0][i];
-  value_lanes(u, lanes_of(step->t), step->parameters, rates);
-  for (int i = 0; i < M; i++) {
-    dq[i] = step->h * at_first(&z[0][i]), dp[i] = step->h * at_first(&rates[i]);
-    moved = larger(moved, fabs(dq[i]));
-  }
-  remember_curve(z, memory);
-  return moved > 0.0 && reaches(step, dq, dp) ? 0.0 : INFINITY;
-}
-#endif
-
-/* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
- * failed. afresh: without the predictor of the grid; inside: levels above this one of a rejected step, or minus those
- * below of a pilot, whose curve is stored, or 0; rough: 1 without low words. */
-static inline __attribute__((always_inline)) double attempt_at(run_memory *run, step_data *step,
-    const solver_data *data, int afresh, int inside, long long *guess, double *dq, double *dp,
-    const error_limits *limits, double least, const solver_options *options, solver_report *report, int rough)
-{
-  struct predictor_tables_of tables = {NULL, NULL, NULL};
-  int status;
-#ifdef COSTLY_POINTS
-  lanes table[POINTS * GROUPS];
-  if (inside == AT_START)
-    return step_by_rates(step, STORED(run, step), dq, dp);
-#endif
-  step->tables = &tables;
-  if (inside > 0) {
-    tables.alone = PREDICTOR_INSIDE[inside - 1];
-    *guess = 1;
-#ifdef COSTLY_POINTS
-  } else if (afresh || inside < 0) {
-    tables.alone = table;
-    *guess = tables_off_grid(run, step, inside, table);
-#endif
-  } else
-    *guess = afresh || run->guess < 0 || !choose_tables(run, &tables) ? 0 : run->guess;
-#ifdef NEWTON_KRYLOV
-  status = solve(step, data, STORED(run, step), guess, dq, dp, options, report, NULL);
-#elif defined(ROUGH)
-  status = adaptive_point(step, data, STORED(run, step), guess, dq, dp, options, report, rough);
-#else
-  status = fixed_point(step, data, STORED(run, step), guess, dq, dp, options, report);
-#endif
-  (void)rough;
-  step->tables = NULL;
-  if (inside != 0) /* the step before is no longer stored */
-    *guess = 1;
-  if (status != OK)
-    return INFINITY;
-#ifdef ARRAYS
-  find_displacements(step, data, STORED(run, step), dq);
-#endif
-  step->noise = report->noise;
-  return curve_error(step, data, STORED(run, step), dq, EACH, limits->decay, least, limits->most);
-}
-
-/* Out of line, one copy compiles faster than two. Steps without low words have one of their own, so that others take no
- * longer. */
-static __attribute__((noinline)) double attempt(run_memory *run, step_data *step, const solver_data *data, int afresh,
-    int inside, long long *guess, double *dq, double *dp, const error_limits *limits, double least,
-    const solver_options *options, solver_report *report)
-{
-  return attempt_at(run, step, data, afresh, inside, guess, dq, dp, limits, least, options, report, 0);
-}
-
-#ifdef ROUGH
-static __attribute__((noinline)) double rough_attempt(run_memory *run, step_data *step, const solver_data *data,
-    int afresh, int inside, long long *guess, double *dq, double *dp, const error_limits *limits, double least,
-    const solver_options *options, solver_report *report)
-{
-  return attempt_at(run, step, data, afresh, inside, guess, dq, dp, limits, least, options, report, 1);
-}
-#endif
-#endif
-
-#ifdef ROUGH
-#define ATTEMPT(options, ...) \
-  ((options)->tolerance > ROUGH ? rough_attempt(__VA_ARGS__) : attempt(__VA_ARGS__))
-#else
-#define ATTEMPT(options, ...) attempt(__VA_ARGS__)
-#endif
-
 #ifndef ARRAYS
 #if !defined(NEWTON_ALONE) && !defined(NO_FALLBACK)
 #define NEWTON_ADMITTED /* where the fixed-point iteration limits the steps */
@@ -255,13 +115,144 @@ typedef struct {
 #endif
 } trial;
 
+#ifdef NEWTON_ALONE
+#define HOT static
+#define AMPLIFIED 1e-14 /* last update beyond which unknowns do not resolve errors in two words */
+#define SHORT_STEPS_FAIL 0
+#define LEVELS_INSIDE 0 /* no predictor from a rejected step */
+
+/* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
+ * failed. The predictor requires the step size of the previous step. */
+static real attempt(run_memory *run, trial *now, real least, const solver_options *options, solver_report *report)
+{
+  step_data *const step = &now->step;
+  real *const workspace = step->scratch + SCRATCH;
+  now->guess = !now->last && run->change == 0 && run->guess > 0;
+  if (solve(step, &now->data, run->memory, &now->guess, now->dq, now->dp, options, report, workspace) != OK)
+    return INFINITY;
+#ifdef DOUBLE_DOUBLE
+  step->noise = report->change > AMPLIFIED ? report->change : 0;
+  if (step->noise > 0) {
+    real passed[2], both[2 * M], changes[2 * M];
+    memcpy(both, now->dq, sizeof(real) * M), memcpy(changes, now->dp, sizeof(real) * M);
+    if (refine_increments(step, run->memory, run->t_low, 0, both, changes, passed, workspace) != OK)
+      return INFINITY;
+  }
+#endif
+  now->guess = 1;
+  return stage_error(step, run->memory, now->dq, EACH, now->limits.decay, least, now->limits.most);
+}
+#else
+#ifdef ARRAYS
+#define LEVELS_INSIDE 0 /* the stored curves are those of accepted steps */
+#else
+#define LEVELS_INSIDE INSIDE
+#endif
+#define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */
+
+#ifdef COSTLY_POINTS
+/* Table of the last step of a run, whose size is not on the grid, from the curve of the step before; or, if inside < 0,
+ * of a trial in the search for the first step, from that of one that was shorter by -inside levels, of a much shorter
+ * one from the velocity at the start. Returns 0 without a curve. */
+static SELDOM int tables_off_grid(const run_memory *run, const step_data *step, int inside, lanes *table)
+{
+  const int begins_there = inside < 0;
+  const long long level = run->grid_level + (begins_there ? inside : -run->change);
+  if (!begins_there && run->guess <= 0)
+    return 0;
+  tabulate(begins_there ? 0.0 : 1.0, inside < -MOST_UP ? 0.0 : fabs(step->h) / size_of_level(level), table);
+  return 1;
+}
+
+/* Increments of a very short step, and its curve, by the rates at the start; returns 0, or infinity from rest, where
+ * they do not show how the motion begins. */
+static SELDOM double step_by_rates(const step_data *step, history memory, double *dq, double *dp)
+{
+  lanes z[GROUPS][M], u[2 * M], rates[2 * M];
+  double moved = 0.0;
+  if (start_velocities(step, z) != OK)
+    return INFINITY;
+  for (int i = 0; i < M; i++)
+    u[i] = lanes_of(step->q0[i]), u[M + i] = z[0][i];
+  value_lanes(u, lanes_of(step->t), step->parameters, rates);
+  for (int i = 0; i < M; i++) {
+    dq[i] = step->h * at_first(&z[0][i]), dp[i] = step->h * at_first(&rates[i]);
+    moved = larger(moved, fabs(dq[i]));
+  }
+  remember_curve(z, memory);
+  return moved > 0.0 && reaches(step, dq, dp) ? 0.0 : INFINITY;
+}
+#endif
+
+/* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
+ * failed. The last step of a run has no predictor of the grid; rough: 1 without low words. */
+static inline __attribute__((always_inline)) double attempt_at(run_memory *run, trial *now, double least,
+    const solver_options *options, solver_report *report, int rough)
+{
+  struct predictor_tables_of tables = {NULL, NULL, NULL};
+  step_data *const step = &now->step;
+  const solver_data *const data = &now->data;
+  const int afresh = now->last, inside = afresh ? 0 : now->inside;
+  long long *const guess = &now->guess;
+  int status;
+#ifdef COSTLY_POINTS
+  lanes table[POINTS * GROUPS];
+  if (inside == AT_START)
+    return step_by_rates(step, STORED(run, step), now->dq, now->dp);
+#endif
+  step->tables = &tables;
+  if (inside > 0) {
+    tables.alone = PREDICTOR_INSIDE[inside - 1];
+    *guess = 1;
+#ifdef COSTLY_POINTS
+  } else if (afresh || inside < 0) {
+    tables.alone = table;
+    *guess = tables_off_grid(run, step, inside, table);
+#endif
+  } else
+    *guess = afresh || run->guess < 0 || !choose_tables(run, &tables) ? 0 : run->guess;
+#ifdef NEWTON_KRYLOV
+  status = solve(step, data, STORED(run, step), guess, now->dq, now->dp, options, report, NULL);
+#elif defined(ROUGH)
+  status = adaptive_point(step, data, STORED(run, step), guess, now->dq, now->dp, options, report, rough);
+#else
+  status = fixed_point(step, data, STORED(run, step), guess, now->dq, now->dp, options, report);
+#endif
+  step->tables = NULL;
+  if (inside != 0) /* the step before is no longer stored */
+    *guess = 1;
+  if (status != OK)
+    return INFINITY;
+#ifdef ARRAYS
+  find_displacements(step, data, STORED(run, step), now->dq);
+#endif
+  step->noise = report->noise;
+  return curve_error(step, data, STORED(run, step), now->dq, EACH, now->limits.decay, least, now->limits.most);
+}
+
+/* Out of line, one copy compiles faster than two. Steps without low words have one of their own, so that others take no
+ * longer. */
+static __attribute__((noinline)) double attempt(run_memory *run, trial *now, double least,
+    const solver_options *options, solver_report *report)
+{
+  return attempt_at(run, now, least, options, report, 0);
+}
+
+#ifdef ROUGH
+static __attribute__((noinline)) double rough_attempt(run_memory *run, trial *now, double least,
+    const solver_options *options, solver_report *report)
+{
+  return attempt_at(run, now, least, options, report, 1);
+}
+#endif
+#endif
+
 /* Returns 1 if Newton's method solved a trial, which then has no curve. */
 static inline int by_newton(const trial *now)
 {
 #ifdef NEWTON_ADMITTED
   return now->fallbacks > 0;
 #else
-  (void)now;
   return 0;
 #endif
 }
@@ -321,8 +312,11 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
     return;
   }
 #endif
-  now->error = ATTEMPT(options, run, &now->step, &now->data, now->last, now->last ? 0 : now->inside, &now->guess,
-      now->dq, now->dp, &now->limits, least, options, report);
+#ifdef ROUGH
+  now->error = (options->tolerance > ROUGH ? rough_attempt : attempt)(run, now, least, options, report);
+#else
+  now->error = attempt(run, now, least, options, report);
+#endif
   now->iterations = report->iterations - now->iterations;
 #ifdef RATTLE
   now->fallbacks = report->fallback_steps - now->fallbacks;
@@ -356,7 +350,6 @@ static inline int compare_trial(const run_memory *run, const trial *now, int mom
   if (run->error_before == 0 && MATH(fabs)(now->step.h) == 2 * now->half_length)
     half = now->half;
 #endif
-  (void)run;
   return compare_with_halves(&now->step, now->dq, momenta ? now->dp : NULL, half, options, apart);
 }
 
@@ -550,8 +543,6 @@ static SELDOM void avoid_size(run_memory *run, trial *now)
 #ifdef RATTLE
   if (++now->failures >= FAILURES_BEFORE_NEWTON)
     run->avoiding = -AVOIDED;
-#else
-  (void)now;
 #endif
 }
 
@@ -597,8 +588,6 @@ static inline int try_by_newton(run_memory *run, trial *now, const solver_option
   run->avoiding = 0;
   run->grid_level = level;
   now->error = INFINITY;
-#else
-  (void)run, (void)now, (void)options, (void)report;
 #endif
   return 0;
 }
@@ -675,7 +664,6 @@ static SELDOM int is_free_flight(const step_data *step, stored_values of)
 /* Returns 1 for a free flight whose size is far from that of the step before: much larger, or shortened at once. */
 static inline int is_leap(const run_memory *run, const trial *now)
 {
-  (void)run;
   if (by_newton(now))
     return 0;
   if (now->change < LEAP && now->change > -LEVELS_PER_BINADE)
@@ -782,7 +770,6 @@ static SELDOM int passes_over_force(const trial *now, real allowed, const solver
   }
   return difference(step, step->h, step->q0, now->dq, halves, &far) > allowed;
 #else
-  (void)now, (void)allowed, (void)options;
   return 0;
 #endif
 }
@@ -984,7 +971,6 @@ int NAME(advance_to)(run_memory *run, double t_end, const step_control *control,
       .q = q,
       .p = p,
       .iterations = iterations};
-  (void)workspace;
   return perform(run, way, parameters, options, report);
 }
 #endif
