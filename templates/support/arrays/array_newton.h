@@ -1,4 +1,5 @@
 #include "../core/points.h"
+#include "../core/shifts.h"
 #include "../core/step.h"
 #include "../iteration/convergence.h"
 #include "arrays.h"
@@ -61,46 +62,20 @@ static void apply_inverses(const linear_system *of, const lanes *x, lanes *y, se
   }
 }
 
-/* Inverse of a matrix stored by columns, which is overwritten (Gauss-Jordan elimination with pivoting). */
-static void invert(double (*matrix)[POINTS], double (*inverse)[POINTS])
-{
-  for (int j = 0; j < POINTS; j++)
-    for (int i = 0; i < POINTS; i++)
-      inverse[j][i] = i == j;
-  for (int k = 0; k < POINTS; k++) {
-    int pivot = k;
-    for (int i = k + 1; i < POINTS; i++)
-      pivot = fabs(matrix[k][i]) > fabs(matrix[k][pivot]) ? i : pivot;
-    for (int j = 0; j < POINTS; j++) {
-      const double a = matrix[j][k], b = inverse[j][k];
-      matrix[j][k] = matrix[j][pivot], matrix[j][pivot] = a;
-      inverse[j][k] = inverse[j][pivot], inverse[j][pivot] = b;
-    }
-    for (int i = 0; i < POINTS; i++) {
-      const double by = i == k ? 1.0 - 1.0 / matrix[k][k] : matrix[k][i] / matrix[k][k];
-      for (int j = 0; j < POINTS; j++) {
-        if (j != k)
-          matrix[j][i] -= by * matrix[j][k];
-        inverse[j][i] -= by * inverse[j][k];
-      }
-      matrix[k][i] = i == k ? 1.0 : 0.0;
-    }
-  }
-}
-
-/* Stores `by` times the inverse of 1 - derivative A for a coordinate; a positive (unstable) derivative counts as 0. */
+/* Stores `by` times the inverse of 1 - derivative A for a coordinate, from eigenvectors of A; a positive (unstable)
+ * derivative counts as 0. */
 static void keep_inverse(linear_system *of, long long i, double derivative, double by)
 {
-  double matrix[POINTS][POINTS], inverse[POINTS][POINTS];
-  derivative = smaller(derivative, 0.0);
-  for (int j = 0; j < POINTS; j++)
-    for (int k = 0; k < POINTS; k++)
-      matrix[j][k] = (j == k) - derivative * at_point(&PRODUCT[j * GROUPS], 1, k);
-  invert(matrix, inverse);
-  for (int j = 0; j < POINTS; j++)
-    for (int k = 0; k < POINTS; k++)
-      inverse[j][k] *= by;
-  memcpy(of->work->inverse + i * POINTS * GROUPS, inverse, sizeof inverse);
+  const double d = smaller(derivative, 0.0);
+  const complex_shifts system = {1.0 - d * shifts_at(MU), -d * shifts_at(MU + SHIFTS)};
+  const complex_shifts inverse = inverse_of_shifts(system);
+  lanes *const column = of->work->inverse + i * POINTS * GROUPS;
+  memset(column, 0, sizeof(lanes) * POINTS * GROUPS);
+  for (int j = 0; j < MATRIX_POINTS; j++) {
+    const double *into = TO_SHIFTS + 2 * SHIFTS * j;
+    const complex_shifts unit = {by * shifts_at(into), by * shifts_at(into + SHIFTS)};
+    from_shifts(product_of(inverse, unit), 1, column + j * GROUPS);
+  }
 }
 
 /* Inverts 1 - h^2 A F'_ii / m of every coordinate. */

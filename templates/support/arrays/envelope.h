@@ -161,12 +161,6 @@ static void find_factors(linear_system *of)
   wait_at_barrier(of->run);
 }
 
-static inline void from_shifts(const envelope *all, complex_shifts z, lanes *y)
-{
-  for (int g = 0; g < GROUPS; g++)
-    y[g * all->stride] = from_shifts_at(z, g);
-}
-
 #ifdef FORCES_OF_VELOCITIES
 /* Changes of positions, which follow from those of velocities: x_q + h B (y_v - x_v). */
 static void follow_velocities(const linear_system *of, const lanes *x, lanes *y)
@@ -199,7 +193,7 @@ static void apply_factors(const linear_system *of, const lanes *x, lanes *y)
     const complex_shifts *column = row_of(&all, SIDES - 1, i), solved = z[i];
     for (long long j = all.first[i]; j < i; j++)
       z[j] = minus_product(z[j], column[j], solved);
-    from_shifts(&all, solved, y + solved_part + all.order[i]);
+    from_shifts(solved, all.stride, y + solved_part + all.order[i]);
   }
   wait_at_barrier(of->run);
 #ifdef FORCES_OF_VELOCITIES

@@ -100,20 +100,19 @@ static int invert_modes(linear_system *of)
 /* Solves x - h A J H'' x = y / places for the modes of this thread, in eigenvectors of A. */
 static void apply_inverses_of_modes(const linear_system *of, lanes *x, section own, double places)
 {
-  const envelope all = {.stride = X_VECTORS * of->n};
+  const long long apart = X_VECTORS * of->n;
   for (long long i = own.first; i < own.end; i++) {
     const double *rates = rates_of_mode(of, i);
     const complex_shifts mu = {shifts_at(MU), shifts_at(MU + SHIFTS)}, square = product_of(mu, mu);
-    const complex_shifts q = into_shifts(x + i, all.stride, 1.0 / places);
-    const complex_shifts p = into_shifts(x + of->n + i, all.stride, 1.0 / places);
+    const complex_shifts q = into_shifts(x + i, apart, 1.0 / places);
+    const complex_shifts p = into_shifts(x + of->n + i, apart, 1.0 / places);
     const complex_shifts from_q = product_of(mu, q), from_p = product_of(mu, p);
-    const shifts re = 1.0 - rates[0] * rates[1] * square.re, im = -(rates[0] * rates[1]) * square.im;
-    const shifts size = 1.0 / (re * re + im * im);
-    const complex_shifts inverse = {re * size, -im * size};
+    const double both = rates[0] * rates[1];
+    const complex_shifts inverse = inverse_of_shifts((complex_shifts){1.0 - both * square.re, -both * square.im});
     const complex_shifts position = {q.re + rates[1] * from_p.re, q.im + rates[1] * from_p.im};
     const complex_shifts momentum = {p.re + rates[0] * from_q.re, p.im + rates[0] * from_q.im};
-    from_shifts(&all, product_of(inverse, position), x + i);
-    from_shifts(&all, product_of(inverse, momentum), x + of->n + i);
+    from_shifts(product_of(inverse, position), apart, x + i);
+    from_shifts(product_of(inverse, momentum), apart, x + of->n + i);
   }
 }
 #else

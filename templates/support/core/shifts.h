@@ -26,6 +26,13 @@ static inline complex_shifts minus_product(complex_shifts a, complex_shifts x, c
   return a;
 }
 
+/* 1 / x. */
+static inline complex_shifts inverse_of_shifts(complex_shifts x)
+{
+  const shifts size = 1.0 / (x.re * x.re + x.im * x.im);
+  return (complex_shifts){x.re * size, -x.im * size};
+}
+
 /* factor x in eigenvectors of A; groups of x are `apart` apart. */
 static inline complex_shifts into_shifts(const lanes *x, long long apart, double factor)
 {
@@ -47,4 +54,11 @@ static inline lanes from_shifts_at(complex_shifts z, int g)
   for (int k = 0; k < SHIFTS; k++)
     sum += z.re[k] * FROM_SHIFTS[k * GROUPS + g] + z.im[k] * FROM_SHIFTS[(SHIFTS + k) * GROUPS + g];
   return sum;
+}
+
+/* Stores the values at all groups, which are `apart` apart. */
+static inline void from_shifts(complex_shifts z, long long apart, lanes *y)
+{
+  for (int g = 0; g < GROUPS; g++)
+    y[g * apart] = from_shifts_at(z, g);
 }

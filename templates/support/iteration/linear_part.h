@@ -51,8 +51,7 @@ static void factorise_linear_part(const double *parameters, double square, const
       pivot = minus_product(pivot, row[d], scaled);
       row[d] = scaled;
     }
-    const shifts size = 1.0 / (pivot.re * pivot.re + pivot.im * pivot.im);
-    row[0].re = pivot.re * size, row[0].im = -pivot.im * size;
+    row[0] = inverse_of_shifts(pivot);
   }
 }
 
@@ -69,8 +68,7 @@ static void solve_linear_part(const linear_part *all, lanes *r)
     z[i] = product_of(z[i], all->row[i][0]);
     for (int d = 1; d <= LINEAR_BAND && i + d < M; d++)
       z[i] = minus_product(z[i], all->row[i + d][d], z[i + d]);
-    for (int g = 0; g < GROUPS; g++)
-      r[g * M + LINEAR_COORDINATE[i]] = from_shifts_at(z[i], g);
+    from_shifts(z[i], M, r + LINEAR_COORDINATE[i]);
   }
 }
 
