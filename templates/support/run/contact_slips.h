@@ -17,13 +17,13 @@ enum {
 #define CONTACT_UNSOLVED 0x1p-30 /* relative to that: smaller steps with unsolved parts are not divided further */
 #define CONTACT_TURN 0.866 /* cosine of an angle after which a direction is renewed */
 
-#ifdef CONTACTS_IN_SPACE
 /* Whether the stage equations of a step were not solved, those of a shorter one may be. */
 static int is_unsolved(int status)
 {
   return status == NOT_CONVERGED || status == SINGULAR || status == STATUS(SPURIOUS_SOLUTION);
 }
 
+#ifdef CONTACTS_IN_SPACE
 /* Adds a change of the modes at a state to the crossings. */
 static int add_change(const event_step *step, int event, const event_sample *at)
 {

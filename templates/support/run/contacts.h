@@ -252,6 +252,66 @@ static int is_of_forces(int transition)
   return kind != CONTACT_CLOSES && kind != CONTACT_LEAVES && kind != CONTACT_STOPS;
 }
 
+/* Whether a gap that the rows of other contacts held at 0 has left it at a state, where they no longer determine it. */
+static int is_released(const event_step *step, const event_sample *at, int k, int *released)
+{
+  contact_terms of;
+  contact_mode mode[EVENT_CONTACTS];
+  contact_problem in = {.of = &of};
+  const int row = CONTACTS[k].normal;
+  int rank;
+  TRY(terms_at(step, at, &of));
+  in.right = of.second;
+  modes_at(&of, step->watch->mode, mode);
+  *released = fabs(of.value[row]) > CONTACT_ROUNDING * of.size[row];
+  if (!*released || (!mode[k].closed && of.value[row] > 0.0))
+    return OK;
+  mode[k] = CONTACT_IS_OPEN;
+  rank = rank_of(&in, mode);
+  mode[k] = CONTACT_SLIPS;
+  *released = rank_of(&in, mode) > rank;
+  return OK;
+}
+
+/* Adds a crossing of a transition at a fraction of a step. */
+static int add_transition(const event_step *step, int transition, real fraction)
+{
+  event_crossing *crossing = step->found + *step->filled;
+  event_sample at;
+  TRY(take_sample(step, EVENT_FIRST[FIRST_TRANSITION + transition], fraction, &at));
+  if (*step->filled == step->room || !place_crossing(step->watch, crossing, step->room))
+    return EVENT_NO_ROOM;
+  *crossing = (event_crossing){.t = at.t, .fraction = fraction, .direction = -1};
+  crossing->function = FIRST_TRANSITION + transition;
+  copy_state(crossing->q, crossing->p, at.q, at.p);
+  ++*step->filled;
+  return OK;
+}
+
+/* Ends the modes of contacts whose gaps others held, as on straight legs until knees bend: at the first of the parts of
+ * a step, each twice as long, after which they are released. */
+static int end_held_modes(const event_step *step, const event_sample *right)
+{
+  for (int i = 0; i < TRANSITIONS; i++) {
+    const contact_places *const places = CONTACTS + TRANSITION[i][0];
+    real fraction = 1.0, first = 0.0;
+    event_sample at = *right;
+    int released = TRANSITION[i][1] == CONTACT_CLOSES && step->watch->mode[places->closed] == 0.0 &&
+        step->watch->mode[places->held] != 0.0;
+    if (released)
+      TRY(is_released(step, &at, TRANSITION[i][0], &released));
+    while (released && fraction > CONTACT_START) {
+      first = fraction;
+      fraction *= 0.5;
+      TRY(state_at(step, fraction, &at));
+      TRY(is_released(step, &at, TRANSITION[i][0], &released));
+    }
+    if (first > 0.0)
+      TRY(add_transition(step, i, first));
+  }
+  return OK;
+}
+
 /* Ends modes at the start of a step whose forces are outside of their cone there within rounding, and more at its end:
  * their functions have no zero. */
 static int end_modes_at_start(const event_step *step, const event_sample *right)
@@ -261,8 +321,6 @@ static int end_modes_at_start(const event_step *step, const event_sample *right)
   for (int i = 0; i < TRANSITIONS; i++) {
     const int e = EVENT_FIRST[FIRST_TRANSITION + i];
     const real before = values_at(step, 0)[e], after = values_at(step, EVENT_DEGREE)[e];
-    event_crossing *crossing = step->found + *step->filled;
-    event_sample start;
     if (!(is_of_forces(i) && before < 0.0 && after < before))
       continue;
     if (!has_terms) {
@@ -270,17 +328,10 @@ static int end_modes_at_start(const event_step *step, const event_sample *right)
       find_outside(step, &of, CONTACT_OUTSIDE, outside);
     }
     has_terms = 1;
-    if (!outside[TRANSITION[i][0]])
-      continue;
-    TRY(take_sample(step, e, CONTACT_START, &start));
-    if (*step->filled == step->room || !place_crossing(step->watch, crossing, step->room))
-      return EVENT_NO_ROOM;
-    *crossing = (event_crossing){.t = start.t, .fraction = CONTACT_START, .direction = -1};
-    crossing->function = FIRST_TRANSITION + i;
-    copy_state(crossing->q, crossing->p, start.q, start.p);
-    ++*step->filled;
+    if (outside[TRANSITION[i][0]])
+      TRY(add_transition(step, i, CONTACT_START));
   }
-  return OK;
+  return end_held_modes(step, right);
 }
 
 /* Fails if a gap is negative at the end of a step without a transition, or forces are outside of their cone. */

@@ -634,7 +634,7 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
   const event_watch initial = *watch;
   const stored_states to = {states, number, t, q, p, length, iterations};
   int status = OK;
-#ifdef CONTACTS_IN_SPACE
+#ifdef EVENT_CONTACTS
   real unsolved = INFINITY; /* largest size of an adaptive step after one whose parts were not solved */
 #endif
   memset(report, 0, sizeof *report);
@@ -652,9 +652,12 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
       status = begin_run(run, &step, control ? t_end - run->t : run->h);
     put_modes(watch->mode, own);
 #endif
+#ifdef EVENT_CONTACTS
+    real longest = INFINITY;
+#endif
 #ifdef CONTACTS_IN_SPACE
     event_sample now = {.t = run->t, .q = run->q, .p = run->p};
-    real longest = fabs(run->h);
+    longest = fabs(run->h);
 #if EVENTS_CONTROLLED
     longest = control ? exp2((real)run->grid_level / 4.0) : longest; /* the size that the controller has found */
 #endif
@@ -688,7 +691,7 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
     watch->first = tried ? fabs(size) : INFINITY;
 #endif
 #endif
-#ifdef CONTACTS_IN_SPACE
+#ifdef EVENT_CONTACTS
     const step_control *limited = control;
 #if EVENTS_CONTROLLED
     step_control shorter;
@@ -705,10 +708,12 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
       status = NOT_CONVERGED;
     if (status == OK && control)
       watch->pace = fmax(watch->pace, CONTACT_PACE * size);
+#ifdef CONTACTS_IN_SPACE
     if (is_unsolved(status) && !control && leave_slips(&step)) {
       copy_run(run, &before);
       status = take_step(run, t_end, limited, &step, &size, &count);
     }
+#endif
 #else
     if (status == OK)
       status = take_step(run, t_end, control, &step, &size, &count);
@@ -717,10 +722,10 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
       status = change_in_step(&before, run, &step, control != NULL, size, count, &to);
     if (status != OK) {
       int again = 0;
-#ifdef CONTACTS_IN_SPACE /* whose slow slips the iteration on stages may not solve */
+#ifdef EVENT_CONTACTS /* whose slow slips and straight legs the iteration on stages may not solve */
       unsolved = 0.5 * size;
       again = control && is_unsolved(status) && !watch->refusal && !watch->accumulated && !watch->through &&
-          unsolved > CONTACT_UNSOLVED * watch->pace;
+          !watch->chatters && !watch->jammed && unsolved > CONTACT_UNSOLVED * watch->pace;
 #endif
       copy_run(run, &before);
       report->stored = kept;
