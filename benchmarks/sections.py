@@ -176,7 +176,7 @@ def _robot(
         return race
 
     def ours() -> list[Contender]:
-        tolerances = LOOSE_TOLERANCES[:: 4 if plan.quick else 1]
+        tolerances = ROBOT_TOLERANCES[:: 4 if plan.quick else 1]
         return [*race.ours(), *controlled_contenders(race.case, *compiled(race.case.system, "svi:4"), tolerances)]
 
     return replace(race, ours=ours)
@@ -208,6 +208,8 @@ EXPLICIT |= {Composition(8): range(6), "stoermer-verlet": range(1, 13)}
 EXACT: dict[str | Method, int] = {"svi:10": 3, Composition(10): 5}
 ROBOT_METHODS: dict[str | Method, range] = {f"svi:{s}": range(most) for s, most in ((2, 7), (4, 5), (6, 4))}
 ROBOTS_EXACT: dict[str | Method, int] = {"svi:8": 3, "svi:6": 4}
+ROBOT_TOLERANCES = (*LOOSE_TOLERANCES, 0.1, 0.3, 0.9)
+"""Tolerances of adaptive steps: those of the curve of a step, whose ends have smaller errors."""
 TREE_METHODS: dict[str | Method, range] = {"svi:2": range(4, 9), "svi:4": range(1, 6)}
 TREE_ERRORS = (1e-4, 1e-7, 1e-10)
 TREES_EXACT: dict[str | Method, int] = {"svi:4": 6, "svi:3": 7}
