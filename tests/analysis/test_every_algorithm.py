@@ -32,6 +32,10 @@ OTHERS = {
         for x in ("s", "_rows", "_forces", "_modes")
     },
     **{f"run/contact_{x}.h": "compared with closed forms in test_contacts.py" for x in ("impacts", "slips")},
+    **{f"run/{x}.h": "compared with exact covariances in test_bath.py" for x in ("bath", "bath_lanes", "bath_run")},
+    "arrays/array_bath.h": "compared with exact covariances in test_arrays_in_bath.py",
+    "run/normals.h": "compared with published words of Philox and with NumPy in test_normals.py",
+    "core/directions.h": "compared with a mechanism without loops in test_equalities.py",
     "run/observation.h": "compared with the states of runs in test_observers.py",
     "frameworks/casadi_flow.h": "interface of CasADi to a compiled step",
     "frameworks/flow.h": "interface of JAX and PyTorch to a compiled step",

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -53,10 +54,10 @@ class TestHelp:
         Path("mine.toml").write_text(output_of("systems", "kepler"))
         shutil.copy(Path(__file__).parents[2] / "examples/fput_ring.toml", "ring.toml")
         found = [match[1] for text in texts for match in re.finditer(r"^ +scvi-codegen (\w.*)$", text, re.MULTILINE)]
-        lines = dict.fromkeys(re.split(r" {2,}| > ", line)[0] for line in found)  # in order: some need others' files
+        lines = dict.fromkeys(re.split(r" {2,}", line)[0] for line in found)  # in order: some need others' files
         assert len(lines) >= 9
         for line in lines:
-            words = line.split()
+            words = list(takewhile(lambda word: word != ">", shlex.split(line)))
             if "--steps" not in words and words[0] == "run":
                 words += ["--span", "10"] if "--span" not in words else []
             words += ["--list"] if words[0] == "reproduce" else []  # running it takes minutes

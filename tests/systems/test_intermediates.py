@@ -11,6 +11,7 @@ from sympy import Add, Mul, Rational, S, Symbol, cos, exp, sin, sqrt, symbols
 
 import scvi_codegen as sc
 from scvi_codegen.codegen.ir.arithmetic import lower_kernel
+from scvi_codegen.codegen.ir.kernel import exact_number
 from scvi_codegen.common.cache import identity
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.precision import mp
@@ -95,6 +96,12 @@ def test_replacements_are_those_of_their_own_rule():
     for shift in (1, 2, 1):
         moved = evaluate(formula.xreplace({X: X + shift}), POINT)
         assert abs(moved - evaluate(formula, POINT | {X: POINT[X] + shift})) < mp.mpf("1e-50")
+
+
+def test_constants_have_the_digits_of_the_formula_written_out():
+    small = intermediate(1 / sqrt(2**120 + S.One))
+    for constant in (small, 3 * small, sin(small) - intermediate(S.Pi / 3)):
+        assert exact_number(constant) == exact_number(written_out(constant))
 
 
 def test_mass_matrix_of_a_planar_chain_takes_few_operations():

@@ -19,6 +19,7 @@ from typing import Any
 from weakref import WeakValueDictionary
 
 from sympy import Abs, Add, Basic, Expr, Mul, Rational, S, Symbol, cos, sin
+from sympy.core.evalf import prec_to_dps
 
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.systems.formulas.kinks import absolute, rint, unit_step
@@ -89,6 +90,9 @@ class Intermediate(Expr):  # type: ignore[misc]  # SymPy is untyped
         return f"({printer._print(self.definition)})"
 
     _sympystr = _latex = _pythoncode = _numpycode = _scipycode = _mpmathcode = _printed
+
+    def _eval_evalf(self, precision: int) -> Expr:
+        return self.definition.evalf(prec_to_dps(precision))
 
     def _eval_derivative(self, symbol: Symbol) -> Expr:
         return self.definition.diff(symbol) if symbol in self._free else S.Zero
