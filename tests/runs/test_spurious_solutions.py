@@ -2,7 +2,10 @@
 
 import numpy as np
 import pytest
+import sympy
 from notation import lagrange
+from scipy.integrate import solve_ivp
+from scipy.optimize import fsolve
 
 import scvi_codegen as sc
 
@@ -15,20 +18,27 @@ PENDULUM = sc.LagrangianSystem.from_text(
 STEPS = (0.05, 0.1, 0.2, 0.3)
 
 
+def thermal_state(rng):
+    q = rng.uniform(-np.pi, np.pi, 2)
+    c = np.cos(q[0] - q[1])
+    factor = np.linalg.cholesky(np.array([[3.0, 2.0 * c], [2.0 * c, 2.0]]))
+    return q, factor @ rng.normal(size=2) * np.sqrt(rng.uniform(0.5, 4.0))
+
+
 @pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("count", [400, pytest.param(20_000, marks=pytest.mark.full)])
 @pytest.mark.parametrize("solver", ["auto", "newton"])
 @pytest.mark.parametrize("method", ["svi:1", "gauss:1", "svi:2", "radau-iia:2"])
 def test_displacements_of_steps_are_those_of_the_motion(method: str, solver: str, count: int) -> None:
-    """A displacement that is accepted differs from that of the motion by at most half of the larger one."""
+    """A displacement that is accepted differs from that of the motion by at most two thirds of the larger one.
+
+    Two that continue those of short steps (see below) differ by .51 and .61, spurious ones of the same states by .72.
+    """
     stepper, reference = sc.compile_stepper(PENDULUM, method, solver=solver), sc.compile_stepper(PENDULUM, "svi:12")
     rng = np.random.default_rng(11)
     refused = 0
     for k in range(count):
-        q, h = rng.uniform(-np.pi, np.pi, 2), STEPS[k % len(STEPS)]
-        c = np.cos(q[0] - q[1])
-        factor = np.linalg.cholesky(np.array([[3.0, 2.0 * c], [2.0 * c, 2.0]]))
-        p = factor @ rng.normal(size=2) * np.sqrt(rng.uniform(0.5, 4.0))
+        (q, p), h = thermal_state(rng), STEPS[k % len(STEPS)]
         try:
             run = stepper.integrate(q, p, h=h, steps=1)
         except sc.ScviCodegenError:
@@ -38,8 +48,75 @@ def test_displacements_of_steps_are_those_of_the_motion(method: str, solver: str
         if abs(energy[1] - energy[0]) > 0.2 * (1.0 + abs(energy[0])):
             moved = reference.integrate(q, p, t_end=h).q[-1] - q
             size = max(np.abs(moved).max(), np.abs(run.q[1] - q).max())
-            assert np.abs(run.q[1] - q - moved).max() < 0.5 * size, (q, p, h)
+            assert np.abs(run.q[1] - q - moved).max() < 2 / 3 * size, (q, p, h)
     assert refused < count // 25
+
+
+@pytest.fixture(scope="module")
+def branch():
+    """Displacements of the midpoint rule that continue those of short steps, until the branch ends: then None.
+
+    The velocities v solve F(v, h) = L_v - h L_q / 2 - p = 0 at q + h v / 2, and Davidenko's equation F_v v' = -F_h.
+    """
+    x, v = sympy.Matrix(PENDULUM.coordinates), sympy.Matrix(PENDULUM.velocities)
+    start, h = sympy.Matrix(sympy.symbols("start:2")), sympy.Symbol("h")
+    lagrangian = PENDULUM.lagrangian.subs(dict(zip(PENDULUM.parameters, PENDULUM.defaults, strict=True)))
+    F = (lagrangian.diff(v) - h / 2 * lagrangian.diff(x)).subs(dict(zip(x, start + h / 2 * v, strict=True)))
+    derivatives = sympy.lambdify([h, v, start], [F.jacobian(v), F.diff(h)], cse=True)
+
+    def displacement(q, p, h):
+        def rate(at, velocity):
+            by_velocity, by_h = derivatives(at, velocity, q)
+            return np.linalg.solve(by_velocity, -by_h)[:, 0]
+
+        def determinant(at, velocity):
+            return np.linalg.det(derivatives(at, velocity, q)[0])
+
+        determinant.terminal = True
+        first = np.linalg.solve(derivatives(0.0, [0.0, 0.0], q)[0], p)
+        solved = solve_ivp(rate, (0.0, h), first, rtol=1e-8, atol=1e-8, events=determinant)
+        return h * solved.y[:, -1] if solved.status == 0 else None
+
+    return displacement
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("solver", ["auto", "newton"])
+def test_all_steps_of_a_run_continue_those_of_short_steps(branch, solver: str) -> None:
+    """From the stages of the step before, as from those of a straight line; some states have no step of that size."""
+    stepper, rng = sc.compile_stepper(PENDULUM, "svi:1", solver=solver), np.random.default_rng(3)
+    refused = 0
+    for k in range(24):
+        h = STEPS[2 + k % 2]
+        try:
+            run = stepper.integrate(*thermal_state(rng), h=h, steps=12, check_growth=False)
+        except sc.StepFailedError as failed:
+            run, refused = failed.trajectory, refused + 1
+        for n, moved in enumerate(np.diff(run.q, axis=0)):
+            continued = branch(run.q[n], run.p[n], h)
+            assert continued is not None, (run.q[n], run.p[n], h)
+            assert abs(moved - continued).max() < 1e-5
+    assert refused > 4
+
+
+def test_steps_on_a_steep_wall_are_those_of_collocation() -> None:
+    """Their first updates are too large for a root nearby; Gauss's collocation at growing h, by scipy, has them."""
+    atoms = lagrange("atoms", "q", "q_dot**2/2 - (1/q**12 - 2/q**6)")
+    stepper = sc.compile_stepper(atoms, "svi:2", solver="newton")
+    root = np.sqrt(3) / 6
+    A = np.array([[1 / 4, 1 / 4 - root], [1 / 4 + root, 1 / 4]])
+    for q, p in [(0.8722791306338056, -0.6627991279475038), (0.9, -3.0), (0.85, -0.1)]:
+        force = np.zeros(2)
+        for h in np.linspace(0.0, 0.1, 101)[1:]:
+
+            def residual(F, q=q, p=p, h=h):
+                x = q + h * A @ (p + h * A @ F)
+                return F - 12 * (x**-13 - x**-7)
+
+            force = fsolve(residual, force, xtol=1e-13)
+        q1, p1 = stepper.step([q], [p], h=0.1)
+        assert abs(p1[0] - p - 0.1 * force.mean()) < 1e-9
+        assert abs(q1[0] - q - 0.1 * (p + 0.1 * A @ force).mean()) < 1e-10
 
 
 def test_published_jump_of_the_midpoint_rule_is_refused() -> None:

@@ -11,11 +11,15 @@
 #define STAGNATIONS (SITES > M ? 2 : 1) /* with frozen factors positions and multipliers converge one after the other */
 #define REUSE_CHANGE REAL(1e-2) /* factors are reused while updates are below this part of the state */
 #define REUSE_RATE REAL(0.1) /* and decrease at least tenfold: then another iteration costs less than new factors */
+#define NEARBY_RATE REAL(0.5) /* of the first updates towards a root nearby: the second one by the first one */
+#define NEARBY_CHANGE REAL(0.25) /* of this rate from one update to the next, */
+#define FASTEST_RATE REAL(0.03) /* except of faster ones, at which updates may end in rounding */
 
 /* Change of the stages and the end momentum by the last update: the largest ratio to the own size, the ratio of the
  * largest to the largest size, and the largest itself. */
 typedef struct {
   real relative, overall, absolute, stages; /* stages: overall, of the positions of the stages alone */
+  real action; /* with fresh factors: sum of the changes of these positions times the sizes of the momenta */
 } movement;
 
 static void measure(movement *moved, const real *change, const real *size)
@@ -54,9 +58,10 @@ static void start_on_line(const real *v, const real *p0, real *z)
       z[i * B + b] = STRAIGHT[b] * v[i] + MOMENTA[b] * p0[i];
 }
 
-/* z -= update, the solution with the current factors; p0 likewise, if it is not NULL. Measures the update. */
-static void apply_update(newton_data *data, const band *shape, real h, real *p0, const real *size_p,
-    const real *size_q, movement *moved)
+/* z -= update, the solution with the current factors, fresh ones or those of another iterate; p0 likewise, if it is not
+ * NULL. Measures the update. */
+static inline void apply_update(newton_data *data, const band *shape, real h, real *p0, const real *size_p,
+    const real *size_q, int is_fresh, movement *moved)
 {
   const int blocks = shape->rows / SITES;
   real change[SITES];
@@ -73,6 +78,8 @@ static void apply_update(newton_data *data, const band *shape, real h, real *p0,
   }
   measure(moved, change, size_q);
   moved->stages = moved->overall;
+  for (int i = 0; is_fresh && i < M; i++)
+    moved->action += change[i] * size_p[i];
   for (int i = 0; p0 && i < M; i++) {
     change[i] = data->update[POSITION_IN_MATRIX[i] * blocks + B];
     p0[i] -= change[i];
@@ -101,6 +108,18 @@ static int has_converged(const solver_options *options, const movement *moved, i
   if (moved->relative <= options->tolerance)
     return 1;
   return trials > 2 && stagnations >= STAGNATIONS;
+}
+
+/* Returns 1 if an update, after one of the action `before`, may lead to a root nearby; `first`, that of the first one,
+ * shows which are rounding, of any rate. By the theorem of Newton and Kantorovich one root is near an iterate, and
+ * continues that of equations little different, if h_0 <= 1/2 for h_k = omega |update k|, omega a Lipschitz constant of
+ * the Jacobian relative to itself. The rate of successive updates is at most h_k / 2 and estimates h_k; so does its
+ * change, since h_k+1 = h_k^2 / 2 (Deuflhard, Newton Methods for Nonlinear Problems, sec. 2.1). */
+static inline int is_nearby(const movement *moved, real first, real before, real *rate)
+{
+  const real most = *rate == 0 ? NEARBY_RATE : larger(NEARBY_CHANGE * *rate, FASTEST_RATE);
+  *rate = moved->action / before;
+  return !(*rate > most) || moved->overall < MATH(sqrt)(REAL_EPSILON) || before <= REAL_EPSILON * first;
 }
 
 /* Replaces the row of p1 - p0 by q0 + h sum_b beta_b z_b = q1, with p0 as a further unknown. */
@@ -162,13 +181,14 @@ static SELDOM void add_sizes_of_arguments(const step_data *step, const real *z, 
 }
 
 /* Solves the stage equations from the initial guess in z; on success z and the increment p1 - p0 are consistent, on
- * failure they are undefined. The factors, of an earlier step if *keep, are reused as long as updates are small and
- * decrease fast. With an end position q1, p0 is unknown, too, and solved for in place. */
+ * failure they are undefined; SPURIOUS_SOLUTION if the root may not be near the guess. The factors, of an earlier step
+ * if *keep, are reused as long as updates are small and decrease fast. With an end position q1, p0 is unknown, too, and
+ * solved for in place. */
 static int newton(const step_data *step, newton_data *data, const real *q1, real *p0, real *increment, int *keep,
     const solver_options *options, solver_report *report)
 {
   const band shape = band_of(SITES, q1 ? B + 1 : B);
-  real size_q[M], size_p[SITES], change[M], added[M] = {0}, last = (real)INFINITY;
+  real size_q[M], size_p[SITES], change[M], added[M] = {0}, last = (real)INFINITY, rate = 0, first = 0;
   movement moved = {0};
   int trials = 0, stagnations = 0, slow = 0;
   memset(increment, 0, sizeof(real) * M);
@@ -203,8 +223,12 @@ static int newton(const step_data *step, newton_data *data, const real *q1, real
       return NOT_CONVERGED;
     trials = *keep ? trials + 1 : 3;
     TRY(*keep || linearise(step, data, &shape) ? OK : SINGULAR);
+    const real before = moved.action;
     moved = (movement){0};
-    apply_update(data, &shape, step->h, p0, size_p, size_q, &moved);
+    apply_update(data, &shape, step->h, p0, size_p, size_q, !*keep, &moved);
+    first = k == 0 ? moved.action : first;
+    if (!q1 && !*keep && before > 0 && !is_nearby(&moved, first, before, &rate))
+      return STATUS(SPURIOUS_SOLUTION);
     *keep = has_converged(options, &moved, stagnations + has_stagnated(&moved, last), trials) ||
         (moved.overall < REUSE_CHANGE && moved.relative < REUSE_RATE * last);
     report->iterations++;

@@ -13,51 +13,54 @@ static int line_from(const step_data *step, newton_data *data)
 
 /* Stages that solve the equations with a step size near 0 belong to a branch, on which those of the step lie. Newton's
  * method from far away may converge to another root, a spurious solution: so may every method, and steps of one stage
- * have no error estimate that shows it. Roots that take few iterations are near the initial guess. Others are computed
- * again by continuation in the step size (Deuflhard, Newton Methods for Nonlinear Problems, sec. 5.1): from the stages
- * at one size to those at a larger one, in few iterations each. */
-/* Iterations to a root near the initial guess: with frozen factors multipliers converge after positions. */
-#define NEARBY_ITERATIONS (SITES > M ? 12 : 8)
-#define CONTINUED_ITERATIONS 12 /* from the stages at a smaller size: with frozen factors convergence is linear */
-#define LEAST_ADVANCE REAL(0.00390625) /* of the step size: the branch ends, or turns back */
+ * have no error estimate that shows it. Roots that are not near the line are computed by continuation in the step size
+ * (Deuflhard, Newton Methods for Nonlinear Problems, sec. 5.1): from the stages at one size to those nearby at a larger
+ * one. The branch ends, or turns back, where the Jacobian is singular: on it the determinant keeps its sign. */
+#define LEAST_ADVANCE REAL(0.00390625) /* of the step size */
 
-/* Follows the branch from the stages at the line to those at step->h, with the results of newton. Returns
- * SPURIOUS_SOLUTION if there is none that far. */
+/* Follows the branch from the line to the stages at step->h, with the results of newton and the factors at the
+ * root. If it ends before, returns SPURIOUS_SOLUTION where another root was found, else NOT_CONVERGED. */
 static SELDOM int follow_branch(const step_data *step, newton_data *data, real *dp, int *keep,
     const solver_options *options, solver_report *report)
 {
+  const band shape = band_of(SITES, B);
   step_data part = *step;
-  real reached = 0, advance = REAL(0.5), z[N];
-  int status = line_from(step, data);
-  memcpy(z, data->z, sizeof z);
-  while (status == OK && reached < 1) {
-    const long long before = report->iterations;
+  real reached = 0, advance = LEAST_ADVANCE, z[N], size_p[SITES], size_q[M];
+  int sign = 0, status = OK;
+  TRY(line_from(step, data));
+  while (reached < 1 && advance >= LEAST_ADVANCE) {
+    memcpy(z, data->z, sizeof z);
     part.h = reached + advance < 1 ? (reached + advance) * step->h : step->h;
     *keep = 0;
     status = newton(&part, data, NULL, NULL, dp, keep, options, report);
-    if (status == OK && report->iterations - before <= CONTINUED_ITERATIONS) {
-      memcpy(z, data->z, sizeof z);
+    if (status == OK && *keep) /* the factors are those of another iterate, else the Jacobian has none yet */
+      evaluate(&part, data->z, data->rows, size_p, size_q, data->factors, &shape);
+    if (status == OK && !linearise(&part, data, &shape))
+      status = SINGULAR;
+    const int there = sign_of_determinant(data->factors, &shape, data->pivot);
+    sign = reached > 0 ? sign : there;
+    if (status == OK && there == sign) {
       reached += advance;
-      advance = 2 * advance < 1 - reached ? 2 * advance : 1 - reached;
+      advance *= 2;
     } else {
       advance /= 2;
-      status = advance < LEAST_ADVANCE ? STATUS(SPURIOUS_SOLUTION) : OK;
       memcpy(data->z, z, sizeof z);
     }
   }
-  return status;
+  *keep = reached >= 1;
+  if (*keep)
+    return OK;
+  return status == OK ? STATUS(SPURIOUS_SOLUTION) : NOT_CONVERGED;
 }
 
 /* Newton's method from that guess, or by continuation if its solution may be a spurious one. */
 static int newton_from_line(const step_data *step, newton_data *data, real *dp, int *keep,
     const solver_options *options, solver_report *report)
 {
-  const long long before = report->iterations;
   TRY(line_from(step, data));
   *keep = 0;
-  TRY(newton(step, data, NULL, NULL, dp, keep, options, report));
-  const int is_near = report->iterations - before <= NEARBY_ITERATIONS;
-  return is_near ? OK : follow_branch(step, data, dp, keep, options, report);
+  const int status = newton(step, data, NULL, NULL, dp, keep, options, report);
+  return status == STATUS(SPURIOUS_SOLUTION) ? follow_branch(step, data, dp, keep, options, report) : status;
 }
 
 #if defined(SPURIOUS_TESTED) && defined(STAGE_POWER)
