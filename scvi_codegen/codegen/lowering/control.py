@@ -207,6 +207,8 @@ def error_growth_of(system: MechanicalSystem, program: Program) -> ErrorGrowth |
     )
 
 
+DIFFERENT = mp.mpf("1e-40")
+"""Smallest distance of a knot from a point that is not one of both in working precision."""
 COLUMNS, FEW_KNOTS, FEW_POINTS = 8, 4, 8
 """Columns of the tables of tangent vectors, one for each knot; numbers of knots and of points in short steps.
 
@@ -227,17 +229,20 @@ def _growth_tables(points: Vector, knots: Vector, *, of_velocities: bool) -> tup
         cardinal_integrals(knots, end, mp.zero)[0],
         *(tuple(x / k for x in row) for k, row in ((2, at_end), (6, slope), (24, bend))),
     )
-    parts = [tuple(start + size * c for c in knots) for start, size in ((0, 1), (0, half), (half, half))]
+    halves = ((0, half), (half, half)) if len(knots) <= FEW_KNOTS else ()
+    parts = [tuple(start + size * c for c in knots) for start, size in ((0, 1), *halves)]
 
     def columns(*tables: Matrix, repeat: bool = True) -> NumberTable:
         return tuple(pad_vector(column, COLUMNS, repeat=repeat) for table in tables for column in transpose(table))
 
     tables = {
         "KNOT_ABSCISSA": columns(*(transpose((part,)) for part in parts)),
-        "KNOT_VALUES": columns(*(cardinal_values(points, part) for part in parts)),
         "TANGENT_INTEGRALS_TWICE": columns(_twice_integrated(knots, knots)),
         "TANGENT_END": columns(taylor, repeat=False),
     }
+    are_points = COLUMNS == len(knots) == len(points)
+    if not are_points or max(map(abs, map(operator.sub, knots, points))) > DIFFERENT:
+        tables["KNOT_VALUES"] = columns(*(cardinal_values(points, part) for part in parts))
     if of_velocities:
         tables["TANGENT_INTEGRALS"] = columns(cardinal_integrals(knots, knots, mp.zero))
         tables["KNOT_INTEGRALS"] = columns(*(cardinal_integrals(points, part, mp.zero) for part in parts))

@@ -75,6 +75,17 @@ static inline lanes add_rows(
   return sum[0] + sum[1];
 }
 
+/* Values at the knots of a group from those at the points, of which LANES are contiguous and then `apart` apart. */
+static inline lanes at_knots(int part, int group, const double *value, int apart)
+{
+#ifndef KNOTS_ARE_POINTS
+  return add_rows(lanes_of(0.0), KNOT_VALUES + part * KEPT, KEPT, group, value, apart);
+#else
+  (void)part;
+  return columns_of(value + group * (apart - LANES), group);
+#endif
+}
+
 #ifdef VARIABLE_ACCELERATIONS
 typedef struct {
   tangent_at_knots u[KNOT_GROUPS];
@@ -95,7 +106,7 @@ static APART void linearise_accelerations(const run_memory *run, const step_data
     for (int i = 0; i < M; i++) {
       const double *V = run->memory + i * POINTS;
       u[i] = step->q0[i] + step->h * add_rows(lanes_of(0.0), KNOT_INTEGRALS + part * KEPT, KEPT, n, V, LANES);
-      u[M + i] = add_rows(lanes_of(0.0), KNOT_VALUES + part * KEPT, KEPT, n, V, LANES);
+      u[M + i] = at_knots(part, n, V, LANES);
       u[2 * M + i] = inverse * add_rows(lanes_of(0.0), KNOT_RATES + part * KEPT, KEPT, n, V, LANES);
     }
     memset(at->mass[n], 0, sizeof at->mass[n]);
@@ -127,7 +138,7 @@ static APART void linearise_accelerations(const run_memory *run, const step_data
   (void)run;
   for (int n = 0; n < KNOT_GROUPS; n++) {
     for (int i = 0; i < M; i++)
-      u[i] = add_rows(lanes_of(0.0), KNOT_VALUES + part * KEPT, KEPT, n, x + i * LANES, M * LANES);
+      u[i] = at_knots(part, n, x + i * LANES, M * LANES);
     point_derivatives(
         u, step->t + step->h * columns_of(KNOT_ABSCISSA[part], n), step->parameters, at->u[n] + TANGENT);
   }
@@ -171,29 +182,28 @@ static inline void place_tangents(double (*s)[8], double (*a)[KNOTS_STORED], tan
     }
 }
 
-/* Coefficients at the end of the step from accelerations. */
+/* Coefficients at the end of the step from accelerations; loads of several stores at once would wait for them. */
 static inline void end_tangents(double (*s)[8], double (*a)[KNOTS_STORED])
 {
+  static const double q[COLUMNS] = {1.0}, v[COLUMNS] = {1.0, 1.0};
   for (int i = 0; i < M; i++) {
-    const double q = s[i][0] + s[i][1], v = s[i][1];
+    const double of_q = s[i][0], of_v = s[i][1];
     for (int n = 0; n < COLUMNS / LANES; n++) {
-      const lanes end = add_rows(lanes_of(0.0), TANGENT_END, KNOTS, n, a[i], LANES);
+      const lanes linear = of_q * columns_of(q, n) + of_v * columns_of(v, n);
+      const lanes end = add_rows(linear, TANGENT_END, KNOTS, n, a[i], LANES);
       memcpy(s[i] + n * LANES, &end, sizeof end);
     }
-    s[i][0] += q;
-    s[i][1] += v;
   }
 }
 
-/* Converts the coefficients to another step size. */
-static SELDOM void rescale_tangent(run_memory *run, double h)
+/* Converts the coefficients to another step size, always: jumps that depend on whether it is another one cost more. */
+static inline void rescale_tangent(run_memory *run, double h)
 {
-  const double ratio = h / run->tangent_h;
-  for (int i = 0; i < M; i++) {
-    double power = 1.0;
-    for (int k = 0; k < TAYLOR; k++, power *= ratio)
-      run->tangent[i][k] *= power;
-  }
+  const double ratio = h / run->tangent_h, square = ratio * ratio;
+  const double power[TAYLOR] = {1.0, ratio, square, ratio * square, square * square};
+  for (int i = 0; i < M; i++)
+    for (int k = 1; k < TAYLOR; k++)
+      run->tangent[i][k] *= power[k];
   run->tangent_h = h;
 }
 
@@ -206,8 +216,7 @@ static inline void advance_tangent(
   int k = 0, is_resolved = 0;
   tangent_knots at;
   lanes a[KNOT_GROUPS][M], before[KNOT_GROUPS][M];
-  if (h != run->tangent_h)
-    rescale_tangent(run, h);
+  rescale_tangent(run, h);
   for (int i = 0; i < M; i++) {
     const double *of = run->tangent[i];
     size += of[0] * of[0] + 0.25 * (of[1] * of[1]);
@@ -360,6 +369,6 @@ static __attribute__((noinline)) void measure_growth(run_memory *run, const step
     advance_tangent(run, step, data, X, 2, 0.5 * step->h);
   } else
     advance_tangent(run, step, data, X, 0, step->h);
-  if (run->measures_growth && run->tangent_steps++ % run->measures_growth == 0)
+  if (run->measures_growth && (run->tangent_steps++ & (run->measures_growth - 1)) == 0)
     sample_growth(run, step, data, dq, dp);
 }
