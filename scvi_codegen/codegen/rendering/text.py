@@ -59,8 +59,8 @@ def wrapped(statement: str, indent: int = 2) -> str:
 
 
 def wrapped_comment(text: str) -> str:
-    """Return a comment in the first column."""
-    return "\n".join(_lines(f"/* {text} */", "", " * "))
+    """Return a comment in the first column, whose end is on the line of its last word."""
+    return "\n".join(_lines(f"/* {text}\0*/", "", " * ")).replace("\0", " ")
 
 
 def wrapped_comment_lines(text: str) -> str:

@@ -94,7 +94,7 @@ def splitting_header(split: Splitting, layout: Layout, *, action: bool) -> str:
     if split.driven and words == 2:
         first = ["known = 0; /* inputs, which may jump between steps, have changed the last force */"]
     if words == 1:
-        acted = ", and if the action is summed\n * acted[1], its part over h, and acted[0], the last L at v = 0"
+        acted = ", with acted[1], their action over h, and acted[0], the last L at v = 0" if action else ""
         arguments = "const solver_data *data, int known, number *F, number *dq, number *dp,\n    number *acted"
         starts = ["memset(dq, 0, sizeof(number) * M);", "memset(dp, 0, sizeof(number) * M);"]
         starts += ["acted[1] = 0;"] if action else []
