@@ -509,27 +509,9 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
                 precision.
             BuildError: with ``device`` if there is no GPU, or too little memory on it.
         """
-        settings = EnsembleSettings(
-            inputs=inputs,
-            h=h,
-            steps=steps,
-            t_end=t_end,
-            tolerance=tolerance,
-            absolute_tolerance=absolute_tolerance,
-            max_step=max_step,
-            first_step=first_step,
-            t_eval=t_eval,
-            save_every=save_every,
-            t=t,
-            parameters=parameters,
-            options=options,
-            error=error,
-            device=device,
-            observe=observe,
-            seed=seed,
-            metropolis=metropolis,
-            precision=precision,
-        )
+        schedule = h, steps, t_end, tolerance, absolute_tolerance, max_step, first_step, save_every, t, t_eval
+        others = parameters, options, error, device, observe, seed, metropolis
+        settings = EnsembleSettings(inputs, *schedule, *others, precision=precision)
         runs = runs_of(self._ensemble(q, p, settings, velocity=velocity, action=action))
         runs.run(progress=progress, threads=threads)
         if isinstance(runs, DeviceRuns):
@@ -752,14 +734,12 @@ class StepperOfRunTimeSizes(Stepper):
 def checked_ensemble_result(runs: CommonRuns | IndividualRuns) -> EnsembleTrajectory:
     """Return the trajectories of an ensemble that was integrated; issue warnings of inaccurate ones."""
     trajectories = runs.result()
-    if isinstance(runs, CommonRuns):
-        successive = None
-    else:
+    if isinstance(runs, IndividualRuns):
         runs.warn_of_too_many_states(trajectories)
-        successive = runs.successive
     try:
-        warn_of_unconfirmed(trajectories.confirmations)
-        warn_of_energy_errors(trajectories, None if successive is None else successive.energies)
+        if isinstance(runs, IndividualRuns):
+            warn_of_unconfirmed(trajectories.confirmations)
+            warn_of_energy_errors(trajectories, None if runs.successive is None else runs.successive.energies)
         warn_of_unresolved_members(trajectories)
     except Exception as error:  # noqa: BLE001  (the runs are complete)
         warn_of_failed_check(error)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from functools import partial
 from itertools import chain
 
 import numpy as np
@@ -22,17 +23,21 @@ def stepper():
 
 @pytest.mark.parametrize("convert", [list, tuple, np.array])
 @pytest.mark.parametrize(
-    ("plan", "calls"),
-    [(FIXED, 40), (ADAPTIVE, 62), ({"h": 0.05, "steps": 900}, 40), ({"t_end": 200.0, "tolerance": 1e-10}, 62)],
+    ("integrate", "plan", "calls"),
+    [
+        *(("integrate", {"h": 0.05, "steps": steps}, 40) for steps in (1, 900)),
+        *(("integrate", {"t_end": t_end, "tolerance": 1e-10}, 62) for t_end in (0.05, 200.0)),
+        ("integrate_ensemble", FIXED, 250),
+    ],
 )
-def test_a_call_takes_few_function_calls(stepper, convert, plan, calls):
+def test_a_call_takes_few_function_calls(stepper, convert, integrate, plan, calls):
     """The limit is a tenth above the present number, and does not depend on the machine."""
-    q, p = convert(Q.tolist()), convert(P.tolist())
-    stepper.integrate(q, p, **plan)
+    run = partial(getattr(stepper, integrate), convert(Q.tolist()), convert(P.tolist()), **plan)
+    run()
     with at_most(calls):
-        stepper.integrate(q, p, **plan)
+        run()
     with pytest.raises(TooMuchWorkError), at_most(calls // 2):
-        stepper.integrate(q, p, **plan)
+        run()
 
 
 @pytest.mark.parametrize("plan", [FIXED, ADAPTIVE, {"t_end": 0.05}])

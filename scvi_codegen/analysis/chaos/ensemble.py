@@ -132,7 +132,7 @@ class ChaosIndicatorsEnsemble:
             diagonal = np.log(np.abs(np.diagonal(triangle)))
         k = tangents.shape[1]
         growth = np.concatenate([np.zeros(2 * k), diagonal, np.zeros(3 * k), triangle.ravel()])  # of tangent_growth.h
-        plan = CommonSteps(self.t[0], self.h, steps=steps, t_end=None, inputs={}, save_every=self.save_every)
+        plan = CommonSteps(self.t[0], self.h, self.save_every, steps)
         saved = np.full((len(plan.numbers), count, len(SERIES), k), np.nan)
         saved[0] = growth[: len(SERIES) * k].reshape(len(SERIES), k)
         binding = Binding(building.load(source, flags=self.stepper.flags), source.prefix)

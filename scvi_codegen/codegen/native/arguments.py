@@ -14,14 +14,15 @@ from scvi_codegen.common.errors import StateError
 LONGEST_SHOWN = 60
 FEW_NUMBERS = 2**24
 """Numbers that fit into the memory of any machine."""
+BINARY64 = np.dtype(np.float64)
 REAL_KINDS = "iufO"
 """Accepted kinds of numbers: not complex ones, whose imaginary part would be lost, dates, text or truth values."""
 
 
 def real_array(value: ArrayLike, name: str) -> NDArray[np.float64]:
     """Return a contiguous copy in binary64 of real numbers, possibly not finite; StateError for others and masks."""
-    if type(value) is float:  # the usual value of a coordinate by name
-        return np.array(value)
+    if type(value) is float or (type(value) is np.ndarray and value.dtype is BINARY64):  # the usual values
+        return np.array(value, order="C")
     for word in ("unit", "units"):  # of astropy, of pint; not the label of a row or a column
         unit = getattr(value, word) if hasattr(type(value), word) else None
         if unit is not None and str(unit) not in ("", "dimensionless"):

@@ -10,13 +10,13 @@ from typing import Any, cast
 
 import numpy as np
 
-from scvi_codegen.codegen.native.arguments import empty_array
+from scvi_codegen.codegen.native.arguments import BINARY64, empty_array
 from scvi_codegen.codegen.native.capacity import room_for_states, too_many_states
 from scvi_codegen.common.errors import ScviCodegenError, StepFailedError
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.driver.singular_time import ProgressWatch, check_energy_surface
 from scvi_codegen.runs.states.times import times_after
-from scvi_codegen.runs.states.validation import BINARY64, FEW, NUMBERS, SEQUENCES, Array, evaluation
+from scvi_codegen.runs.states.validation import FEW, NUMBERS, SEQUENCES, Array, evaluation
 from scvi_codegen.runs.states.words import block_of, from_block
 from scvi_codegen.runs.stepping.chunks import drive
 from scvi_codegen.runs.stepping.memory import Memory

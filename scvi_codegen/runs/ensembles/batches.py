@@ -105,7 +105,7 @@ class Batch:
 
     def __init__(self, binding: Binding, ensemble: Ensemble) -> None:
         self.binding, self.ensemble = binding, ensemble
-        self.segments = None if ensemble.fixed is None else ensemble.fixed.fixed_segments()
+        self.segments = None if ensemble.fixed is None else ensemble.fixed.fixed_segments
         numbers = ensemble.q, ensemble.p, ensemble.parameters
         self.q, self.p, self.parameters = (np.ascontiguousarray(block_of(values)) for values in numbers)
         if ensemble.inputs:
@@ -190,14 +190,8 @@ class Batch:
             return taken
 
         try:
-            drive(
-                take,
-                math.inf,
-                first=FIRST_CHUNK_STEPS,
-                growth=GROWTH,
-                seconds=CHUNK_SECONDS,
-                ended=lambda: self.struct.next == self.struct.end or until(),
-            )
+            chunks: dict[str, Any] = {"first": FIRST_CHUNK_STEPS, "growth": GROWTH, "seconds": CHUNK_SECONDS}
+            drive(take, math.inf, **chunks, ended=lambda: self.struct.next == self.struct.end or until())
         finally:
             self.store(last=True)
 
@@ -238,7 +232,7 @@ class SuccessiveRuns(Batch):
         self.words, self.conserves_energy = interface.words, interface.conserves_energy and interface.words == 1
         self.receive, self.save_every, self.most_states = receive, save_every, most_states
         self.stored, self.fallback_steps = np.zeros((2, len(self.q)), np.int64)
-        self.energies = np.full((len(self.q), 2), np.nan)
+        self.energies = np.empty((0, 2)) if self.segments else np.full((len(self.q), 2), np.nan)
 
     @property
     def names(self) -> NDArray[np.str_]:
@@ -271,7 +265,7 @@ class SuccessiveRuns(Batch):
         struct.words, struct.capacity = self.words, self.capacity
         self.iterations = np.empty(self.capacity, np.int32)
         struct.iterations = binding.integers(self.iterations)
-        self.actions = np.full(self.capacity if stepper.sums_action else 0, np.nan)
+        self.actions = np.full(self.capacity, np.nan) if stepper.sums_action else np.empty(0)
         struct.actions = binding.pointer(self.actions)
         self.states = tuple(np.empty((self.capacity, numbers)) for numbers in (self.words, m, m))
         struct.times, struct.positions, struct.momenta = binding.pointers(*self.states)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
 from typing import Any, Self, cast
 
 import numpy as np
@@ -25,7 +26,7 @@ from scvi_codegen.runs.driver.segments import (
     inputs_of_slice,
     parameters_at,
 )
-from scvi_codegen.runs.ensembles.schedule import CommonSteps
+from scvi_codegen.runs.ensembles.schedule import CommonSteps, common_steps
 from scvi_codegen.runs.events.contacts import in_first_modes
 from scvi_codegen.runs.results.dense_output import times_of_run
 from scvi_codegen.runs.states.validation import (
@@ -44,6 +45,8 @@ from scvi_codegen.runs.stepping.projection import make_consistent
 from scvi_codegen.runs.stepping.state_functions import neither_or_both
 from scvi_codegen.runs.stepping.step_plan import Adaptive, ErrorControl, KindOfSteps, check_max_step, planned_steps
 
+checked_steps = lru_cache(maxsize=64, typed=True)(partial(planned_steps, KindOfSteps()))
+"""Check of the arguments of :func:`planned_steps`, which those of earlier ensembles have passed."""
 RANGE = np.finfo(np.float32)
 """Range of single precision."""
 
@@ -67,10 +70,10 @@ def momenta_of_each(
     stepper: Integrator, q: States, p: States | None, velocity: States | None, t: float, parameters: EnsembleParameters
 ) -> States:
     """Return the momenta of states specified by p or by velocity, each with its own parameters."""
-    if (p is None) == (velocity is None):
+    if velocity is None and p is not None:
+        return p
+    if velocity is None or p is not None:
         raise neither_or_both(p)
-    if velocity is None:
-        return cast(States, p)
     positions, velocities = checked_ensemble(stepper, q, velocity, "velocity")
     t, values = stepper._states.time(t), stepper._states.parameters_of_each(parameters, len(positions))
     interface = stepper.interface
@@ -103,7 +106,7 @@ def start_of_ensemble(
     return positions, momenta, values
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True)
 class EnsembleSettings:
     """Arguments of ``integrate_ensemble`` but the initial state, for one stepper."""
 
@@ -203,13 +206,17 @@ class EnsembleSettings:
         if ends is not None and not ends.size:
             raise StateError("t_end has no final time: give one number, or one for each trajectory")
         first = None if ends is None else float(ends.flat[0])
-        planned_steps(KindOfSteps(), h, self.steps, first, *self.control, 1, hashed(t))
+        schedule = h, self.steps, first, *self.control, 1, 0.0 if first is None else hashed(t)
+        try:
+            checked_steps(*schedule)
+        except TypeError:  # of an argument that is not hashable, as an array
+            checked_steps.__wrapped__(*schedule)
         if h is None or (self.inputs is None and first is None):
             return self.steps, ends
         return None, np.array(final_time(t, h, self.steps, first))
 
 
-@dataclass(slots=True, kw_only=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Ensemble:
     """Initial states, parameters, inputs and steps of k trajectories.
 
@@ -272,15 +279,14 @@ class Ensemble:
         save_every, fixed = checked_count(settings.save_every, "save_every", least=1), None
         if settings.h is not None:
             t_end = None if ends is None else float(ends)
-            plan: dict[str, Any] = {"steps": steps, "t_end": t_end, "inputs": inputs, "save_every": save_every}
-            fixed = CommonSteps(t0, settings.h, **plan, words=layout.words)
+            fixed = common_steps(t0, settings.h, save_every, steps, t_end, inputs, layout.words)
         positions, momenta, values = start_of_ensemble(stepper, q, momenta, t0, parameters)
         settings.check_range(values, positions, momenta)
         noise = Noise.checked(stepper, settings.seed, settings.metropolis, settings.trajectory, settings.inputs)
-        start: dict[str, Any] = {"t0": t0, "q": positions, "p": momenta, "parameters": values, "noise": noise}
         for member in np.unique(values, axis=0) if stepper.interface.temperature is not None else ():
             check_strengths(stepper, t0, settings.h, member)
-        ensemble = cls(stepper=stepper, settings=settings, **start, inputs=inputs, fixed=fixed, save_every=save_every)
+        start = t0, positions, momenta, values
+        ensemble = cls(stepper, settings, *start, inputs, fixed, save_every=save_every, noise=noise)
         if not stepper._has_energy(parameters):
             for member, at, momentum in zip(values, positions, momenta, strict=True):
                 member[stepper.interface.energy_index] = stepper.energy(at, momentum, 0.0, member)
@@ -322,10 +328,9 @@ class Ensemble:
 
     def settings_of(self, part: slice) -> EnsembleSettings:
         """Return the arguments, besides the initial states, of the ensemble of a slice of the trajectories."""
-        settings = replace(
-            self.settings, parameters=self.parameters[part], inputs=inputs_of_slice(self.inputs, part) or None
-        )
-        in_bath = self.stepper.interface.temperature is not None
-        seed = settings.seed if in_bath else 0  # the inputs are values
-        settings = replace(settings, seed=seed, trajectory=self.noise.trajectory + part.start)
-        return settings if self.fixed is not None else replace(settings, t_end=self.ends[part])
+        in_bath, inputs = self.stepper.interface.temperature is not None, inputs_of_slice(self.inputs, part)
+        of_part: dict[str, Any] = {"parameters": self.parameters[part], "inputs": inputs or None}
+        if self.fixed is None:
+            of_part["t_end"] = self.ends[part]
+        seed = self.settings.seed if in_bath else 0  # the inputs are values
+        return replace(self.settings, **of_part, seed=seed, trajectory=self.noise.trajectory + part.start)

@@ -51,8 +51,8 @@ class CommonRuns:
     def __init__(self, ensemble: Ensemble, observation: EnsembleObservation | None = None) -> None:
         self.ensemble, self.observation, self.steps = ensemble, observation, cast(CommonSteps, ensemble.fixed)
         count = len(ensemble)
-        self.status, self.done = np.full(count, OK, dtype="<U32"), np.zeros(count, dtype=np.int64)
-        self.fallback_steps = np.zeros_like(self.done)
+        self.status = np.full(count, OK, dtype="<U32")
+        self.done, self.fallback_steps = np.zeros((2, count), np.int64)
         self.times: Array | None = None
         self.actions: Array | None = None
         self._allocate()
@@ -65,7 +65,7 @@ class CommonRuns:
         self.blocks = [empty_array((*shape, words * m)) for _ in "qp"]
         states: list[Array] = self.blocks if words == 1 else [*map(from_block, self.blocks)]
         self.q, self.p = states
-        self.q[:] = self.p[:] = np.nan
+        self.q[1:] = self.p[1:] = np.nan
         self.q[0], self.p[0] = ensemble.q, ensemble.p
         if stepper.sums_action:
             self.actions = np.full(shape, np.nan)
@@ -95,8 +95,7 @@ class CommonRuns:
             batch.run(progress=None if progress is None else lambda done: progress(int(done * unit)), threads=threads)
         finally:
             if isinstance(batch, SuccessiveRuns):
-                self.status = batch.names
-                self.done, self.fallback_steps = batch.done, batch.fallback_steps
+                self.status, self.done, self.fallback_steps = batch.names, batch.done, batch.fallback_steps
 
     def batch(self) -> LaneRuns | SuccessiveRuns | None:
         """Return the trajectories as C integrates many in one call.
@@ -150,11 +149,13 @@ class CommonRuns:
 
     def about(self) -> dict[str, Any]:
         """Return the attributes of a result other than its states; unfinished trajectories are ``"interrupted"``."""
-        unfinished = (self.done < self.steps.steps) & (self.status == OK)
+        status, unfinished = self.status, self.done < self.steps.steps
+        if unfinished.any():
+            status = np.where(unfinished & (status == OK), INTERRUPTED, status)
         return {
-            "t": self.steps.times(tau=False) if self.times is None else self.times,
+            "t": self.steps.t.copy() if self.times is None else self.times,
             "tau": None if self.times is None else self.steps.times(tau=True),
-            "status": np.where(unfinished, INTERRUPTED, self.status) if unfinished.any() else self.status,
+            "status": status,
             "steps": self.done,
             "h": self.steps.h,
             "parameters": self.ensemble.parameters,
@@ -255,7 +256,7 @@ class LaneRuns(Batch):
             return
         common, ended, width = self.common, self.struct.segment < 0, len(self.active)
         first = (int(self.struct.next) - ended) // width * width
-        for lane in np.flatnonzero(self.active[: self.struct.end - first] == 0.0).tolist():
+        for lane in (self.active[: self.struct.end - first] == 0.0).nonzero()[0].tolist():
             j, step = first + lane, int(self.memory.last_step[lane])
             row = common.steps.row(step)
             common.q[row:, j] = common.p[row:, j] = np.nan

@@ -2,6 +2,7 @@
 
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping
+from functools import cached_property, lru_cache
 from itertools import accumulate
 from typing import Any, NamedTuple
 
@@ -13,7 +14,7 @@ from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.driver.segments import Input, Segment, planned_segments, time_after_steps
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import Array
-from scvi_codegen.runs.states.words import exact_sum, low_words, with_low
+from scvi_codegen.runs.states.words import exact_sum, with_low
 
 
 class StepChunk(NamedTuple):
@@ -39,9 +40,9 @@ class CommonSteps:
 
     Args:
         t0, h: initial time and step size.
+        save_every: steps between saved states.
         steps, t_end: number of steps, or final time, with a shorter step before each breakpoint and at the end.
         inputs: validated inputs, with ``t_end``.
-        save_every: steps between saved states.
         words: of numbers of states; of two, the last step ends at ``t_end`` to both words.
 
     Attributes:
@@ -55,19 +56,18 @@ class CommonSteps:
         self,
         t0: float,
         h: float,
-        *,
-        steps: int | None,
-        t_end: float | None,
-        inputs: Mapping[str, Input],
         save_every: int,
+        steps: int | None = None,
+        t_end: float | None = None,
+        inputs: Mapping[str, Input] | None = None,
         words: int = 1,
     ) -> None:
         self.t0, self.h, self.t_end, self.save_every = t0, checked_step(h), t_end, save_every
         self.has_inputs = bool(inputs)
         count = 0 if t_end is not None else checked_count(steps, "steps", least=0)
-        self.segments = [Segment(count, self.h, (float(t0), float(low_words(t0))), t0)]
+        self.segments = [Segment(count, self.h, (float(t0), getattr(t0, "low", 0.0)), t0)]
         if t_end is not None:
-            self.segments = planned_segments(t0, t_end, self.h, inputs, words=words) or self.segments
+            self.segments = planned_segments(t0, t_end, self.h, inputs or {}, words=words) or self.segments
         ends = list(accumulate(segment.steps for segment in self.segments))
         self.steps = ends[-1]
         empty_array((self.steps // save_every + 1,))  # rejects numbers of states beyond any memory
@@ -101,8 +101,9 @@ class CommonSteps:
             yield StepChunk(until - step, save_every, self.segments[k] if entering else None)
             step = until
 
+    @cached_property
     def fixed_segments(self) -> FixedSegments:
-        """Return the chunks of all steps, as C takes them."""
+        """Chunks of all steps, as C takes them."""
         segment, rows = self.segments[0], []
         for chunk in self.chunks(0, self.steps):
             segment = chunk.entered or segment
@@ -121,10 +122,17 @@ class CommonSteps:
         """Return the number of steps before segment k."""
         return self.ends[k] - self.segments[k].steps
 
+    @cached_property
+    def t(self) -> Array:
+        """Times of the saved states."""
+        return self.times(tau=False)
+
     def times(self, *, tau: bool) -> Array:
         """Return the (n,) times of the saved states, of one or two words; tau from 0 in transformed time."""
         columns = [(*segment.start, segment.h, self._first(k)) for k, segment in enumerate(self.segments)]
-        start, low, h, first = np.repeat(np.array(columns).T, np.diff([0, *map(self.row, self.ends)]), axis=1)
+        start, low, h, first = columns[0]  # of all states, or of each
+        if len(columns) > 1:
+            start, low, h, first = np.repeat(np.array(columns).T, np.diff([0, *map(self.row, self.ends)]), axis=1)
         high, rest = times_after(0.0 * start if tau else start, h, self.numbers - first)
         rest += 0.0 if tau else low
         times, lows = exact_sum(high, rest)
@@ -139,3 +147,14 @@ class CommonSteps:
         for end, segment in zip(self.ends, self.segments, strict=True):
             yield slice(first, self.row(end)), segment
             first = self.row(end)
+
+
+FEW_STEPS, _kept_steps = 1000, lru_cache(maxsize=16)(CommonSteps)
+"""Largest number of steps that are kept, and those of the latest ensembles."""
+
+
+def common_steps(t0: float, h: float, save_every: int, steps: int | None, *others: Any) -> CommonSteps:
+    """Return common steps of t_end, inputs and words; a few of one size, of one word, are kept for later ensembles."""
+    if isinstance(steps, int) and steps <= FEW_STEPS and others[-1] == 1:
+        return _kept_steps(t0, float(h), save_every, steps)
+    return CommonSteps(t0, h, save_every, steps, *others)

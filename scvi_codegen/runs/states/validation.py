@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.codegen.native.arguments import checked_number, real_array
+from scvi_codegen.codegen.native.arguments import BINARY64, checked_number, real_array
 from scvi_codegen.codegen.rendering.source import NAME_IN_FORMULA, NUMBER, Interface
 from scvi_codegen.common.errors import ContactError, StateError, closest
 from scvi_codegen.common.representation import counted
@@ -63,7 +63,7 @@ def flat_state(interface: Interface, value: Any, name: str) -> Any:
     Momenta of a Hamiltonian have the names of their arrays or of those of the coordinates. The only array of a system
     need not be named: numbers of its shape suffice.
     """
-    if not interface.arrays and not isinstance(value, Mapping):
+    if not interface.arrays and (type(value) is np.ndarray or not isinstance(value, Mapping)):
         return value
     arrays = coordinate_shapes(interface)
     if isinstance(value, Mapping):
@@ -151,7 +151,7 @@ def _declared(declaration: str) -> tuple[str, tuple[int, ...]]:
     return declaration.partition("[")[0], tuple(map(int, re.findall(r"\d+", declaration.partition("[")[2])))
 
 
-BINARY64, FEW = np.dtype(np.float64), 64
+FEW = 64
 SEQUENCES, NUMBERS = (list, tuple), frozenset((float, int, np.float64))
 """Types of short vectors, and of their entries, that are converted without NumPy."""
 States = ArrayLike | Mapping[str, Any]

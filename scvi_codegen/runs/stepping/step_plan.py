@@ -135,8 +135,7 @@ class ErrorControl(NamedTuple):
     @property
     def named(self) -> dict[str, Any]:
         """The arguments that are not omitted, by name."""
-        values = {name: getattr(self, name) for name in self._fields}
-        return {name: value for name, value in values.items() if value is not None}
+        return {name: value for name, value in zip(self._fields, self, strict=True) if value is not None}
 
     @classmethod
     def of(cls, plan: Adaptive) -> Self:
