@@ -13,24 +13,6 @@ enum {
   REACH = CHANGES / 2
 };
 
-#ifdef COSTLY_POINTS
-/* Table by Lagrange's formula, from the curve of a step to the points of another one, which begins at `begin` and takes
- * `ratio`, both in units of the former. */
-static SELDOM void tabulate(double begin, double ratio, lanes *table)
-{
-  memset(table, 0, sizeof(lanes) * POINTS * GROUPS);
-  for (int j = 0; j < KEPT; j++)
-    for (int g = 0; g < GROUPS; g++) {
-      lanes product = lanes_of(1.0);
-      for (int k = 0; k < KEPT; k++)
-        if (k != j)
-          product *= (begin + ratio * ABSCISSA[g] - VECTOR_ENTRY(ABSCISSA, k)) /
-              (VECTOR_ENTRY(ABSCISSA, j) - VECTOR_ENTRY(ABSCISSA, k));
-      TABLE_ENTRY(table, g, j) = product;
-    }
-}
-#endif
-
 /* Selects the tables for the next step; returns 0 if there are none. */
 static inline int choose_tables(const run_memory *run, struct predictor_tables_of *tables)
 {

@@ -20,6 +20,7 @@
 #define LEVELS_OUTSIDE MOST_UP /* by which the curve of a pilot is extrapolated */
 #define GROWTH_OF_PILOTS (GROWTH * REAL(0.84)) /* of their errors, which grow with a lower power of the step size, .. */
 #define LEAST_RISE 4 /* .. or, divided by as much, until they are rounding */
+#define SHORT_LAST REAL(0.5) /* of the step before: a last step so short is made longer, and that one shorter */
 #else
 #define LEVELS_OUTSIDE 0
 #define GROWTH_OF_PILOTS GROWTH
@@ -100,7 +101,7 @@ typedef struct {
 #endif
   int status; /* other than OK if no smaller step can succeed */
 #ifdef COSTLY_POINTS
-  real half_length, half[M * (2 + POINTS)]; /* largest pilot but one, or 0: increments and curve */
+  real half_length, half[2 * M]; /* largest pilot but one, or 0: increments */
 #endif
   real length; /* step size; 0 before the first trial */
   real pilot; /* that of the largest trial so far, in the search for the first step, that was solved */
@@ -345,12 +346,14 @@ static SELDOM int moves_little(const run_memory *run, const trial *now)
 static inline int compare_trial(const run_memory *run, const trial *now, int momenta, const solver_options *options,
     real *apart)
 {
-  const real *half = NULL;
+  const real *half = NULL, *curve = NULL;
 #ifdef COSTLY_POINTS
-  if (run->error_before == 0 && MATH(fabs)(now->step.h) == 2 * now->half_length)
+  if (!by_newton(now))
+    curve = run->memory;
+  if (curve && run->error_before == 0 && MATH(fabs)(now->step.h) == 2 * now->half_length)
     half = now->half;
 #endif
-  return compare_with_halves(&now->step, now->dq, momenta ? now->dp : NULL, half, options, apart);
+  return compare_with_halves(&now->step, now->dq, momenta ? now->dp : NULL, half, curve, options, apart);
 }
 
 /* Number of levels, at most `most`, by which the step size may be increased without exceeding the largest one. */
@@ -403,7 +406,6 @@ static inline void try_pilot(run_memory *run, trial *now, const solver_options *
   now->half_length = now->length == now->pilot && !by_newton(now) ? now->pilot : 0;
   memcpy(now->half, now->dq, sizeof(real) * M);
   memcpy(now->half + M, now->dp, sizeof(real) * M);
-  memcpy(now->half + 2 * M, run->memory, sizeof(real) * M * POINTS);
 #endif
   try_step(run, now, 0, options, report);
   now->inside = 0;
@@ -840,6 +842,20 @@ static inline int limit_by_iterations(run_memory *run, const trial *now)
   return most;
 }
 
+#ifdef COSTLY_POINTS
+/* Change of level, as far as it has a predictor, that divides what is left of a run evenly where its last step would be
+ * short: both steps then need as few iterations as possible. */
+static inline int even_out(const run_memory *run, const trial *now, int change)
+{
+  const real left = MATH(fabs)((now->t_end - now->at.t) - now->at.t_low);
+  const real size = size_of_level(run->grid_level + change);
+  if (size * (1 + LAST_STEP) < left && left < size * (1 + SHORT_LAST))
+    while (change > -REACH && 2 * size_of_level(run->grid_level + change - 1) >= left)
+      change--;
+  return change;
+}
+#endif
+
 /* Chooses the size of the next step. The error of a loose tolerance may allow steps at which the iteration fails: the
  * size of such a step is not tried again for some steps (cf. Hairer & Wanner, Solving ODEs II, IV.8). */
 static inline void choose_size(run_memory *run, const trial *now)
@@ -854,6 +870,9 @@ static inline void choose_size(run_memory *run, const trial *now)
   if (run->avoiding > 0 && run->avoiding-- && run->grid_level + change >= run->failed)
     change = (int)(run->failed - 1 - run->grid_level);
   change = levels_within(run, now, change);
+#ifdef COSTLY_POINTS
+  change = even_out(run, now, change);
+#endif
   run->guess = now->guess;
   run->change_before = run->change;
   run->change = change;
