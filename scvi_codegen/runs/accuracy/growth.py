@@ -130,6 +130,10 @@ def measured_growth(stepper: Integrator, plan: StepPlan, requested: bool | None)
     return SOME_STEPS if plan.tolerance is None or plan.tolerance <= LOOSE_TOLERANCE else ALL_STEPS
 
 
+def _by_factor(growth: float) -> str:
+    return "small perturbations of the initial state grew by a factor of " + f"{growth:.0e}".replace("+", "")
+
+
 def _warn_of_amplification(what: str, difference: float, t: float) -> None:
     digits = min(max(0, math.floor(-math.log10(difference))) if difference > 0.0 else DIGITS, DIGITS)
     left = f"about {counted(digits, 'digit')}" if digits else "no digit"
@@ -165,14 +169,12 @@ class _Repetition:
         states, count = self.states, len(self.states.t) - 1
         tolerable = min(max(RIGHT, LOOSER * self.tolerance), LARGEST)
         distance = float(np.abs(states.q[0]).max()) / (largest_range(states.q) or math.inf)  # of the origin
-        growth = math.exp(min(grown, 600.0)) / max(distance, 1.0)
-        expected = growth * max(self.nudge, NUDGE * distance)
+        growth, perturbation = math.exp(min(grown, 600.0)) / max(distance, 1.0), max(self.nudge, NUDGE * distance)
+        expected = growth * perturbation
         if expected < tolerable:
             return None
-        factor = f"{growth:.0e}".replace("+", "")
-        what = f"small perturbations of the initial state grew by a factor of {factor}"
         if len(states.q) != len(states.t):
-            return _warn_of_amplification(what, expected, float(states.t[-1]))
+            return _warn_of_amplification(_by_factor(growth), expected, float(states.t[-1]))
         last = count if self.steps <= MOST_REPEATED else max(1, count * MOST_REPEATED // self.steps)
         apart, k = 0.0, 0
         try:
@@ -188,8 +190,10 @@ class _Repetition:
             apart = 1.0
         if k == last < count and apart <= LARGEST:
             apart = expected
+        elif apart <= LARGEST:  # the size of a motion that begins at an equilibrium, and so `grown`, has changed
+            growth = apart / perturbation
         if apart > tolerable:
-            _warn_of_amplification(what, apart, float(states.t[k]))
+            _warn_of_amplification(_by_factor(growth), apart, float(states.t[k]))
         return None
 
     def warn(self, *, requested: bool) -> None:
