@@ -149,12 +149,21 @@ class CommonSteps:
             first = self.row(end)
 
 
-FEW_STEPS, _kept_steps = 1000, lru_cache(maxsize=16)(CommonSteps)
-"""Largest number of steps that are kept, and those of the latest ensembles."""
+FEW_STEPS = 1000
+"""Largest number of steps that are kept."""
+_kept_steps = lru_cache(maxsize=16)(CommonSteps)
 
 
-def common_steps(t0: float, h: float, save_every: int, steps: int | None, *others: Any) -> CommonSteps:
-    """Return common steps of t_end, inputs and words; a few of one size, of one word, are kept for later ensembles."""
-    if isinstance(steps, int) and steps <= FEW_STEPS and others[-1] == 1:
+def common_steps(
+    t0: float,
+    h: float,
+    save_every: int,
+    steps: int | None,
+    t_end: float | None,
+    inputs: Mapping[str, Input],
+    words: int,
+) -> CommonSteps:
+    """Return common steps; a few of one size, in one word and without inputs, are kept for later ensembles."""
+    if isinstance(steps, int) and steps <= FEW_STEPS and t_end is None and not inputs and words == 1:
         return _kept_steps(t0, float(h), save_every, steps)
-    return CommonSteps(t0, h, save_every, steps, *others)
+    return CommonSteps(t0, h, save_every, steps, t_end, inputs, words)
