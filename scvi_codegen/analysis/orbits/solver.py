@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -686,22 +687,37 @@ class OrbitSearch:
         A step length is accepted if the simplified Newton correction with the same Jacobian decreases (Deuflhard's
         natural monotonicity test), which is independent of the unstable direction that dominates the residuals.
         """
-        inverse, units = self._inverse(equations), self._units(equations)
-        change, into = inverse @ equations.defects, equations.into
-        rows, size = self.row_units(equations), float(np.linalg.norm(change / units))
+        units, into, rows = self._units(equations), equations.into, self.row_units(equations)
         residual = float(np.linalg.norm(equations.defects / rows))
-        if size <= SETTLED * math.sqrt(len(z)):
+        inverses = [self._inverse(closing) for closing in (equations, *self._without_implied(z, equations))]
+        changes = [inverse @ equations.defects for inverse in inverses]
+        if np.linalg.norm(changes[0] / units) <= SETTLED * math.sqrt(len(z)):
             return None
-        for shortened in 0.5 ** np.arange(MOST_HALVINGS):
+        corrections = list(zip(inverses, changes, strict=True))
+        for shortened, (inverse, change) in product(0.5 ** np.arange(MOST_HALVINGS), corrections):
             if not self.period / FREEDOM <= z[-1] - shortened * change[-1] <= self.period * FREEDOM:
                 continue
             with suppress(EventError, OrbitError, StepFailedError):
-                trial = self.moved(z, -shortened * into @ change)
+                trial, decrease = self.moved(z, -shortened * into @ change), 1.0 - shortened / 4.0
                 at = self.closing_equations(trial)
-                less = np.linalg.norm(inverse @ at.defects / units) < (1.0 - shortened / 4.0) * size
+                less = np.linalg.norm(inverse @ at.defects / units) < decrease * np.linalg.norm(change / units)
                 if less and np.linalg.norm(at.defects / rows) < MOST_INCREASE * residual:
                     return trial, at
         return None
+
+    def _without_implied(self, z: Array, equations: ClosingEquations) -> Iterator[ClosingEquations]:
+        """Yield the equations without those that conserved quantities imply near a closed orbit, if they have more.
+
+        Far from it the equations keep what is implied only up to their error (see :meth:`independent_equations`), in
+        which the linear part of a return may say nothing; which correction is right its decrease decides.
+        """
+        if self.reversor is not None or IMPLIED * equations.relative_error <= CONSERVED:
+            return
+        starts, size = z[:-1].reshape(-1, 2 * self.stepper.dimension), self.reduction.size
+        independent = self.independent_equations(starts, equations.segments, equations.sizes, error=0.0)
+        partials, last = equations.partials.copy(), slice((len(starts) - 1) * size, len(starts) * size)
+        partials[last] = independent @ partials[last]
+        yield replace(equations, partials=partials)
 
     def moved(self, z: Array, change: Array) -> Array:
         """Return unknowns after a change, normalised and on the constraints, with the fixed entries."""
