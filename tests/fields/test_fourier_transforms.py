@@ -104,8 +104,9 @@ def test_convolutions_of_any_size_and_coefficients(method, solver):
     """Energies and forces of functions of convolutions and of their powers, along one axis and both, are NumPy's."""
     options = {} if solver is None else {"solver": solver}
     stepper = sc.compile_stepper(CONVOLVED, method, flags=QUICK_FLAGS, **options)
+    random = np.random.default_rng(4)
     for m, n in ((1, 2), (2, 9), (3, 8)):
-        c, d, q = RANDOM.normal(size=n) / n, RANDOM.normal(size=m), RANDOM.normal(size=(m, n))
+        c, d, q = random.normal(size=n) / n, random.normal(size=m), random.normal(size=(m, n))
         c -= (n == 8) * np.roll(c[::-1], 1)  # antisymmetric
         C, D = (np.array([np.roll(each, k) for k in range(len(each))]) for each in (c, d))
 

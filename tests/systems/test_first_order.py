@@ -202,7 +202,7 @@ def test_integrals_are_expanded_about_the_origins_of_the_lagrangian(name: str) -
         ends: dict[float | None, list[np.ndarray]] = {}
         for tolerance in (None, 1e-6):
             runs = [
-                stepper.integrate(np.array(state) + origin, t_end=1.0, tolerance=tolerance)
+                stepper.integrate(np.array(state) + origin, t_end=2.0, tolerance=tolerance)
                 for stepper, origin in zip(steppers, (0.0, 1000.0), strict=True)
             ]
             fewer, more = sorted(len(run.t) + run.rejected_steps for run in runs)
