@@ -139,9 +139,10 @@ static int sweep_alone(sweep *of)
   return 1;
 }
 
-/* Adds `by` times the forces at X to F, and continues all coordinates; returns 0 if there are too few rows. */
+/* Adds `by` times the forces at X to F, and continues all coordinates, `backward` from the last block; returns 0 if
+ * there are too few rows. */
 static int kick_by_rows(const run_memory *run, const problem *arrays, const work_arrays *work, const double *X,
-    double t, double by, double *F, const continuation *then)
+    double t, double by, double *F, const continuation *then, int backward)
 {
   sweep of = {.run = run, .arrays = arrays, .work = work, .X = X, .t = t, .by = by, .F = F, .then = then};
   of.how = share_rows(run, arrays, work->n), of.rows = rows_of(arrays);
@@ -153,11 +154,11 @@ static int kick_by_rows(const run_memory *run, const problem *arrays, const work
   describe_coordinate_arrays(arrays, of.array);
   wait_at_barrier(run);
   const section pairs = share_of(run, blocks / 2);
-  if (pairs.first < pairs.end)
-    sweep_even(&of, 2 * pairs.first);
-  for (long long k = pairs.first; k + 1 < pairs.end; k++) {
-    sweep_even(&of, 2 * k + 2);
-    sweep_odd(&of, 2 * k + 1);
+  for (long long k = 0; k < pairs.end - pairs.first; k++) {
+    const long long even = 2 * (backward ? pairs.end - 1 - k : pairs.first + k);
+    sweep_even(&of, even);
+    if (k > 0)
+      sweep_odd(&of, backward ? even + 1 : even - 1);
   }
   wait_at_barrier(run);
   if (pairs.first < pairs.end)

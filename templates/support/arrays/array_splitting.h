@@ -158,12 +158,15 @@ static void continue_section(const run_memory *run, const work_arrays *work, sec
 #include "array_rows.h"
 #endif
 
-/* Adds `by` times the forces at X to F, and continues all coordinates. */
-static void kick(const run_memory *run, const problem *arrays, const work_arrays *work, const double *X, double t,
+/* Kick k: adds `by` times the forces at X to F, and continues all coordinates. Blocks of rows come in alternating
+ * directions: the last ones of a kick are in the second cache at the start of the next one. */
+static void kick(const run_memory *run, const problem *arrays, const work_arrays *work, int k, const double *X,
     double by, double *F, continuation then)
 {
+  const double t = run->t + KICK_ABSCISSA[k] * run->h;
 #ifdef ROWS
-  if (kick_by_rows(run, arrays, work, X, t, by, F, &then))
+  const int backward = (run->step * (LEAPS - 1) + k) % 2 != 0;
+  if (kick_by_rows(run, arrays, work, X, t, by, F, &then, backward))
     return;
 #endif
   add_forces(run, arrays, X, t, by, F);
@@ -187,20 +190,19 @@ static void take_step(run_memory *run, const problem *arrays, const work_arrays 
   if (!continues && (run->guess || !kicks_end))
     continue_section(run, work, mine(run, work->n), starting(h, 0, kicks_end));
   else if (!continues)
-    kick(run, arrays, work, run->q, run->t, h * KICK[0], INCREMENTS(run), starting(h, 0, 0));
+    kick(run, arrays, work, 0, run->q, h * KICK[0], INCREMENTS(run), starting(h, 0, 0));
   for (int k = 1; k < last + !kicks_end; k++) {
     const continuation then = {.ends = k == last, .moves = 1, .arrives = k == last - kicks_end, .drift = h * DRIFT[k]};
-    kick(run, arrays, work, POSITIONS(run, work), run->t + KICK_ABSCISSA[k] * h, h * KICK[k], INCREMENTS(run), then);
+    kick(run, arrays, work, k, POSITIONS(run, work), h * KICK[k], INCREMENTS(run), then);
   }
 #ifdef PLAIN_SUMS
   if (kicks_end && into_next) /* with the first kick of the next step */
-    kick(run, arrays, work, run->q, run->t + KICK_ABSCISSA[last] * h, h * (KICK[last] + KICK[0]), run->p,
-        starting(h, 0, 0));
+    kick(run, arrays, work, last, run->q, h * (KICK[last] + KICK[0]), run->p, starting(h, 0, 0));
   else
 #endif
       if (kicks_end) {
     const continuation then = into_next ? starting(h, 1, 1) : (continuation){.ends = 1, .end = h * KICK[last]};
-    kick(run, arrays, work, run->q, run->t + KICK_ABSCISSA[last] * h, 1.0, work->F, then);
+    kick(run, arrays, work, last, run->q, 1.0, work->F, then);
   }
   run->guess = kicks_end;
 }
