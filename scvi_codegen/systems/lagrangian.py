@@ -436,8 +436,8 @@ class LagrangianSystem(MechanicalSystem):
 
         Raises:
             SystemDefinitionError: naming file and element, if something is malformed or unknown, or changes the motion
-                and is not read: equalities of tendons, tendons around geoms; or if it names a file that is neither in
-                its folder nor in ``folders``.
+                and is not read: equalities of flexible bodies, tendons around geoms; or if it names a file that
+                is neither in its folder nor in ``folders``.
         """
         from scvi_codegen.systems.multibody.trees.mjcf import links_of_mjcf
 

@@ -82,14 +82,27 @@ def test_a_connection_of_points_is_a_ball_joint(equality, tmp_path):
     np.testing.assert_allclose(run.rotation("R_box")[-1], expected, rtol=0, atol=1e-10)
 
 
+FIXED = '<fixed name="t{0}"><joint joint="{0}" coef="{1}"/></fixed>'
+SPATIAL = '<spatial name="t{0}"><site site="below"/><site site="s{0}"/></spatial>'
+TENDONS = '<tendon tendon1="ta" tendon2="tb" polycoef="{}"/></equality><tendon>{}</tendon><equality>'
+
+
 @pytest.mark.rotated
-def test_a_polynomial_between_joints_reduces_the_motion_to_one_coordinate(tmp_path):
-    slides = "".join(
-        f'<body><joint name="{name}" type="slide" axis="0 0 1" ref="{ref}"/>'
+@pytest.mark.parametrize(
+    "equality",
+    [
+        '<joint joint1="a" joint2="b" polycoef="0.1 0.3 0.2 0 0"/>',
+        TENDONS.format("0.2 -1.2 1.6", FIXED.format("a", 2) + FIXED.format("b", -0.5)),
+        TENDONS.format("0.1 0.3 0.2", SPATIAL.format("a") + SPATIAL.format("b")),
+    ],
+)
+def test_a_polynomial_between_lengths_reduces_the_motion_to_one_coordinate(equality, tmp_path):
+    slides = '<site name="below" pos="0 0 -9"/>' + "".join(
+        f'<body><joint name="{name}" type="slide" axis="0 0 1" ref="{ref}"/><site name="s{name}"/>'
         f'<inertial pos="0 0 0" mass="{mass}" diaginertia="1 1 1"/></body>'
         for name, ref, mass in (("a", 0.5, 2), ("b", 0.25, 3))
     )
-    system = model(tmp_path, slides, '<joint joint1="a" joint2="b" polycoef="0.1 0.3 0.2 0 0"/>')
+    system = model(tmp_path, slides, equality)
     run = run_of(system, {"a": 0.6 + 0.3 * 0.5 + 0.2 * 0.25, "b": 0.75}, {"a": 0.5, "b": 1.0})
     one = sc.LagrangianSystem.from_text(
         "one", ["b"], "(2*(0.3 + 0.4*(b - 0.25))**2 + 3)*b_dot**2/2 - 9.81*(2*(0.3*b + 0.2*(b - 0.25)**2) + 3*b)"

@@ -99,8 +99,12 @@ ROWS: dict[str, tuple[dict[str, str], str | None]] = {
     ),
     "shell": ({"b": B + '<geom size=".1" shellinertia="true"/>'}, "whose inertia is not computed: give its body an"),
     "massless leaf": ({"b": '<body><joint name="z"/></body>' + B}, "joint 'z' moves no mass"),
-    "equality of tendons": (
-        {"rest": PATH.format("") + '<equality><tendon tendon1="t"/></equality>'},
+    "equality of an unknown tendon": (
+        {"rest": PATH.format("") + '<equality><tendon tendon1="t" tendon2="u"/></equality>'},
+        "names the tendon 'u', which does not exist",
+    ),
+    "equality of flexible bodies": (
+        {"rest": '<equality><flex flex="f"/></equality>'},
         "is not read: remove it or write a constraint",
     ),
     "too many copies": (

@@ -46,10 +46,10 @@ class Closure:
 
 @dataclass(frozen=True, slots=True)
 class Coupling:
-    """Relation q = offset + sum_k coefficients_k (q_other - zero)^k between the coordinates of two joints."""
+    """Relation l = offset + sum_k coefficients_k (l_other - zero)^k between the lengths of two joints or tendons."""
 
-    joint: str
-    other: str | None
+    length: Expr
+    other: Expr | None
     coefficients: tuple[float, ...]
     offset: float
     zero: float
@@ -129,9 +129,9 @@ def _pivots(rows: Vector) -> Iterator[int]:
 def _conditions(links: Sequence[Link], closure: Closure | Coupling) -> list[list[Expr]]:
     """Return the equations of one closure or coupling, with dependent ones, as components of vectors."""
     if isinstance(closure, Coupling):
-        relative = symbol(closure.other) - exact_number(closure.zero) if closure.other else 0
+        relative = 0 if closure.other is None else closure.other - exact_number(closure.zero)
         terms = (a * relative**k for k, a in enumerate(map(exact_number, closure.coefficients)))
-        return [[symbol(closure.joint) - exact_number(closure.offset) - Add(*terms)]]
+        return [[closure.length - exact_number(closure.offset) - Add(*terms)]]
     (position, axes), (other, others) = frames_in_common(links, closure.ends)
     equations = [[*(position - other)]]
     if closure.turning:

@@ -6,7 +6,7 @@ Attributes and defaults are those of https://mujoco.readthedocs.io/en/stable/XML
 
 import re
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import combinations, zip_longest
@@ -16,9 +16,11 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+from sympy import Expr, S
 
 from scvi_codegen.common.errors import closest
 from scvi_codegen.systems.formulas.rotations import matrix_of
+from scvi_codegen.systems.formulas.symbols import symbol
 from scvi_codegen.systems.multibody.trees.actuators import Actuator, Range, actuator_of
 from scvi_codegen.systems.multibody.trees.closures import Closure, Coupling, at_reference
 from scvi_codegen.systems.multibody.trees.contacts import Touch
@@ -28,7 +30,7 @@ from scvi_codegen.systems.multibody.trees.geoms import Geom, Pair
 from scvi_codegen.systems.multibody.trees.macros import Macros
 from scvi_codegen.systems.multibody.trees.meshes import inertia_of
 from scvi_codegen.systems.multibody.trees.schema import MJCF, TURN
-from scvi_codegen.systems.multibody.trees.tendons import Tendon, mean_inverses
+from scvi_codegen.systems.multibody.trees.tendons import Tendon, length_of, mean_inverses, reference_length
 from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about, named
 
 Sizes = Vector
@@ -92,7 +94,8 @@ def links_of_mjcf(path: str | PathLike[str], parts: Collection[str] = ()) -> tup
     root = _document(Path(path))
     model = _MujocoModel(root, parts)
     acting = [*model.actuators(tendons := [*model.tendons()])]
-    others = [*model.closures()], tendons, [*model.touches()], acting, dict(model.keyframes([x[1] for x in acting]))
+    keys = dict(model.keyframes([x[1] for x in acting]))
+    others = [*model.closures(tendons)], tendons, [*model.touches()], acting, keys
     model.unread.warn(root.file)
     return root.node.get("model") or Path(path).stem, model.completed(), model.gravity, *others
 
@@ -156,15 +159,13 @@ class _MujocoModel:
             yield from element.children()
 
     def tendons(self) -> Iterator[Tendon]:
-        """Yield the tendons with forces, rotors or actuators; limits and dry friction are listed as unread.
+        """Yield the tendons with forces, rotors, actuators or equalities; limits and dry friction are listed as unread.
 
         https://mujoco.readthedocs.io/en/stable/XMLreference.html#tendon
         """
-        acted = (
-            {actuator.text("tendon", "") for actuator in self.entries("actuator")}
-            if "actuators" in self.parts
-            else set()
-        )
+        acting = self.entries("actuator") if "actuators" in self.parts else ()
+        acted = {actuator.text("tendon", "") for actuator in acting}
+        acted |= {equality.text(f"tendon{k}", "") for equality in self.equalities() for k in (1, 2)}
         for tendon in self.entries("tendon"):
             self.read_limits(tendon, "tendons", tendon.name)
             stiffness, damping = (self.coefficients(tendon, key) for key in ("stiffness", "damping"))
@@ -384,16 +385,21 @@ class _MujocoModel:
                 ):
                     self.unread.add(f"the keyframe '{key.name}' within the limits of joints", joint.label)
 
-    def closures(self) -> Iterator[Closure | Coupling]:
+    def equalities(self) -> Iterator[Element]:
+        """Yield the equalities that are active."""
+        for equality in [] if self.disabled & {"equality", "constraint"} else self.entries("equality"):
+            if equality.choice("active", "true", "false") == "true":
+                yield equality
+
+    def closures(self, tendons: Sequence[Tendon]) -> Iterator[Closure | Coupling]:
         """Yield the equalities that are active; their softness is not read.
 
         https://mujoco.readthedocs.io/en/stable/XMLreference.html#equality
         """
-        for equality in self.entries("equality"):
-            if equality.choice("active", "true", "false") == "false" or self.disabled & {"equality", "constraint"}:
-                continue
-            if equality.tag == "joint":
-                yield self.coupling(equality)
+        paths = {tendon.name: tendon for tendon in tendons}
+        for equality in self.equalities():
+            if equality.tag in ("joint", "tendon"):
+                yield self.coupling(equality, paths)
             elif equality.tag in ("connect", "weld"):
                 yield self.closure(equality)
             else:
@@ -430,17 +436,26 @@ class _MujocoModel:
             end = at_reference(self.links, second).inverse @ at_reference(self.links, first) @ at
         return Closure(((first, at), (second, end)), turning)
 
-    def coupling(self, equality: Element) -> Coupling:
-        """Return a relation between two joints, or the fixed value of one."""
-        joint = self.single(equality, "joint1")
-        other = self.single(equality, "joint2") if equality.text("joint2", "") else None
-        if joint is other:
-            equality.refuse(f"is between joint '{joint.label}' and itself")
-        first = equality.vector("polycoef", (0,), range(1, 6))
-        polynomial = (*first, *(0, 1, 0, 0, 0)[len(first) :])  # those that are not written keep their defaults
+    def coupling(self, equality: Element, paths: Mapping[str, Tendon]) -> Coupling:
+        """Return a relation between two joints or tendons, or the fixed value of one."""
+        first, second = (f"{equality.tag}{k}" for k in (1, 2))
+        length = self.length(equality, first, paths)
+        other = self.length(equality, second, paths) if equality.text(second, "") else None
+        if length == other:
+            equality.refuse(f"is between {equality.tag} '{equality.text(first)}' and itself")
+        written = equality.vector("polycoef", (0,), range(1, 6))
+        polynomial = (*written, *(0, 1, 0, 0, 0)[len(written) :])  # those that are not written keep their defaults
         coefficients = tuple(map(float, polynomial if other else polynomial[:1]))
-        zeros = joint.zero, other.zero if other else 0.0
-        return Coupling(joint.name, other.name if other else None, coefficients, *zeros)
+        zeros = [reference_length(self.links, part) for part in (length, other or S.Zero)]
+        return Coupling(length, other, coefficients, *zeros)
+
+    def length(self, element: Element, key: str, paths: Mapping[str, Tendon]) -> Expr:
+        """Return the length of the joint or tendon that an attribute names."""
+        if key.startswith("joint"):
+            return symbol(self.single(element, key).name)
+        if (name := element.text(key)) not in paths:
+            element.refuse(f"names the tendon '{name}', which does not exist{closest(name, paths)}")
+        return length_of(self.links, paths[name])
 
     def single(self, element: Element, key: str) -> Joint:
         """Return the hinge or slide that an attribute names."""

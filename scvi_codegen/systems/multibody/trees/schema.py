@@ -119,7 +119,7 @@ MJCF = {
     "site": Kind(f"name class type pos {TURN} fromto size", "group material mesh rgba user", defaults="site"),
     "deformable": Kind(children="flex! skin~"),
     "equality": Kind(
-        children="connect* weld* joint=coupling* tendon=any_equality* flex=any_equality* flexstrain=any_equality* "
+        children="connect* weld* joint=coupling* tendon=coupling* flex=any_equality* flexstrain=any_equality* "
         "flexvert=any_equality*"
     ),
     "any_equality": EQUALITY,
@@ -127,7 +127,7 @@ MJCF = {
     "weld": Kind(
         "name class active body1 body2 relpose site1 site2 torquescale", f"{SOFTNESS} anchor", defaults="equality"
     ),
-    "coupling": Kind("name class active joint1 joint2 polycoef", SOFTNESS, defaults="equality"),
+    "coupling": Kind("name class active joint1 joint2 tendon1 tendon2 polycoef", SOFTNESS, defaults="equality"),
     "tendon": Kind(children="spatial* fixed*"),
     "spatial": TENDON,
     "fixed": TENDON,

@@ -86,6 +86,11 @@ def rate_of(links: Sequence[Link], length: Expr) -> Expr:
     return rate
 
 
+def reference_length(links: Sequence[Link], length: Expr) -> float:
+    """Return the length in the reference configuration."""
+    return _evaluated(links, length, {symbol(link.joint.name): link.joint.zero for link in links})
+
+
 def _relaxed(links: Sequence[Link], length: Expr) -> float:
     """Return the length where the springs of joints are relaxed."""
     return _evaluated(links, length, {symbol(link.joint.name): link.joint.rest for link in links})
