@@ -307,6 +307,28 @@ def test_painleves_paradox_is_an_impact_without_collision(tangent: float, consis
     assert run.contact_modes == [(0.0, ("open",))]
 
 
+@pytest.mark.parametrize("h", [1e-6, 1e-7])
+def test_steps_near_painleves_paradox_are_solved(h: float) -> None:
+    """Slip with G M^-1 D^T = 2e-4, by which rounding of the gap moves the rod much farther than its height."""
+    floor = sc.contact("y - cos(a)", slip="x_dot - cos(a)*a_dot", friction=1.5)
+    stepper = of(f"{PLANE} + a_dot**2/6 - g*y", "x y a", [floor], "svi:2", g=1)
+
+    def force(a: float, w: float) -> float:
+        return float((1 - np.cos(a) * w**2) / (1 + 3 * np.sin(a) ** 2 - 4.5 * np.sin(a) * np.cos(a)))
+
+    def slides(_: float, x: NDArray[Any]) -> list[float]:
+        f = force(x[2], x[5])
+        return [*x[3:], 1.5 * f, f - 1, 3 * f * (np.sin(x[2]) - 1.5 * np.cos(x[2]))]
+
+    a = np.arctan((4.5 - np.sqrt(4.25)) / 8 - 1e-4)
+    w = -np.sqrt((1 - 1 / force(a, 0)) / np.cos(a))
+    start = np.array([0, np.cos(a), a, -3, -np.sin(a) * w, w])
+    run = stepper.integrate(start[:3], velocity=start[3:], h=h, steps=10)
+    true = solve_ivp(slides, (0, 10 * h), start, "DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
+    assert (force(a, w), len(run.t)) == (pytest.approx(1), 11)
+    assert [*run.q[-1], *run.velocity[-1]] == pytest.approx(true, abs=1e-6)
+
+
 def test_derivatives_through_an_impact_without_collision_are_refused() -> None:
     floor = sc.contact("y - cos(a)", slip="x_dot - cos(a)*a_dot", friction=1.5)
     stepper = of(f"{PLANE} + a_dot**2/6 - g*y", "x y a", [floor], "svi:2", g=1)

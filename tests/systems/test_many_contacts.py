@@ -278,6 +278,41 @@ def test_feet_on_straight_legs_are_not_held_by_others(speeds, spring, start, dep
     assert (gaps.min() > -depth, np.diff(run.energy()).max() < 1e-9) == (True, True)
 
 
+@cache
+def bent_legs() -> tuple[Any, list[str]]:
+    """Return the stepper of a body on three legs with springs at hips and knees, and the heights of its feet."""
+    names, place = [*"xzr", "a0", "b0", "a1", "b1", "a2", "b2"], []
+    energy = f"5*(x_dot**2 + z_dot**2)/2 + r_dot**2/10 - 5*{G}*z"
+    for k, s in enumerate((-0.3, 0, 0.3)):
+        for m, part in ((0.5, f"a{k}"), (0.3, f"a{k}, b{k}")):
+            angles = part.split(", ")
+            x = " + ".join([f"x_dot - {s}*sin(r)*r_dot", *(f"0.3*cos({c})*{c}_dot" for c in angles)])
+            z = " + ".join([f"z_dot + {s}*cos(r)*r_dot", *(f"0.3*sin({c})*{c}_dot" for c in angles)])
+            height = " - ".join([f"z + {s}*sin(r)", *(f"0.3*cos({c})" for c in angles)])
+            energy += f" + {m}*(({x})**2 + ({z})**2)/2 - {m}*{G}*({height})"
+        energy += f" - 5*((a{k} - r)**2 + (b{k} - a{k})**2)/2"
+        place.append((height, x))
+    feet = [sc.contact(height, slip=slip, friction=0.3) for height, slip in place]
+    system = sc.LagrangianSystem.from_text("legs", names, energy, contacts=feet)
+    return sc.compile_stepper(system, "svi:2"), [height for height, _ in place]
+
+
+@pytest.mark.second
+@pytest.mark.filterwarnings("ignore:a transition has several motions")
+@pytest.mark.parametrize("h", [0.005, 0.0025, 0.001])
+def test_bent_legs_with_friction_swing_on_their_feet(h: float) -> None:
+    """Feet lift and land; near Painleve's paradox, at t = 0.24 and 0.568, long steps are divided, adaptive ones not."""
+    stepper, heights = bent_legs()
+    start = {"q": [0, 0.6 * np.cos(0.1), 0, *3 * (0.1, -0.1)], "velocity": [0] * 9, "t_end": 0.6}
+    runs = [stepper.integrate(**start, **steps) for steps in ({"h": h}, {"tolerance": 1e-9})]
+    for run in runs:
+        q = {name: run.q[:, k] for k, name in enumerate(stepper.coordinates)} | {"sin": np.sin, "cos": np.cos}
+        assert min(eval(height, q).min() for height in heights) > -1e-12
+        assert np.diff(run.energy()).max() < 1e-6 * np.ptp(run.energy())
+    (t, modes), (true, others) = (run.contact_modes[-1] for run in runs)
+    assert (t, modes) == (pytest.approx(true, abs=1e-6), others)
+
+
 @pytest.mark.second
 @pytest.mark.filterwarnings("ignore:the contacts depend")
 @pytest.mark.parametrize(("speed", "stop"), [(0.0, 0.0), (0.2, 0.2 * np.sqrt(0.2 / G))])

@@ -93,13 +93,15 @@ static void solve_saddle(saddle *at, const real *a, const real *b, real *x, real
 }
 
 /* Adds to the sizes of positions the displacements for which constraints change by the sizes of their terms: rounding
- * leaves g_k = O(u r_k), with the rounding size r of constraint_rounding, and positions q + X_k g_k, X = M^-1 G^T (G
- * M^-1 G^T)^-1, whatever |q| is. Nothing is added where the constraints are dependent. */
-static SELDOM void add_constraint_sizes(real t, const real *q, const real *parameters, saddle *at, real *size)
+ * leaves g_k = O(u r_k), with the rounding size r of constraint_rounding, and positions q + X_k g_k, X = M^-1 D^T (G
+ * M^-1 D^T)^-1, whatever |q| is: with ideal forces D = G, with actual ones X grows near Painleve's paradox. Nothing is
+ * added where the constraints are dependent. */
+static SELDOM void add_constraint_sizes(int forces, real t, const real *q, const real *parameters, saddle *at,
+    real *size)
 {
   real u[2 * M] = {0}, g[CONSTRAINTS], rounding[CONSTRAINTS], x[M], y[CONSTRAINTS];
   memcpy(u, q, sizeof(real) * M);
-  if (factorise_saddle(IDEAL_FORCES, t, u, parameters, at, g) != OK)
+  if (factorise_saddle(forces, t, u, parameters, at, g) != OK)
     return;
   constraint_rounding(u, t, parameters, rounding);
   for (int k = 0; k < CONSTRAINTS; k++) {
@@ -143,7 +145,7 @@ static inline const real *last_unknowns(const step_data *step)
 static SELDOM real size_by_constraints(const step_data *step)
 {
   real size[M] = {0};
-  add_constraint_sizes(step->t, step->q0, step->parameters, saddle_in(step->scratch), size);
+  add_constraint_sizes(ACTUAL_FORCES, step->t, step->q0, step->parameters, saddle_in(step->scratch), size);
   return largest_magnitude(size, M) + displacement_by_reactions(step, last_unknowns(step));
 }
 
@@ -168,7 +170,7 @@ static SELDOM void lengths_of_constraints(const step_data *step, real *lengths)
   for (int k = 0; k < CONSTRAINTS; k++)
     if (steepest[k] > 0)
       length = larger(length, rounding[k] / steepest[k]);
-  add_constraint_sizes(step->t, step->q0, step->parameters, saddle_in(step->scratch), yields);
+  add_constraint_sizes(ACTUAL_FORCES, step->t, step->q0, step->parameters, saddle_in(step->scratch), yields);
   for (int i = 0; i < M; i++) {
     const real most = length * MATH(sqrt)(largest_magnitude(lightest, M) / lightest[i]); /* infinite without a mass */
     lengths[i] = by_reactions + larger(length, yields[i] < most ? yields[i] : most);
@@ -258,7 +260,7 @@ static void times_mass(const real *mass, const real *x, real *y)
 static real square_by_constraints(real t, const real *q, const real *parameters, const real *mass, saddle *at)
 {
   real size[M] = {0}, dual[M], square = 0;
-  add_constraint_sizes(t, q, parameters, at, size);
+  add_constraint_sizes(IDEAL_FORCES, t, q, parameters, at, size);
   times_mass(mass, size, dual);
   for (int i = 0; i < M; i++)
     square += size[i] * dual[i];

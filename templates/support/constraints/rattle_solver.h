@@ -10,7 +10,7 @@ static SELDOM __attribute__((noinline)) void widen_sizes(const step_data *step, 
 {
   sizes->widened = 1;
   term_sizes(step, now, 0, sizes->inverse);
-  add_constraint_sizes(step->t, step->q0, step->parameters, saddle_in(step->scratch), sizes->inverse);
+  add_constraint_sizes(ACTUAL_FORCES, step->t, step->q0, step->parameters, saddle_in(step->scratch), sizes->inverse);
   sizes->largest = invert_sizes(sizes->inverse);
 }
 

@@ -159,7 +159,7 @@ static SELDOM void add_sizes_of_arguments(const step_data *step, const real *z, 
 {
 #ifdef CONSTRAINED
   const real by_reactions = displacement_by_reactions(step, z);
-  add_constraint_sizes(step->t, step->q0, step->parameters, saddle_in(step->scratch), size);
+  add_constraint_sizes(ACTUAL_FORCES, step->t, step->q0, step->parameters, saddle_in(step->scratch), size);
   for (int i = 0; i < M; i++)
     size[i] += by_reactions;
 #elif defined(FIRST_ORDER_SYSTEM) && !defined(DOUBLE_DOUBLE) /* whose error estimates resolve these */

@@ -116,20 +116,25 @@ static real size_by_position(const real *G, const real *q)
   return sum;
 }
 
+/* Sets the parameters of one mode of all contacts. */
+static void put_in_all(contact_mode now, real *parameters)
+{
+  real mode[EVENT_MODES];
+  for (int k = 0; k < EVENT_MODES; k++)
+    mode[k] = parameters[MODE_PLACE[k]];
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    put_mode(CONTACTS + k, now, AT_REST, 0.0, mode);
+  put_modes(mode, parameters);
+}
+
 /* Evaluates the numbers of the rows at a state. */
 static int rows_at(real t, const real *q, const real *p, const real *parameters, contact_terms *of, real *workspace)
 {
-  real idle[PARAMETERS], imposed[PARAMETERS], mode[EVENT_MODES];
-  for (int k = 0; k < EVENT_MODES; k++)
-    mode[k] = parameters[MODE_PLACE[k]];
+  real idle[PARAMETERS], imposed[PARAMETERS];
   memcpy(idle, parameters, BYTES(PARAMETERS));
   memcpy(imposed, parameters, BYTES(PARAMETERS));
-  for (int k = 0; k < EVENT_CONTACTS; k++)
-    put_mode(CONTACTS + k, CONTACT_IS_OPEN, AT_REST, 0.0, mode);
-  put_modes(mode, idle);
-  for (int k = 0; k < EVENT_CONTACTS; k++)
-    put_mode(CONTACTS + k, CONTACT_STICKS, AT_REST, 0.0, mode);
-  put_modes(mode, imposed);
+  put_in_all(CONTACT_IS_OPEN, idle);
+  put_in_all(CONTACT_STICKS, imposed);
   of->value = of->numbers;
   of->rate = of->value + CONTACT_ROWS;
   of->second = of->rate + CONTACT_ROWS;

@@ -1,10 +1,6 @@
 #include "contact_modes.h"
 
 /* Directions of slips in space where these stop and begin. */
-enum {
-  CONTACT_HALVINGS = 1000 /* of parts of a step whose iterations do not converge */
-};
-
 #define CONTACT_BEGIN 1e-4 /* first part of a slip in space, relative to a step: longer than that of rounding */
 #define CONTACT_BRAKES 0.25 /* longest parts relative to the time to its stop .. */
 #define CONTACT_GROWS 0.2 /* .. to that from its beginning .. */
@@ -16,12 +12,6 @@ enum {
 #define CONTACT_PACE 0x1p-6
 #define CONTACT_UNSOLVED 0x1p-30 /* relative to that: smaller steps with unsolved parts are not divided further */
 #define CONTACT_TURN 0.866 /* cosine of an angle after which a direction is renewed */
-
-/* Whether the stage equations of a step were not solved, those of a shorter one may be. */
-static int is_unsolved(int status)
-{
-  return status == NOT_CONVERGED || status == SINGULAR || status == STATUS(SPURIOUS_SOLUTION);
-}
 
 #ifdef CONTACTS_IN_SPACE
 /* Adds a change of the modes at a state to the crossings. */

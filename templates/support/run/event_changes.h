@@ -323,7 +323,7 @@ static int renew_sides(const event_step *step, long long first, const event_samp
 }
 #endif
 
-#ifdef CONTACTS_IN_SPACE
+#ifdef EVENT_CONTACTS
 /* Cuts a part of a fixed step to one that resolves slips in space, and to the longest whose iterations converge; the
  * first part was taken by the run unless it is replaced, in other modes. */
 static int shorten_part(const event_step *step, event_sample *left, event_sample *right, real end, int changes,
@@ -338,7 +338,9 @@ static int shorten_part(const event_step *step, event_sample *left, event_sample
   real by_slips = longest;
   if (longest < fabs(whole))
     *part = copysign(longest, whole);
+#ifdef CONTACTS_IN_SPACE
   TRY(renew_slips(step, left, &by_slips));
+#endif
   if (by_slips < longest)
     *part = copysign(by_slips, whole);
   if (!(*part == whole && is_taken)) {
@@ -346,6 +348,16 @@ static int shorten_part(const event_step *step, event_sample *left, event_sample
     right->t = *part == whole ? end : left->t + *part;
   }
   return OK;
+}
+
+/* Whether the stage equations of a part of a step were not solved, of which those of its half may be: of slow slips and
+ * nearly straight legs. */
+static int may_be_halved(const event_step *step, int status, real part, real pace)
+{
+  const event_watch *const watch = step->watch;
+  const int unsolved = status == NOT_CONVERGED || status == SINGULAR || status == STATUS(SPURIOUS_SOLUTION);
+  return unsolved && 0.5 * fabs(part) > CONTACT_UNSOLVED * pace &&
+      !(watch->refusal || watch->accumulated || watch->through || watch->chatters || watch->jammed);
 }
 #endif
 
@@ -357,9 +369,8 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
   real *const states = step->memory + 9 * M;
   event_sample left = {.t = before->t, .q = states, .p = states + M};
   event_sample right = {.fraction = 1.0, .t = run->t, .q = states + 2 * M, .p = states + 3 * M};
-#ifdef CONTACTS_IN_SPACE
+#ifdef EVENT_CONTACTS
   real longest = INFINITY;
-  int halvings = 0;
 #endif
   step->whole = step->h = length;
 #ifdef CONTACTS_IN_SPACE
@@ -374,7 +385,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     event_sample at = {.q = states + 4 * M, .p = states + 5 * M};
     real part = length;
     int acts = 0, far = 0, ends, cut = 0, status = OK;
-#ifdef CONTACTS_IN_SPACE
+#ifdef EVENT_CONTACTS
     if (!adaptive)
       status = shorten_part(step, &left, &right, run->t, changes, longest, &part);
     cut = part != length;
@@ -395,15 +406,13 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
 #endif
     if (status == OK && !far)
       status = search_step(step, &left, &right);
-#ifdef CONTACTS_IN_SPACE
-    if (is_unsolved(status) && !adaptive && !step->watch->accumulated && halvings++ < CONTACT_HALVINGS) {
+#ifdef EVENT_CONTACTS
+    longest = INFINITY;
+    if (!adaptive && may_be_halved(step, status, part, fabs(step->whole))) {
       *step->filled = first;
       longest = 0.5 * fabs(part);
-      status = OK;
       continue;
     }
-    longest = INFINITY;
-    halvings = 0;
 #endif
 #ifdef EVENT_KINKS
     if (status == OK && !far)
@@ -493,7 +502,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     left.t = at.t;
     copy_state(left.q, left.p, at.q, at.p);
     TRY(evaluate_functions(step, &left, values_at(step, 0)));
-#ifndef CONTACTS_IN_SPACE /* which shorten the next part first */
+#ifndef EVENT_CONTACTS /* which shorten the next part first */
     TRY(step_from_left(step, &left, length, &right));
 #endif
   }
@@ -601,20 +610,6 @@ static int take_step(event_run *run, real t_end, const step_control *control, co
   return status;
 }
 
-#ifdef CONTACTS_IN_SPACE
-/* Leaves out the friction of slips in space, for a step that parts replace: only the time of the run advances. */
-static int leave_slips(const event_step *step)
-{
-  int slips = 0;
-  for (int k = 0; k < EVENT_CONTACTS; k++)
-    if (CONTACTS[k].slips == 2 && step->own[MODE_PLACE[CONTACTS[k].direction]] != 0.0) {
-      step->own[MODE_PLACE[CONTACTS[k].direction]] = 0.0;
-      slips = 1;
-    }
-  return slips;
-}
-#endif
-
 int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, const step_control *control,
     long long steps, const real *parameters, const solver_options *options, long long states, real *t, real *q, real *p,
     real *length, int *iterations, long long *number, long long room, event_crossing *found, long long *filled,
@@ -708,12 +703,11 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
       status = NOT_CONVERGED;
     if (status == OK && control)
       watch->pace = fmax(watch->pace, CONTACT_PACE * size);
-#ifdef CONTACTS_IN_SPACE
-    if (is_unsolved(status) && !control && leave_slips(&step)) {
+    if (watch->begun && !control && may_be_halved(&step, status, run->h, 0.0)) { /* by parts: only time advances */
+      put_in_all(CONTACT_IS_OPEN, own);
       copy_run(run, &before);
       status = take_step(run, t_end, limited, &step, &size, &count);
     }
-#endif
 #else
     if (status == OK)
       status = take_step(run, t_end, control, &step, &size, &count);
@@ -722,10 +716,9 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
       status = change_in_step(&before, run, &step, control != NULL, size, count, &to);
     if (status != OK) {
       int again = 0;
-#ifdef EVENT_CONTACTS /* whose slow slips and straight legs the iteration on stages may not solve */
+#ifdef EVENT_CONTACTS
       unsolved = 0.5 * size;
-      again = control && is_unsolved(status) && !watch->refusal && !watch->accumulated && !watch->through &&
-          !watch->chatters && !watch->jammed && unsolved > CONTACT_UNSOLVED * watch->pace;
+      again = control && may_be_halved(&step, status, size, watch->pace);
 #endif
       copy_run(run, &before);
       report->stored = kept;
