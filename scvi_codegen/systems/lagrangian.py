@@ -455,12 +455,12 @@ class LagrangianSystem(MechanicalSystem):
         from scvi_codegen.systems.multibody.trees.closures import conditions_of
         from scvi_codegen.systems.multibody.trees.contacts import contacts_of
         from scvi_codegen.systems.multibody.trees.energies import exact_number, system_of_tree
-        from scvi_codegen.systems.multibody.trees.tendons import energies_of
+        from scvi_codegen.systems.multibody.trees.tendons import contacts_of_tendons, energies_of
 
         try:
             closures, tendons, touches, actuators, keys = others or ((), (), (), (), {})
             of_impacts = {"restitution": exact_number(law[0]), "impacts": law[1]}
-            touching = contacts_of(links, touches, of_impacts)
+            touching = contacts_of(links, touches, of_impacts) + contacts_of_tendons(links, tendons, of_impacts)
             added = (
                 conditions_of(links, closures),
                 checked,

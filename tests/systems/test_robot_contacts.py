@@ -141,13 +141,40 @@ def test_what_is_not_read_of_geoms_is_named_in_one_warning(tmp_path):
     [
         ("", PAIR.format('friction=".7"'), "two coefficients of sliding friction, 0.7 and 1"),
         ("", '<contact><pair geom1="ball" geom2="flor"/></contact>', "geom 'flor', which does not exist.*floor"),
-        ("", '<tendon><spatial name="t" range="0 1"/></tendon>', "<spatial> 't' has limits, which is read of joints"),
+        ("", '<tendon><fixed name="t" limited="true" range="2 1"/></tendon>', "<fixed> 't' has the limits 2 and 1"),
         ('/></body><body><joint range="2 1" limited="true"/><geom size=".1"', "", "limits 0.0349066 and"),
     ],
 )
 def test_what_contacts_cannot_be_is_refused_by_name(ball, rest, message, tmp_path):
     with pytest.raises(SystemDefinitionError, match=message):
         robot(tmp_path, FLOOR + BALL.format(ball), rest)
+
+
+ROPE = """<site name="top"/><body name="mass" pos=".3 0 0"><joint name="x" type="slide" axis="1 0 0"/><joint name="z"
+type="slide" axis="0 0 1"/><site name="mass"/><geom size=".1" mass="2"/></body>"""
+
+
+@pytest.mark.second
+def test_a_rope_becomes_taut_by_an_impact_and_swings(tmp_path):
+    """A mass falls freely until x^2 + z^2 = l^2; its velocity along the rope is lost, and it swings as a pendulum."""
+    path = '<tendon><spatial name="r" range="0 .5"><site site="top"/><site site="mass"/></spatial></tendon>'
+    system = robot(tmp_path, ROPE, path, limits="contact")
+    assert [contact.name for contact in system.contacts] == ["upper limit of tendon 'r' of the range 0 to 0.5"]
+    run = sc.compile_stepper(system, "svi:4").integrate(**system.keyframes["qpos0"], h=0.005, steps=80)
+    (x, z), v = run.q[-1] + [0.3, 0], run.velocity[-1]
+    assert np.hypot(x, z) == pytest.approx(0.5, abs=1e-9)
+    across = 2 * 9.81 * 0.4 * (0.3 / 0.5) ** 2  # squared velocity after the impact at z = -0.4
+    assert v @ v + 2 * 9.81 * z == pytest.approx(across - 2 * 9.81 * 0.4, abs=1e-8)
+
+
+@pytest.mark.second
+def test_dry_friction_of_a_tendon_stops_the_joints_that_it_joins(tmp_path):
+    slides = "".join(f'<body><joint name="{n}" type="slide"/><geom mass="{n}" size=".1"/></body>' for n in "21")
+    path = '<tendon><fixed frictionloss=".6"><joint joint="2" coef="1"/><joint joint="1" coef="-1"/></fixed></tendon>'
+    system = robot(tmp_path, slides, f'<option gravity="0 0 0"/>{path}', friction="contact")
+    run = sc.compile_stepper(system, "svi:2").integrate([0, 0], velocity=[0, 1.2], h=0.01, steps=200)
+    assert run.velocity[-1] == pytest.approx([0.4, 0.4], abs=1e-12)  # of the momentum 1.2 and the mass 3
+    assert run.q[-1, 1] - run.q[-1, 0] == pytest.approx(2 / 3 * 1.2**2 / (2 * 0.6), abs=1e-10)
 
 
 @pytest.mark.parametrize("restitution", [-0.1, 2, "e", float("nan")])

@@ -211,10 +211,10 @@ class Unread:
             warn(f"{file}: the motion is computed without {'; '.join(parts)}", SystemDefinitionWarning)
 
 
-def checked_limits(joint: Element, low: float, high: float) -> tuple[float, float]:
-    """Return the limits of a joint, of which the second must be the larger one."""
+def checked_limits(element: Element, low: float, high: float) -> tuple[float, float]:
+    """Return the limits of a joint or tendon, of which the second must be the larger one."""
     if not low < high:
-        joint.refuse(
+        element.refuse(
             f"has the limits {low:g} and {high:g}: the second must be larger; fix the joint, or limits='ignore'"
         )
     return low, high

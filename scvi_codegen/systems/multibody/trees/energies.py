@@ -264,9 +264,7 @@ class Tree:
             low, high = joint.limits or (0.0, 0.0)
             of = f"limit of joint '{joint.label}' of the range {low:g} to {high:g}"
             if joint.limits is not None and joint.kind in SINGLE:
-                q = self.coordinate(joint)[0]
-                yield contact(q - exact_number(low), name=f"lower {of}", **law)
-                yield contact(exact_number(high) - q, name=f"upper {of}", **law)
+                yield from limits_of(self.coordinate(joint)[0], low, high, of, law)
             elif high and high < np.pi:
                 cosine, edge = Matrix(3, 3, rotation_of(joint).entries).trace() / 2 - S.Half, exact_number(high)
                 yield contact((cosine - cos(edge)) / sin(edge), name=of, **law)
@@ -321,6 +319,12 @@ def position_of(joint: Joint) -> tuple[str, ...]:
 def integral(coefficients: Sequence[float], x: Expr) -> Expr:
     """Return c1 x^2/2 + c2 x^3/3 + ..: the energy of a spring with the force c1 x + c2 x^2 + .."""
     return Add(*(exact_number(c) * x**k / k for k, c in enumerate(coefficients, 2)))
+
+
+def limits_of(length: Expr, low: float, high: float, name: str, law: Mapping[str, Any]) -> Iterator[ContactLike]:
+    """Yield the contacts at the ends of the range of a coordinate or length."""
+    yield contact(length - exact_number(low), name=f"lower {name}", **law)
+    yield contact(exact_number(high) - length, name=f"upper {name}", **law)
 
 
 def times(a: Matrix, b: Matrix) -> Matrix:

@@ -159,7 +159,7 @@ class _MujocoModel:
             yield from element.children()
 
     def tendons(self) -> Iterator[Tendon]:
-        """Yield the tendons with forces, rotors, actuators or equalities; limits and dry friction are listed as unread.
+        """Yield the tendons with forces, rotors, limits, actuators or equalities.
 
         https://mujoco.readthedocs.io/en/stable/XMLreference.html#tendon
         """
@@ -167,10 +167,11 @@ class _MujocoModel:
         acted = {actuator.text("tendon", "") for actuator in acting}
         acted |= {equality.text(f"tendon{k}", "") for equality in self.equalities() for k in (1, 2)}
         for tendon in self.entries("tendon"):
-            self.read_limits(tendon, "tendons", tendon.name)
+            limits, friction = self.read_limits(tendon, "tendons", tendon.name)
             stiffness, damping = (self.coefficients(tendon, key) for key in ("stiffness", "damping"))
             armature = tendon.number("armature", 0, 0)
-            if not (any(stiffness) or any(damping) or armature or tendon.node.get("name") in acted):
+            forces = any(stiffness) or any(damping) or armature or limits or friction
+            if not (forces or tendon.node.get("name") in acted):
                 continue
             for part in tendon.children("geom", "pulley"):
                 part.refuse(f"is on the tendon '{tendon.name}', which is read through sites only, without wrapping")
@@ -181,7 +182,8 @@ class _MujocoModel:
             pull = self.bounds(tendon, "actuatorfrc")
             if armature and self.responses:
                 tendon.refuse(f"has armature, which is not read with the springdamper of '{min(self.responses)}'")
-            yield Tendon(factors, points, stiffness, damping, armature, slack, tendon.name, pull)
+            own = tendon.name, pull, limits and checked_limits(tendon, *limits), friction
+            yield Tendon(factors, points, stiffness, damping, armature, slack, *own)
 
     def read(self, world: Element) -> None:
         """Add links, places and shapes of a world body and of all bodies in it, parents first."""
@@ -318,8 +320,6 @@ class _MujocoModel:
         present = {"limits": limits is not None, "friction": friction > 0}
         for what in (what for what in present if present[what] and what not in self.parts):
             self.unread.add(f"{PARTS[what]} of {part}", name)
-        if part == "tendons" and (both := [what for what in present if present[what] and what in self.parts]):
-            element.refuse(f"has {PARTS[both[0]]}, which is read of joints only: write {both[0]}='ignore'")
         return limits if "limits" in self.parts else None, friction if "friction" in self.parts else 0.0
 
     def bounds(self, element: Element, prefix: str = "", inherited: Sequence[float] = (0.0, 0.0)) -> Range:

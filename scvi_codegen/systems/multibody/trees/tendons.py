@@ -1,12 +1,14 @@
 """Tendons: springs, dampers and rotors on linear combinations of coordinates or on paths through points of links."""
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import islice, pairwise
+from typing import Any
 
 import numpy as np
 from sympy import Abs, Add, Expr, Matrix, S, sqrt
 
+from scvi_codegen.systems.contact import ContactLike, friction
 from scvi_codegen.systems.formulas.expressions import derivative_along, evaluate, gradient
 from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.formulas.kinks import positive_part
@@ -17,6 +19,7 @@ from scvi_codegen.systems.multibody.trees.energies import (
     dual_energy,
     exact_number,
     integral,
+    limits_of,
     position_of,
     rotation_of,
 )
@@ -28,7 +31,7 @@ from scvi_codegen.systems.rotations.points import torque_of
 class Tendon:
     """Spring, relaxed at lengths in ``slack`` or as those of joints, damper and rotor on a combination or a path.
 
-    ``pull``: range of the forces of actuators.
+    ``pull``: range of the forces of actuators; ``limits``: range of the length.
     """
 
     joints: tuple[tuple[str, float], ...]
@@ -39,6 +42,8 @@ class Tendon:
     slack: tuple[float, float] | None = None
     name: str = ""
     pull: tuple[float, float] | None = None
+    limits: tuple[float, float] | None = None
+    dry_friction: float = 0.0
 
 
 def energies_of(links: Sequence[Link], tendons: Iterable[Tendon]) -> tuple[Expr, Expr, Expr]:
@@ -54,6 +59,21 @@ def energies_of(links: Sequence[Link], tendons: Iterable[Tendon]) -> tuple[Expr,
             extension = length - low if low == high else positive_part(length - high) - positive_part(low - length)
             potential += integral(tendon.stiffness, extension)
     return kinetic, potential, dissipated
+
+
+def contacts_of_tendons(links: Sequence[Link], tendons: Iterable[Tendon], law: Mapping[str, Any]) -> list[ContactLike]:
+    """Return the contacts of tendons with limits, where ``law`` is that of impacts, and their dry friction."""
+    contacts: list[ContactLike] = []
+    for tendon in tendons:
+        length, of = length_of(links, tendon), f"of tendon '{tendon.name}'"
+        if tendon.limits:
+            low, high = tendon.limits
+            gaps = limits_of(length, low, high, f"limit {of} of the range {low:g} to {high:g}", law)
+            contacts += islice(gaps, 1 if tendon.points and low <= 0 else 0, None)  # paths are not shorter than 0
+        if tendon.dry_friction:
+            limit = exact_number(tendon.dry_friction)
+            contacts.append(friction(rate_of(links, length), limit=limit, name=f"dry friction {of}"))
+    return contacts
 
 
 def length_of(links: Sequence[Link], tendon: Tendon) -> Expr:
