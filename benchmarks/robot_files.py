@@ -22,13 +22,13 @@ EQUAL = 1e-8
 """Largest error of a file that counts as equal."""
 
 
-def outcome(path: Path) -> str:
-    """Return what becomes of a file, the reason first."""
+def outcome(path: Path, folder: Path) -> str:
+    """Return what becomes of a file, the reason first; it may name files of the whole folder."""
     try:
         if path.suffix == ".urdf":
             LagrangianSystem.from_urdf(path)
             return "loaded"
-        system = LagrangianSystem.from_mjcf(path, actuators=True)
+        system = LagrangianSystem.from_mjcf(path, actuators=True, folders=[folder])
     except (SystemDefinitionError, MissingLibraryError) as error:
         return f"refused: {str(error).removeprefix(str(path))}"
     try:
@@ -52,7 +52,7 @@ if __name__ == "__main__":
     warnings.simplefilter("ignore")
     kinds = Counter[str]()
     for file in robots(Path(sys.argv[1])):
-        text = outcome(file)
+        text = outcome(file, Path(sys.argv[1]))
         kinds[text.partition(":")[0].partition(", with")[0]] += 1
         print(f"{file}: {text}", flush=True)
     print(", ".join(f"{count} {kind}" for kind, count in kinds.items()))

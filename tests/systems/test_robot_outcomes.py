@@ -193,6 +193,15 @@ def test_outcome_of_urdf(kind, tmp_path):
     assert equations((np.array(angles)[: len(u)], u, changes), [0.0])[2] < 1e-8
 
 
+def test_the_link_world_needs_no_declaration(tmp_path):
+    joints = JOINT.format("w", "fixed", "world", "a", "") + JOINT.format("x", "revolute", "a", "b", AXIS)
+    file, systems = tmp_path / "robot.urdf", []
+    for world in ("", '<link name="world"/>'):
+        file.write_text(f'<robot name="r">{world}{"".join(map(LINKS.format, "ab"))}{joints}</robot>')
+        systems.append(sc.LagrangianSystem.from_urdf(file))
+    assert systems[0] == systems[1]
+
+
 @pytest.mark.second
 def test_outcome_of_states_outside_limits(tmp_path):
     file, keys = tmp_path / "robot.xml", '<keyframe><key name="far" qpos="2 0"/></keyframe>'

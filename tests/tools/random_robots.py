@@ -454,7 +454,7 @@ def flow(kinds: Any, q: Any, v: Any) -> Any:
 
 
 def errors_of_motion(system: Any, path: Path) -> list[float]:
-    """Return errors of T - V (but for a constant), damping power and equations of motion at a random state of MuJoCo.
+    """Return relative errors of T - V (but for a constant), power and equations of motion at a random state of MuJoCo.
 
     The accelerations are MuJoCo's without equalities.
     """
@@ -480,8 +480,10 @@ def errors_of_motion(system: Any, path: Path) -> list[float]:
         energy, power, error = equations((data.qpos, data.qvel, data.qacc_smooth), constants)
         lift = lifts @ data.xipos @ model.opt.gravity * lifted
         energies.append(energy - data.energy[1] + data.energy[0] + lift)
-    power -= float((data.qfrc_damper + data.qfrc_fluid + data.qfrc_actuator) @ data.qvel)
-    return [float(abs(x)) for x in (energies[1] - energies[0], power, error)]
+    powers = (data.qfrc_damper + data.qfrc_fluid + data.qfrc_actuator) * data.qvel
+    sizes = np.abs(data.energy).max() + 1, np.abs(powers).sum() + 1, 1
+    errors = energies[1] - energies[0], power - powers.sum(), error
+    return [float(abs(x) / size) for x, size in zip(errors, sizes, strict=True)]
 
 
 def equations_of(system: Any, labels: Sequence[str], kinds: Sequence[int]) -> Any:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from itertools import product
 from os import PathLike
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -47,7 +48,7 @@ def links_of_urdf(path: str | PathLike[str], *, floating: bool, parts: Collectio
         element.check_neutral(kind)
         if others := [f"<{child.tag}>" for child in element.node if ":" in child.tag or child.tag == "frame"]:
             unread.add("elements", *others)
-    links = _by_name(robot, "link")
+    links = _links(robot)
     joints = _by_child(robot, links, floating=floating)
     roots = [name for name in links if name not in joints]
     if len(roots) != 1:
@@ -162,6 +163,15 @@ def _by_name(robot: Element, tag: str) -> dict[str, Element]:
             element.refuse("is defined twice")
         elements[name] = element
     return elements
+
+
+def _links(robot: Element) -> dict[str, Element]:
+    """Return the links by name, of which ``world`` needs no declaration."""
+    links = _by_name(robot, "link")
+    if "world" in {_linked(joint, "parent") for joint in robot.children("joint")} - {*links}:
+        world = ElementTree.Element("link", name="world")
+        links["world"] = Element(world, {world: robot.places[robot.node]})
+    return links
 
 
 def _linked(joint: Element, end: str) -> str:
