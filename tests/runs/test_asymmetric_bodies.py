@@ -8,6 +8,7 @@ from mpmath import mp, mpf
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
+from scvi_codegen.codegen.native.building import PORTABLE_FLAGS
 
 DIGITS = 50
 BITS = 180
@@ -164,3 +165,19 @@ def test_tangents_are_differences_in_extended_precision_and_symplectic(stepper):
                     ends.append([*product(z[:4], g), *product(z[4:], g)])
                 expected = [float((x - y) / (2 * mpf(10) ** -20)) for x, y in zip(*ends, strict=True)]
                 np.testing.assert_allclose(tangent[:, column], expected, rtol=0, atol=3e-14 * size)
+
+
+@pytest.mark.second
+def test_lanes_by_different_formulas_have_the_bits_of_single_runs():
+    stepper = sc.compile_stepper(BODY, "composition:8", flags=(*PORTABLE_FLAGS, "-march=native"))  # lanes of a register
+    assert stepper.ensemble is not None
+    resting = [((1, 2, 3), (0, 1.5, 0)), ((1, 2, 3), (0, 0, 0))]
+    symmetric = [(moments, (0.3, -1.5, 0.4)) for moments in ((1, 2, 2), (2, 1, 2), (2, 2, 1), (2, 2, 2))]
+    bodies = [*(case[:2] for case in CASES.values()), *resting, *symmetric]
+    p = np.array([momenta(ATTITUDE, map(mul, *body)) for body in bodies], float)
+    parameters = dict(zip(stepper.parameters, np.transpose([moments for moments, _ in bodies]), strict=True))
+    for h in (0.01, 0.6, 1.6, 8.0):
+        runs = stepper.integrate_ensemble(np.tile(ATTITUDE, (len(p), 1)), p, h=h, steps=3, parameters=parameters)
+        for j, (moments, _) in enumerate(bodies):
+            run = stepper.integrate(ATTITUDE, p[j], h=h, steps=3, parameters=moments)
+            assert np.array_equal([runs.q[:, j], runs.p[:, j]], [run.q, run.p])

@@ -549,8 +549,8 @@ def render_ensemble(
 ) -> Source | None:
     """Return source that integrates many trajectories at once, one per lane, by fixed-point iteration or explicitly.
 
-    ``None`` for other steps, for rigid bodies turned in closed form, for large heat baths, and with integrals: with a
-    time transformation, trajectories have no common times.
+    ``None`` for other steps, for large heat baths, and with integrals: with a time transformation, trajectories have no
+    common times.
 
     Args:
         program: the program.
@@ -563,7 +563,7 @@ def render_ensemble(
     bath, target = program.bath, TARGETS[precision]
     if program.quantities.integrals or (bath and bath.sizes["BATH_FACTORS"] > LARGEST_BATH_IN_LANES):
         return None
-    if split is not None and not split.bodies:
+    if split is not None:
         kernels, points, source = split.kernels, 1, splitting_source(split, observed, target)
         headers = {LEAP: splitting_header(split, Layout(lanes=True), action=program.acts_along)}
     elif program.rattle and program.constraints and not program.damping:

@@ -1,4 +1,5 @@
 #include "../core/trajectories.h"
+#include "../core/choices.h"
 
 /* Trajectories as SIMD lanes of a constrained step, whose points are in turn: group g is point g. point_lanes.h defines
  * the same names, and the order of sums is the same. Requires: POINT_LANES, columns of the tables. */
@@ -18,7 +19,6 @@ enum {
   LAST_GROUP = DEGREE - 1
 };
 typedef real_bits lane_numbers __attribute__((vector_size(REAL_BYTES * LANES)));
-typedef lane_numbers condition; /* all bits of the lanes where it holds */
 
 /* Change of an iteration: the largest ratio to the own size, the ratio of the largest to the largest size, and the
  * largest itself. */
@@ -31,33 +31,9 @@ LANE_FUNCTION lanes former(const lanes *x, lanes first, int g)
   return g > 0 ? x[g - 1] : first;
 }
 
-/* x in the lanes where the condition holds, y in others. */
-LANE_FUNCTION lanes where(condition holds, lanes x, lanes y)
-{
-  return (lanes)(((lane_numbers)x & holds) | ((lane_numbers)y & ~holds));
-}
-
-LANE_FUNCTION int any_of(condition holds)
-{
-  long long any = 0;
-  for (int j = 0; j < LANES; j++)
-    any |= holds[j];
-  return any != 0;
-}
-
-LANE_FUNCTION int all_of(condition holds)
-{
-  return !any_of(~holds);
-}
-
 LANE_FUNCTION lanes greater_lanes(lanes x, lanes y)
 {
   return where((condition)(y > x), y, x);
-}
-
-LANE_FUNCTION number larger_number(number a, number b)
-{
-  return where((condition)(a > b), a, b);
 }
 
 static inline number share(number a, number b)

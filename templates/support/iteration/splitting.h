@@ -5,7 +5,7 @@
  * their kinetic energy in the time h DRIFT[n]. Of many trajectories, which are SIMD lanes, if LANES is defined.
  * Requires: step.h, status_codes.h; or trajectories.h. */
 
-#ifndef LANES
+#if !defined(LANES) && !defined(ROTATING_BODIES)
 typedef real number; /* a value of the trajectory */
 #endif
 
@@ -28,7 +28,7 @@ static void prepare(const step_data *step, solver_data *data)
   for (int i = 0; i < M; i++)
     data->inverse_mass[i] = 1 / data->inverse_mass[i];
 #elif defined(ROTATING_BODIES)
-  real rates[3 * BODIES];
+  number rates[3 * BODIES];
   turning(NULL, step->t, step->parameters, rates);
   for (int k = 0; k < BODIES; k++)
     data->bodies[k] = sorted_axes(BODY[k] + 1, rates + 3 * k);

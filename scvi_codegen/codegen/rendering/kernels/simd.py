@@ -264,7 +264,8 @@ def iteration_source(
 
 def splitting_source(split: Splitting, observed: Kernel | None = None, number: Target = DOUBLE) -> IterationSource:
     """Return the template data of explicit steps of many trajectories, which are lanes."""
-    kernels = (split.force, *(() if split.by_masses else (split.drift,)), *((observed,) if observed else ()))
+    of_drifts = () if split.by_masses else (split.drift, split.turning)
+    kernels = tuple(kernel for kernel in (split.force, *of_drifts, observed) if kernel)
     functions = {name for kernel in (*kernels, split.drift) for name in lane_functions(kernel, TRAJECTORIES.sources)}
     sizes = {rows: str(count) for rows, count in split.sizes.items()}
     sizes |= {"EXPLICIT_STEPS": "1", "SPLITTING": "static inline"}
@@ -274,6 +275,7 @@ def splitting_source(split: Splitting, observed: Kernel | None = None, number: T
         meaning=TRAJECTORIES,
         defines=sizes
         | ({"CONSTANT_MASSES": "1"} if split.by_masses else {})
+        | ({"ROTATING_BODIES": "1"} if split.bodies else {})
         | ({"DRIVEN_FORCES": "1"} if split.driven else {}),
         functions=tuple(map(_vector_function, sorted(functions))),
         tables=tuple(lane_table(name, numbers, len(numbers), number=number) for name, numbers in split.numbers.items()),
