@@ -14,6 +14,7 @@ from scvi_codegen.systems.checks.definition import warn_of_mistakes
 from scvi_codegen.systems.constraints import constraint_sides, constraints_of, rate_of_positions
 from scvi_codegen.systems.contact import contacts_of, names_in
 from scvi_codegen.systems.forces import damping_rate
+from scvi_codegen.systems.formulas.expressions import KINKED
 from scvi_codegen.systems.formulas.grammar import named_tables
 from scvi_codegen.systems.formulas.rotations import RotationNames
 from scvi_codegen.systems.formulas.symbols import (
@@ -141,7 +142,8 @@ def _system(
         **others,
     )
     of_contacts = map(symbol, names_in(item.table for item in others.get("contacts", ())))
-    return system, warn_of_mistakes(system, (*of_contacts, *(bath.symbols if bath else ())))
+    is_warned = warn_of_mistakes(system, (*of_contacts, *(bath.symbols if bath else ())))
+    return system, is_warned or not KINKED.keys().isdisjoint((*coordinates, *momenta, *values))
 
 
 def system_from_sympy(

@@ -3,6 +3,7 @@
 import math
 import re
 import warnings
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import mpmath
@@ -199,7 +200,7 @@ class TestMotions:
     @pytest.mark.second
     def test_a_short_last_step_is_no_close_encounter(self):
         oscillator = made("o", ["x"], "x_dot**2/2 - x**2/2")
-        stepper, lost = sc.compile_stepper(oscillator, "svi:6"), SimpleNamespace(estimate=1e-9)
+        stepper, lost = sc.compile_stepper(oscillator, "svi:6"), SimpleNamespace(estimate=1e-9, requested=1e-9)
         whole = stepper.integrate([1.0], [0.0], t_end=9.0)
         run = stepper.integrate([1.0], [0.0], t_end=whole.t[-3] + 1e-3)
         assert run.step_sizes[-2] < 0.01 * run.step_sizes[-3]
@@ -457,3 +458,12 @@ def test_the_other_branch_of_a_constraint_is_an_error():
     assert not samples.independent[:, 1].any()
     samples.compare(mirrored)
     assert samples.largest() > 1.0
+
+
+def test_times_far_from_zero_are_rounded_and_said_to_be():
+    """Formulas of the time see t to half an ulp, whatever the steps: that is neither a narrow force nor an error."""
+    stepper = sc.compile_stepper(lagrange("late", "x", "x_dot**2/2 + x*cos(t - a)", a=0.0), "svi:8")
+    for late, warning in ((1e6, nullcontext()), (1e9, pytest.warns(sc.AccuracyWarning, match="begin at t = 0: at t"))):
+        with warning:
+            run = stepper.integrate([0.0], [0.0], t=late, t_end=late + 5.0, parameters={"a": late}, error=1e-9)
+        assert abs(run.q[-1, 0] - (1.0 - math.cos(5.0))) < run.global_error < 1e-6

@@ -291,8 +291,9 @@ def test_restored_runs_and_members_have_the_modes_and_bits_of_runs() -> None:
 
 @pytest.mark.parametrize("name", ["min", "max", "abs", "sign", "where"])
 def test_names_of_a_system_win_over_functions(name: str) -> None:
-    with pytest.warns(sc.SystemDefinitionWarning, match=rf"so the function {name}\(..\) is not available"):
-        stepper = made(f"x_dot**2/2 - {name}*x**2/2", **{name: 4.0})
+    for _ in range(2):  # also of what the cache knows
+        with pytest.warns(sc.SystemDefinitionWarning, match=rf"so the function {name}\(..\) is not available"):
+            stepper = made(f"x_dot**2/2 - {name}*x**2/2", **{name: 4.0})
     assert stepper.integrate([1.0], [0.0], h=0.1, t_end=np.pi / 2).q[-1] == pytest.approx([-1.0], abs=1e-8)
 
 

@@ -980,10 +980,10 @@ def _warn_of_distance(orbit: PeriodicOrbit, guess: Array) -> None:
     amplitude = float(np.ptp(np.concatenate([states.q, states.p], axis=1), axis=0).max()) / 2.0
     away = float(np.abs(np.concatenate([orbit.q, orbit.p]) - guess[:-1]).max())
     if away > OTHER * amplitude or not _is_near(orbit, guess, np.concatenate([states.q, states.p], axis=1)):
+        period = "" if orbit.period == guess[-1] else f"its period is {orbit.period:.6g}, not {guess[-1]:.6g}, and "
         warn(
-            f"the periodic orbit that was found is far from the guess: its period is {orbit.period:.6g}, not "
-            f"{guess[-1]:.6g}, and its state differs by {away:.2g}, where the amplitude of the orbit is "
-            f"{amplitude:.2g}. Compare both, or fix an amplitude",
+            f"the periodic orbit that was found is far from the guess: {period}its state differs by {away:.2g}, where "
+            f"the amplitude of the orbit is {amplitude:.2g}. Compare both, or fix an amplitude",
             AccuracyWarning,
         )
 

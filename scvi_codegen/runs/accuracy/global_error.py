@@ -15,7 +15,7 @@ Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I, II.
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate, chain, repeat
 from operator import mul
 from typing import Any, TypeAlias
@@ -255,6 +255,9 @@ def _alternative(trajectory: Any, result: GlobalError) -> str:
     """
     if trajectory.modes is not None and trajectory.modes.ambiguous:
         return "; but several motions of the contacts were consistent: others are as consistent as this one"
+    latest = float(abs(trajectory.t).max())
+    if math.ulp(latest) > result.requested * float(np.ptp(trajectory.t)):
+        return f"; or begin at t = 0: at t = {latest:g} times are rounded by {math.ulp(latest):.1e}"
     if math.isinf(result.estimate):
         return f"; or use a method of higher order: others took more than {FURTHER} times the steps of the first run"
     if kinks := trajectory.stepper.interface.kinks:
@@ -356,18 +359,24 @@ class Runs:
             self.taken = self.most  # no further run begins
             raise _TooManyStepsError
 
-    def _judged(self) -> Attempt:
-        """Return the first run that is confirmed, and its estimate; otherwise the better one."""
+    def _judged(self, passing: Attempt | None = None) -> Attempt:
+        """Return the first run that is confirmed, and its estimate; otherwise the better one.
+
+        Args:
+            passing: the run before that passes over forces; it is lost if none of smaller steps can be made.
+        """
         attempts: list[tuple[Attempt, Any]] = []
         for attempt in chain(self._limited() if self.parts else self._by_tolerance(), self._at_round_off()):
             if attempt[1].confirmed:
-                return self._judged() if self._passes_over_forces(self.compared) else attempt
+                return self._judged(attempt) if self._passes_over_forces(self.compared) else attempt
             attempts.append((attempt, self.compared))
+        if not attempts and passing is not None:
+            return passing[0], replace(passing[1], estimate=math.inf, confirmed_until=self.start)
         if self.failure is not None and not attempts:
             raise self.failure
         best, compared = min(attempts, key=lambda attempt: attempt[0][1].estimate)
         further = [best[0]] if len(best[0].t) == best[0].steps + 1 else []
-        return self._judged() if self._passes_over_forces(compared, *further) else best
+        return self._judged(best) if self._passes_over_forces(compared, *further) else best
 
     def _passes_over_forces(self, compared: tuple[Any, "_Samples"] | None, *further: Any) -> bool:
         """Return whether a run for comparison, or a further one, passes over forces; runs have smaller steps then."""
@@ -379,7 +388,9 @@ class Runs:
         apart = np.array([differences_in_pieces(compared, size) for compared in (run, *further)]).max(axis=0)
         apart[:, ~samples.independent.any(axis=0) & samples.is_rounding(apart[0]).any(axis=0)] = 0.0
         differences = relative(apart, samples.sizes(len(samples.t), apart)).max()
-        if differences <= max(PART_OF_ERROR * self.requested, ROUNDINGS * samples.epsilon):
+        end = samples.end
+        rounding = samples.epsilon * max(1.0, max(abs(self.start), abs(end)) / abs(end - self.start))  # also of times
+        if differences <= max(PART_OF_ERROR * self.requested, ROUNDINGS * rounding):
             return False
         self.largest = size
         return True

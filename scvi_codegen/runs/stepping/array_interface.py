@@ -52,6 +52,8 @@ def read_arrays(
 ) -> RunArrays:
     """Return the arrays of a run, valid by their declarations and together; StateError otherwise."""
     index_tables, state = read_tables(interface, tables), read_state(interface, q, "positions")
+    if not any(values.size for values in state.values()):
+        raise StateError(f"positions: the array '{next(iter(state))}' is empty: a motion has at least one coordinate")
     shapes = [(array, state[array.name].shape) for array in interface.layout.coordinates]
     if (mesh := interface.layout.mesh) is not None:
         for array, shape in shapes:
