@@ -1,6 +1,6 @@
 /* Choices between numbers of a trajectory or, if LANES is defined, in every SIMD lane by itself. */
 #if defined(LANES) && !defined(SCALAR_LANES)
-typedef __typeof__(lanes_of(0) < lanes_of(0)) condition; /* all bits of the lanes where it holds */
+typedef real_bits condition __attribute__((vector_size(REAL_BYTES * LANES))); /* all bits of the lanes where it holds */
 
 /* x in the lanes where the condition holds, y in others. */
 static inline __attribute__((always_inline)) lanes where(condition holds, lanes x, lanes y)
