@@ -187,6 +187,24 @@ def test_a_table_on_four_legs_tips() -> None:
     assert run.contact_modes[1] == (pytest.approx(0.97, abs=1e-9), ("stick", "stick", "open", "open"))
 
 
+@pytest.mark.parametrize("first", [1, -1])
+def test_a_bar_slips_about_the_end_that_sticks(first: int) -> None:
+    """Friction in space of the end that sticks has its own limit, whichever contact comes first; by SciPy."""
+    slips = [[f"x_dot - {end}*sin(c)*c_dot", f"y_dot + {end}*cos(c)*c_dot"] for end in (-0.5, 0.5)]
+    feet = [sc.friction(slip, limit=limit) for slip, limit in zip(slips, (1e6, 1), strict=True)][::first]
+    energy, forces = "(x_dot**2 + y_dot**2)/2 + c_dot**2/24", {"x": "3*t", "y": "t", "c": "t/2"}
+    system = sc.LagrangianSystem.from_text("bar", ["x", "y", "c"], energy, forces=forces, contacts=feet)
+    own = sc.compile_stepper(system, "svi:2", flags=("-O1",))
+    run = own.integrate([0.5, 0, 0], velocity=[0, 0, 0], h=0.05, t_end=1.4)
+
+    def turn(t: float, state: NDArray[Any]) -> list[float]:
+        c, w = state
+        return [w, 1.5 * t * (np.cos(c) - 3 * np.sin(c) + 1) - 3]
+
+    true = solve_ivp(turn, (1, 1.4), [0.0, 0.0], "DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
+    assert [run.q[-1, 2], run.velocity[-1, 2]] == pytest.approx(true, abs=3e-8)
+
+
 def test_balls_close_at_once_by_one_formula() -> None:
     floor = sc.contact("y[i] for i in 12", slip="x_dot[i]", friction="mu[i]")
     text, mu = "sum(i in 12, (x_dot[i]**2 + y_dot[i]**2)/2 - 9.81*y[i])", 0.01 * np.arange(1, 13)

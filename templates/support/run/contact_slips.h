@@ -74,7 +74,7 @@ static int turn_slips(const event_step *step, const event_sample *at, const cont
   in.right = right;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int slip = CONTACTS[k].tangential;
-    in.limit[k] = mode[k].sticks;
+    in.limit[k] = mode[k].sticks != 0;
     if (!begins[k])
       continue;
     mode[k] = CONTACT_STICKS;
