@@ -325,15 +325,16 @@ static int renew_sides(const event_step *step, long long first, const event_samp
 
 #ifdef EVENT_CONTACTS
 /* Cuts a part of a fixed step to one that resolves slips in space, and to the longest whose iterations converge; the
- * first part was taken by the run unless it is replaced, in other modes. */
-static int shorten_part(const event_step *step, event_sample *left, event_sample *right, real end, int changes,
+ * first part was taken by the run unless it is replaced, in its state, too, in other modes. */
+static int shorten_part(const event_step *step, event_sample *left, event_sample *right, event_run *run, int changes,
     real longest, real *part)
 {
   const real whole = *part;
+  real taken[EVENT_MODES];
   int is_taken = changes == 0;
   longest = fmin(longest, fabs(whole));
   for (int k = 0; k < EVENT_MODES; k++)
-    is_taken &= step->own[MODE_PLACE[k]] == step->watch->mode[k];
+    taken[k] = step->own[MODE_PLACE[k]];
   put_modes(step->watch->mode, step->own);
   real by_slips = longest;
   if (longest < fabs(whole))
@@ -343,10 +344,15 @@ static int shorten_part(const event_step *step, event_sample *left, event_sample
 #endif
   if (by_slips < longest)
     *part = copysign(by_slips, whole);
-  if (!(*part == whole && is_taken)) {
-    TRY(step_from_left(step, left, *part, right));
-    right->t = *part == whole ? end : left->t + *part;
-  }
+  for (int k = 0; k < EVENT_MODES; k++)
+    is_taken &= taken[k] == step->watch->mode[k];
+  if (*part == whole && is_taken)
+    return OK;
+  TRY(evaluate_functions(step, left, values_at(step, 0)));
+  TRY(step_from_left(step, left, *part, right));
+  right->t = *part == whole ? run->t : left->t + *part;
+  if (*part == whole)
+    set_run(run, run->t, right);
   return OK;
 }
 
@@ -387,10 +393,8 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     int acts = 0, far = 0, ends, cut = 0, status = OK;
 #ifdef EVENT_CONTACTS
     if (!adaptive)
-      status = shorten_part(step, &left, &right, run->t, changes, longest, &part);
+      status = shorten_part(step, &left, &right, run, changes, longest, &part);
     cut = part != length;
-    if (status == OK && cut)
-      status = evaluate_functions(step, &left, values_at(step, 0));
 #endif
     const real span = part;
     const long long first = *step->filled;
@@ -501,8 +505,8 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     }
     left.t = at.t;
     copy_state(left.q, left.p, at.q, at.p);
-    TRY(evaluate_functions(step, &left, values_at(step, 0)));
 #ifndef EVENT_CONTACTS /* which shorten the next part first */
+    TRY(evaluate_functions(step, &left, values_at(step, 0)));
     TRY(step_from_left(step, &left, length, &right));
 #endif
   }
@@ -642,11 +646,6 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
         memory, memory + 15 * M, 0, &horizon, own};
     real size = 0.0;
     int count = 0;
-#ifdef EVENT_MODES
-    if (!watch->begun)
-      status = begin_run(run, &step, control ? t_end - run->t : run->h);
-    put_modes(watch->mode, own);
-#endif
 #ifdef EVENT_CONTACTS
     real longest = INFINITY;
 #endif
@@ -656,6 +655,14 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
 #if EVENTS_CONTROLLED
     longest = control ? exp2((real)run->grid_level / 4.0) : longest; /* the size that the controller has found */
 #endif
+    step.whole = fmax(longest, watch->pace);
+#endif
+#ifdef EVENT_MODES
+    if (!watch->begun)
+      status = begin_run(run, &step, control ? t_end - run->t : run->h);
+    put_modes(watch->mode, own);
+#endif
+#ifdef CONTACTS_IN_SPACE
     if (status == OK)
       status = renew_slips(&step, &now, &longest);
 #endif
