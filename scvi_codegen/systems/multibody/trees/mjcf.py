@@ -445,8 +445,8 @@ class _MujocoModel:
             equality.refuse(f"is between {equality.tag} '{equality.text(first)}' and itself")
         written = equality.vector("polycoef", (0,), range(1, 6))
         polynomial = (*written, *(0, 1, 0, 0, 0)[len(written) :])  # those that are not written keep their defaults
-        coefficients = tuple(map(float, polynomial if other else polynomial[:1]))
-        zeros = [reference_length(self.links, part) for part in (length, other or S.Zero)]
+        coefficients = tuple(map(float, polynomial[:1] if other is None else polynomial))
+        zeros = [reference_length(self.links, S.Zero if part is None else part) for part in (length, other)]
         return Coupling(length, other, coefficients, *zeros)
 
     def length(self, element: Element, key: str, paths: Mapping[str, Tendon]) -> Expr:
