@@ -51,11 +51,12 @@ ROUNDED_OF_TWO_WORDS, LEAST_OF_TWO_WORDS, LAST_OF_TWO_WORDS = 1e-26, 1e-30, (1e-
 """The same with states of two words."""
 COARSER = 1e4
 """Factor of the tolerance of a comparison that fails, for a second attempt."""
-SAFETY, SAFETY_OF_TWO, SAFETY_OF_ROUNDING = 3.0, 12.0, 4.0
-"""Factors between the largest difference and the estimate; for two and three comparisons where rounding may dominate.
+SAFETY, SAFETIES_OF_ROUNDING = 3.0, (400.0, 12.0, 4.0)
+"""Factors between the largest difference and the estimate; for one to three comparisons where rounding may dominate.
 
-If the errors are independent normal numbers, those of two further runs are both within e / 12 of the error e of the run
-in 8 of 10,000 cases, and those of three within e / 4 in as many.
+If the errors are independent normal numbers, that of a further run is within e / s of the error e of the run in
+1 / (pi s) of the cases, for s = 400 in 8 of 10,000; those of two are both within e / 12, those of three within e / 4 in
+as many.
 """
 PARTS_AT_KINKS, LEAST_AT_KINKS = (math.inf, 0.0913, 0.0331, 0.0127, 0.00491), 1e-13
 """Largest steps relative to the run, one after the other, of formulas that are not smooth: free flight has the same
@@ -98,7 +99,8 @@ class GlobalError:
         differences: (n,) the largest difference of a position relative to the range of that coordinate over the run, or
             of a momentum relative to its own or that of its velocity (:mod:`scvi_codegen.runs.accuracy.size`); not of
             coordinates that constraints determine from others at that time, where their positions differ by rounding.
-        safety: factor of the estimate: 3; where rounding may dominate the error, 12 for two comparisons, 4 for three.
+        safety: factor of the estimate: 3; where rounding may dominate the error, 400 for one comparison (which confirms
+            nothing), 12 for two, 4 for three.
         estimate: this factor times the largest difference, at least ten roundings and the tolerance; meaningless above
             about 0.1, where runs are uncorrelated.
         confirmed_until: last of the times up to which the factor times each difference is at most the requested error.
@@ -459,11 +461,11 @@ class Runs:
     ) -> GlobalError:
         """Return the estimate of the error of a run by others; the last runs are compared with all of them."""
         compared = _Samples(trajectory, self.start, self.interface)
-        safety = SAFETY if len(others) == 1 else SAFETY_OF_ROUNDING
+        safety = SAFETY if len(others) == 1 else SAFETIES_OF_ROUNDING[-1]
         floor = max(smallest_estimate(self.words), 0.0 if tolerance is None else tolerance)
         for number, other in enumerate(others if compared.end != self.start else ()):
-            if number == 2 and SAFETY_OF_TWO * compared.largest() <= self.requested:
-                safety = SAFETY_OF_TWO
+            if number == 2 and SAFETIES_OF_ROUNDING[1] * compared.largest() <= self.requested:
+                safety = SAFETIES_OF_ROUNDING[1]
                 break
             try:
                 complete = compared.compare(self._other(other, compared, number))
@@ -473,6 +475,7 @@ class Runs:
             except _TooManyStepsError:
                 compared.lose()
             if not last and safety * compared.largest() > self.requested:
+                safety = SAFETY if len(others) == 1 else SAFETIES_OF_ROUNDING[number]
                 break
         if trajectory.modes is not None and trajectory.modes.ambiguous:
             compared.lose()  # all runs chose the same one of several motions
