@@ -68,7 +68,8 @@ def states_and_steps_at(states: SavedStates, times: Array) -> tuple[Array, Array
         for k in np.flatnonzero(t - times):
             q[k], p[k] = stepped_to(states, q[k], p[k], t[k : k + 1], times[k])
     else:
-        _take_partial_steps(states, t, times - t, q, p)
+        forward = states.forward * (times - t) > 0.0  # whole steps may pass a time by a rounding
+        _take_partial_steps(states, t, np.where(forward, times - t, 0.0), q, p)
     return q, p, times
 
 
