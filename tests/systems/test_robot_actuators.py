@@ -12,7 +12,7 @@ from scvi_codegen.runs.driver.segments import input_of
 
 LIFT = """<mujoco><option gravity="0 0 0"/><default><default class="a"><position kp="9"/></default></default>
 <worldbody><body><joint name="x" type="slide"/>
-<geom type="sphere" size=".1" mass="2"/></body></worldbody><actuator>{actuators}</actuator></mujoco>"""
+<geom type="sphere" size=".1" mass="2"/><site name="t"/></body></worldbody><actuator>{actuators}</actuator></mujoco>"""
 ARM = """<mujoco><option><flag contact="disable"/></option><default><geom type="capsule" size=".04"/>
 <joint axis="0 1 0" damping=".1"/></default><worldbody><body><joint name="shoulder"/><geom fromto="0 0 0 0 0 -.5"/>
 <body pos="0 0 -.5"><joint name="elbow"/><geom fromto="0 0 0 0 0 -.4"/></body></body></worldbody><actuator>
@@ -65,18 +65,20 @@ def test_actuators_of_one_joint_have_different_names(tmp_path):
 
 
 REFUSED = {
-    '<motor site="s"/>': "<motor> 'motor' acts on no hinge, slide or tendon",
+    '<motor site="s"/>': "<motor> 'motor' names the site 's', which does not exist",
+    '<position site="t" refsite="t" dampratio="1"/>': "a dampratio, which hinges and slides with gear, kp",
+    '<position site="t" inheritrange="1"/>': "an inheritrange, which is read of joints with a range",
     '<muscle joint="x"/>': "is not read as an actuator: general, motor, position, velocity are",
     '<damper joint="x" kv="1"/>': "is not read as an actuator",
     '<cylinder joint="x"/>': "is not read as an actuator",
     '<general joint="x" dyntype="filter"/>': "dyntype='filter', which changes the motion and is not read",
     '<position joint="x" timeconst=".1"/>': "timeconst='.1', which changes the motion",
-    '<position joint="x" dampratio="1" kv="1"/>': "a dampratio, which is read of joints with gear, kp",
+    '<position joint="x" dampratio="1" kv="1"/>': "a dampratio, which hinges and slides with gear, kp",
     '<position joint="x" inheritrange="1"/>': "an inheritrange, which is read of joints with a range",
     '<velocity joint="x" dampratio="1"/>': "dampratio='1', which changes",
     '<velocity joint="x" class="a"/>': "has gains of <position> by its class: write them out",
     '<general joint="x" biasprm="0 -1 2" biastype="affine"/>': "biasprm='0 -1 2', a damping ratio of the mass matrix",
-    '<motor joint="y"/>': "<motor> 'motor' acts on no hinge, slide or tendon",
+    '<motor joint="y"/>': "<motor> 'motor' acts on no joint, tendon or site",
     '<motor joint="x" name="m"/><motor joint="x" name="m"/>': "<motor> 'm' is the second actuator of this name",
     '<general joint="x" gaintype="affine" gainprm="1 0 2" forcerange="-1 1"/>': "a gain that depends on the velocity",
 }

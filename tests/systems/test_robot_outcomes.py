@@ -25,6 +25,7 @@ A, B = '<joint name="x" axis="1 2 3" {}/>', '<joint name="y" axis="0 1 0" {}/>'
 PATH = '<tendon><spatial name="t" stiffness="3"><site site="w"/>{}<site site="e"/></spatial></tendon>'
 MUSCLE, SERVO = '<actuator><muscle joint="x"/></actuator>', '<actuator><position name="u" joint="x" kv="1"/></actuator>'
 RATIOS = '<actuator><position joint="{}" kp="3" dampratio=".7" gear="2" inheritrange=".8"/></actuator>'
+WRENCHES = '<actuator>{} gear="{}"/></actuator>'
 ELLIPSOIDS = (
     '<geom type="{}" size="{}" pos=".1 0 .2" euler=".3 .2 .1" fluidshape="ellipsoid" fluidcoef=".3 .2 1 .7 .6"/>'
 )
@@ -56,6 +57,37 @@ ROWS: dict[str, tuple[dict[str, str], str | None]] = {
             "a": A.format('range="-1 .5" ref=".3" armature=".2"'),
             "b": B.format('type="slide" range="-.4 .1" ref="-.1"'),
             "rest": RATIOS.format("x") + RATIOS.format("y"),
+        },
+        EQUAL,
+    ),
+    "thrusts and torques of sites": (
+        {"a": '<freejoint name="f"/>', "rest": WRENCHES.format('<motor site="s"', "-1 2 3 .5 .7 -.3")},
+        EQUAL,
+    ),
+    "servos between sites": (
+        {"rest": WRENCHES.format('<position site="e" refsite="s" kp="2" kv="1"', "-1 2 3 .5 .7 -.3")},
+        EQUAL,
+    ),
+    "servos of a site in the world": (
+        {
+            "a": '<joint name="x" type="ball"/>',
+            "rest": WRENCHES.format('<position site="e" refsite="w" kp="2" kv="1" forcerange="-3 2"', ".5 1 2"),
+        },
+        EQUAL,
+    ),
+    "ball joints with servos": (
+        {
+            "a": '<joint name="x" type="ball"/>',
+            "rest": WRENCHES.format('<position joint="x" kp="2" kv="1"', "1 2 3")
+            + WRENCHES.format('<position jointinparent="x" kp="2" kv="1"', "-1 2 1"),
+        },
+        EQUAL,
+    ),
+    "free joints with motors": (
+        {
+            "a": '<freejoint name="f"/>',
+            "rest": WRENCHES.format('<motor joint="f"', "1 2 3 -1 .5 .7")
+            + WRENCHES.format('<motor jointinparent="f"', "1 2 3 -1 .5 .7"),
         },
         EQUAL,
     ),

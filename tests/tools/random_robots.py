@@ -262,6 +262,9 @@ class Whole(Mjcf):
         acting += (
             [element("general", {"name": "force", "joint": first, **affine})] if first and not self.clamped else []
         )
+        if not self.clamped:
+            ends = {"site": f"sb{start}"} | draw.some(0.5, refsite=draw.one("s", f"sb{(start + 1) % self.bodies}"))
+            acting.append(element(servo[0], {"name": "wrench", **plain, **ends, "gear": draw.numbers(draw.one(3, 6))}))
         return [
             element("asset", {}, *meshes, '<model name="part" file="part.xml"/>'),
             element("option", medium),

@@ -1,68 +1,120 @@
-"""Actuators of MJCF: forces of controls, which are inputs, along the lengths of joints and tendons.
+"""Actuators of MJCF: forces of controls, which are inputs, along joints and tendons, and on sites.
 
 With l = gear times the length and the control u, F = (g0 + g1 l + g2 l_dot) u + b0 + b1 l + b2 l_dot = a + b l_dot acts
 along l, f = -dD/dv by the Rayleigh function D = -(a l_dot + b l_dot^2/2). If F is clamped, D = -(Q(a + b l_dot) -
 Q(a))/b with its integral Q. https://mujoco.readthedocs.io/en/stable/computation/index.html#actuation-model
+
+The gear of a site, ball or free joint is a wrench (f, tau) with l_dot = f . v + tau . w for the velocity v and angular
+velocity w, and l = f . x + tau . a, with the position x and rotation vector a, of ball joints and relative to another
+site, else 0. With the axes R of the site and K = hat(tau) R, which does not move, tau . w = d/dt tr(K^T R)/2.
 """
 
 from collections.abc import Mapping, Sequence
 from itertools import chain
 
-from sympy import Add, Expr
+from sympy import Add, Expr, Matrix, S
 
 from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.formulas.kinks import positive_part
-from scvi_codegen.systems.formulas.symbols import input_parameters, symbol
+from scvi_codegen.systems.formulas.symbols import DOT, input_parameters, symbol
+from scvi_codegen.systems.multibody.trees.closures import frames_in_common
 from scvi_codegen.systems.multibody.trees.document import Element
-from scvi_codegen.systems.multibody.trees.energies import exact_number
+from scvi_codegen.systems.multibody.trees.energies import (
+    as_quantities,
+    exact_number,
+    exact_vector,
+    position_of,
+    rotation_of,
+    rotation_vector,
+)
 from scvi_codegen.systems.multibody.trees.schema import Kind
 from scvi_codegen.systems.multibody.trees.tendons import Tendon, length_of, rate_of
-from scvi_codegen.systems.multibody.trees.tree import Link, identifier, numbered, symbols_of
+from scvi_codegen.systems.multibody.trees.tree import (
+    SINGLE,
+    Joint,
+    Link,
+    Pose,
+    Vector,
+    identifier,
+    numbered,
+    symbols_of,
+)
 
+Motion = tuple[Expr, Expr]
+"""Length of an actuator and its rate, times the gear."""
 Range = tuple[float, float] | None
 Actuator = tuple[str, str, Range, Expr]  # name in the file, name and range of the input, Rayleigh function
+JOINTED = "joint", "jointinparent"
+ACTED = *JOINTED, "tendon", "site"
 NONE = (0.0, 0.0, 0.0)
 ABSENT = Kind(refused={"dyntype": "none", "timeconst": "0", "delay": "0"})
 OF_SERVOS = Kind(refused={"dampratio": "0", "inheritrange": "0"})
 
 
+def motion_of(links: Sequence[Link], part: Joint | Tendon, gear: Vector, in_parent: bool) -> Motion:
+    """Return the motion of a joint or tendon; torques on ball and free ones are in the frame of the body or parent."""
+    if isinstance(part, Tendon) or part.kind in SINGLE:
+        length = exact_number(gear[0]) * (length_of(links, part) if isinstance(part, Tendon) else symbol(part.name))
+        return length, rate_of(links, length)
+    force, torque = (exact_vector(x) for x in (gear[:3], gear[3:] if part.kind == "free" else gear[:3]))
+    axes, spin = Matrix(3, 3, rotation_of(part).entries), Matrix(rotation_of(part).rates)
+    rate = torque.dot(axes * spin if in_parent else spin)
+    if part.kind == "ball":
+        return torque.dot(rotation_vector(axes)[0]), rate
+    return S.Zero, rate + force.dot(Matrix([symbol(name + DOT) for name in position_of(part)]))
+
+
+def motion_of_sites(links: Sequence[Link], ends: Sequence[tuple[int, Pose]], gear: Vector) -> Motion:
+    """Return the motion of a site along a wrench in its frame, or relative to a second site in the frame of this."""
+    (place, axes), (origin, others) = frames_in_common(links, [*ends, (-1, Pose())][:2])
+    own = others if ends[1:] else axes
+    force, torque = (exact_vector(part) for part in (gear[:3], gear[3:]))
+    across = as_quantities(own * torque).hat() / 2
+    loads = [*as_quantities(own * force), *as_quantities(across * axes), *as_quantities(across * others)]
+    held = [symbol(f"load {k}") if load != 0 else S.Zero for k, load in enumerate(loads)]
+    rate = rate_of(links, Matrix(held).dot(Matrix([*(place - origin), *axes, *-others])))
+    turn = rotation_vector(as_quantities(others.T * axes))[0]
+    length = force.dot(others.T * (place - origin)) + torque.dot(turn) if ends[1:] else S.Zero
+    return intermediate(length), rate.xreplace(dict(zip(held, loads, strict=True)))
+
+
 def actuator_of(
     links: Sequence[Link],
     element: Element,
-    tendon: Tendon,
+    motion: Motion,
+    gear: float,
     others: Mapping[str, str],
     controls: Range,
     forces: Range,
-    inverse: float,
+    inverse: float | None,
 ) -> Actuator:
-    """Return the actuator of an element, with these ranges, on a tendon; a joint is a tendon with one factor, 1.
+    """Return the actuator of an element, with these ranges, along a motion, of which joints and tendons have one gear.
 
     ``others``: inputs of the actuators before it by name, and no text by the names of those after it.
-    ``inverse``: entry of M^-1 of the joint in the reference configuration, for the damping 2 z sqrt(g0/inverse)/gear of
+    ``inverse``: entry of M^-1 of a hinge or slide at the reference, for the damping 2 z sqrt(g0/inverse)/gear of
     a ratio z.
     """
-    gear = float(element.vector("gear", (1,), range(1, 7))[0])
     gain, bias = _coefficients(element)
     if ratio := element.number("dampratio", 0, 0):
-        if element.has("tendon") or element.has("kv") or gain[0] < 0 or gear == 0:
-            element.refuse("has a dampratio, which is read of joints with gear, kp >= 0 and without kv: give kv alone")
+        if inverse is None or element.has("kv") or gain[0] < 0 or gear == 0:
+            element.refuse(
+                "has a dampratio, which hinges and slides with gear, kp >= 0 and no kv may have: give kv alone"
+            )
         bias = (*bias[:2], -2 * ratio * (gain[0] / inverse) ** 0.5 / abs(gear))
-    forces = _clamped(forces, tendon.pull, gear)
     if not (any(gain[1:]) or any(bias)):
-        controls, forces = _clamped(controls, forces, gain[0]), None
+        controls, forces = clamped(controls, forces, gain[0]), None
     if forces is not None and gain[2]:
         element.refuse("has a gain that depends on the velocity, and a range of the force: omit one")
     if others.get(label := element.node.get("name", "")):
         element.refuse("is the second actuator of this name: rename one")
-    part = element.text("joint", element.text("jointinparent", element.text("tendon", "")))
+    part = next(element.text(key) for key in ACTED if element.has(key))
     label = label or next(x for x in numbered(part) if x not in others)
     taken = {x for link in links for x in symbols_of(link.joint.kind, link.joint.name)}
     taken |= {*(inputs := [*filter(None, others.values())]), *input_parameters(inputs)}
     names = chain([identifier(label)], numbered(f"ctrl_{identifier(label)}"))
     name = next(x for x in names if taken.isdisjoint({x, *input_parameters([x])}))
-    length = exact_number(gear) * length_of(links, tendon)
     a, b, c = (exact_number(g) * symbol(name) + exact_number(b) for g, b in zip(gain, bias, strict=True))
-    rate = intermediate(rate_of(links, length))
+    length, rate = motion[0], intermediate(motion[1])
     return label, name, controls, _dissipation(a + b * length, c, rate, forces)
 
 
@@ -77,7 +129,7 @@ def _dissipation(at_rest: Expr, slope: Expr, rate: Expr, forces: Range) -> Expr:
     return -(force**2 - Add(*(x * positive_part(x) for x in (force - high, low - force)))) / (2 * slope)
 
 
-def _clamped(inner: Range, outer: Range, factor: float) -> Range:
+def clamped(inner: Range, outer: Range, factor: float) -> Range:
     """Return the range of numbers x that are clamped to ``inner``, and then factor x to ``outer``."""
     if outer is None or factor == 0:
         return inner

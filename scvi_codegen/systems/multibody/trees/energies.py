@@ -225,7 +225,7 @@ class Tree:
         return Add(*terms)
 
     def extensions(self, joint: Joint) -> Iterator[Expr]:
-        """Yield the displacements of springs, of a rotation the angle atan2(|R - R^T|_F/8^(1/2), (tr R - 1)/2)."""
+        """Yield the displacements of springs, of a rotation its angle."""
         if joint.kind in SINGLE:
             yield self.coordinate(joint)[0] - exact_number(joint.rest)
             return
@@ -234,8 +234,7 @@ class Tree:
             away = Matrix([symbol(name) for name in position_of(joint)]) - exact_vector(joint.pose.position)
             yield sqrt(away.dot(away) + TINY)
             turn = exact_matrix(joint.pose.rotation).T * turn
-        twice = [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
-        yield atan2(sqrt(Add(*(x**2 for x in twice)) / 4 + TINY), (turn.trace() - 1) / 2)
+        yield rotation_vector(turn)[1]
 
     def dissipation(self) -> Expr:
         """Return Rayleigh's function of the damping of joints."""
@@ -309,6 +308,14 @@ class Tree:
 def rotation_of(joint: Joint) -> Rotation:
     """Return the rotation of a ball joint or free body: ``R_NAME`` with the angular velocity ``omega_NAME``."""
     return Rotation(f"R_{joint.name}", f"omega_{joint.name}")
+
+
+def rotation_vector(turn: Matrix) -> tuple[Matrix, Expr]:
+    """Return a n and a = atan2(|R - R^T|_F/8^(1/2), (tr R - 1)/2) of the rotation R by a about the unit vector n."""
+    along = Matrix([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+    sine = sqrt(along.dot(along) + TINY)
+    angle = atan2(sine, (turn.trace() - 1) / 2)
+    return along * intermediate(angle / sine), angle
 
 
 def position_of(joint: Joint) -> tuple[str, ...]:

@@ -21,7 +21,16 @@ from sympy import Expr, S
 from scvi_codegen.common.errors import closest
 from scvi_codegen.systems.formulas.rotations import matrix_of
 from scvi_codegen.systems.formulas.symbols import symbol
-from scvi_codegen.systems.multibody.trees.actuators import Actuator, Range, actuator_of
+from scvi_codegen.systems.multibody.trees.actuators import (
+    ACTED,
+    JOINTED,
+    Actuator,
+    Range,
+    actuator_of,
+    clamped,
+    motion_of,
+    motion_of_sites,
+)
 from scvi_codegen.systems.multibody.trees.closures import Closure, Coupling, at_reference
 from scvi_codegen.systems.multibody.trees.contacts import Touch
 from scvi_codegen.systems.multibody.trees.document import Element, Unread, checked_limits, root_of
@@ -76,7 +85,7 @@ ORIENTATIONS = TURN.split()
 NO_MASS, LIGHT = 1e-15, 1e-14
 """Bodies with less mass are without forces of a medium, and boxes have no smaller sums of moments of inertia; geoms
 with less than the second have no axes."""
-ACTED, GAINS = ("joint", "jointinparent", "tendon"), {"kp", "kv", "gainprm", "biasprm"}
+GAINS = {"kp", "kv", "gainprm", "biasprm"}
 AXES = dict(zip("xyz", np.eye(3), strict=True))
 Defaults = dict[str, dict[str, str]]
 """Attributes by kind of element."""
@@ -332,35 +341,46 @@ class _MujocoModel:
     def actuators(self, tendons: Sequence[Tendon]) -> Iterator[Actuator]:
         """Yield the actuators, if they are read; ``actuatorfrcrange`` is that of the only one of a joint or tendon."""
         elements = [*self.entries("actuator")] if "actuators" in self.parts and "actuation" not in self.disabled else []
-        parts = {("tendon", tendon.name): tendon for tendon in tendons}
         names = {name: "" for element in elements if (name := element.node.get("name"))}
-        for label, joint in self.singles.items() if elements else ():
-            own = Tendon(((joint.name, 1.0),), pull=self.bounds(self.joints[label], "actuatorfrc"))
-            parts |= {("joint", label): own, ("jointinparent", label): own}
         targets = [next(((x, element.text(x)) for x in ACTED if element.has(x)), ("", "")) for element in elements]
-        damped = {label for x, (_, label) in zip(elements, targets, strict=True) if x.number("dampratio", 0, 0)}
+        parts: dict[tuple[str, str], Joint | Tendon] = {("tendon", tendon.name): tendon for tendon in tendons}
+        moving = [link.joint for link in self.links if link.joint.kind != "fixed"]
+        parts |= {(key, joint.label): joint for key in JOINTED for joint in moving}
+        pulls = {("tendon", tendon.name): tendon.pull for tendon in tendons}
+        for key, label in ((key, label) for key in JOINTED for label in self.singles if elements):
+            pulls[key, label] = self.bounds(self.joints[label], "actuatorfrc")
+        rated = (label for x, (_, label) in zip(elements, targets, strict=True) if x.number("dampratio", 0, 0))
+        damped = self.singles.keys() & {*rated}
         inverses = {self.links[k].joint.label: m for k, m in mean_inverses(self.completed() if damped else (), damped)}
         for element, target in zip(elements, targets, strict=True):
-            if target not in parts:
-                element.refuse("acts on no hinge, slide or tendon of the model, which are the parts that are read")
-            if any(part.pull for part in parts.values()) and (target[0] == "tendon" or targets.count(target) > 1):
+            gear = np.append(element.vector("gear", (1,), range(1, 7)), np.zeros(5))[:6]
+            if target in parts:
+                motion = motion_of(self.links, parts[target], gear, target[0] == "jointinparent")
+            elif target[0] == "site":
+                ends = [self.place(element, key) for key in ("site", "refsite") if element.has(key)]
+                motion = motion_of_sites(self.links, ends, gear)
+            else:
+                element.refuse("acts on no joint, tendon or site of the model, which are the parts that are read")
+            if any(pulls.values()) and (target[0] not in JOINTED or targets.count(target) > 1):
                 element.refuse("is one of several on a part with actuatorfrcrange, which is read of single ones only")
-            inherited = self.inherited(element, target[1])
+            inherited = self.inherited(element, target)
             controls = None if "clampctrl" in self.disabled else self.bounds(element, "ctrl", inherited)
-            ranges = controls, self.bounds(element, "force")
-            actuator = actuator_of(self.links, element, parts[target], names, *ranges, inverses.get(target[1], 1.0))
+            ranges = controls, clamped(self.bounds(element, "force"), pulls.get(target), gear[0])
+            inverse = inverses.get(target[1]) if target[0] in JOINTED else None
+            actuator = actuator_of(self.links, element, motion, gear[0], names, *ranges, inverse)
             names[actuator[0]] = actuator[1]
             yield actuator
 
-    def inherited(self, element: Element, label: str) -> Sequence[float]:
+    def inherited(self, element: Element, target: tuple[str, str]) -> Sequence[float]:
         """Return the range of a control by ``inheritrange``, this multiple of that of the joint; (0, 0) without."""
         if not (share := element.number("inheritrange", 0, 0)):
             return 0.0, 0.0
-        low, high = (0.0, 0.0) if element.has("tendon") else self.joints[label].vector("range", (0, 0), (2,))
+        single = self.singles.get(label := target[1]) if target[0] in JOINTED else None
+        low, high = self.joints[label].vector("range", (0, 0), (2,)) if single else (0.0, 0.0)
         if low == high or element.has("ctrlrange"):
             element.refuse("has an inheritrange, which is read of joints with a range and without ctrlrange")
         middle, radius = (low + high) / 2, (high - low) / 2 * share
-        unit = _unit(element) if self.singles[label].kind == "hinge" else 1.0
+        unit = _unit(element) if single and single.kind == "hinge" else 1.0
         return (middle - radius) * unit, (middle + radius) * unit
 
     def keyframes(self, controls: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -407,7 +427,7 @@ class _MujocoModel:
 
     def place(self, element: Element, key: str) -> tuple[int, Pose]:
         """Return the link and the pose in it of the body or site that an attribute names."""
-        kind, name = key.rstrip("12"), element.text(key, "world" if key == "body2" else None)
+        kind, name = key.rstrip("12").removeprefix("ref"), element.text(key, "world" if key == "body2" else None)
         if (kind, name) not in self.places:
             names = [other for tag, other in self.places if tag == kind]
             element.refuse(f"names the {kind} '{name}', which does not exist{closest(name, names)}")
@@ -754,7 +774,7 @@ def _over(defaults: dict[str, str], attributes: dict[str, str]) -> dict[str, str
     """Return attributes over their defaults: one orientation replaces another, and numbers of a size the first ones."""
     turned = any(key in attributes for key in ORIENTATIONS)
     merged = {key: value for key, value in defaults.items() if not (turned and key in ORIENTATIONS)} | attributes
-    for key in {"size", "gainprm", "biasprm"} & {*defaults} & {*attributes}:
+    for key in {"size", "gear", "gainprm", "biasprm"} & {*defaults} & {*attributes}:
         sizes = attributes[key].split()
         merged[key] = " ".join(sizes + defaults[key].split()[len(sizes) :])
     return merged

@@ -134,10 +134,10 @@ MJCF = {
     "actuator": Kind(children=" ".join(f"{tag}=actuated*" for tag in ACTUATORS.split())),
     "actuated": Kind(
         "name class joint jointinparent tendon gear armature damping gaintype gainprm biastype biasprm kp kv "
-        "ctrllimited ctrlrange forcelimited forcerange dyntype timeconst delay dampratio inheritrange",
+        "ctrllimited ctrlrange forcelimited forcerange dyntype timeconst delay dampratio inheritrange site refsite",
         "actdim actearly actlimited actrange area bias body cogging controller cranklength cranksite diameter dynprm "
         "ffrange force fpmax fvmax gain group imax inductance input instance interp ki lengthrange lmax lmin lugre "
-        "motorconst nominal nsample plugin posrange range refsite resistance saturation scale site slewmax slidersite "
+        "motorconst nominal nsample plugin posrange range resistance saturation scale slewmax slidersite "
         "tausmooth thermal user velrange vmax",
         None,
         "config~",
