@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning
 from scvi_codegen.runs.driver.segments import input_of
 
 LIFT = """<mujoco><option gravity="0 0 0"/><default><default class="a"><position kp="9"/></default></default>
@@ -64,15 +64,24 @@ def test_actuators_of_one_joint_have_different_names(tmp_path):
     assert system.inputs == ("x_2", "x_3", "ctrl_x")
 
 
+def test_activations_are_inputs(tmp_path):
+    key = '</actuator><keyframe><key name="k" qpos="0" ctrl="3 4" act=".5 .25"/></keyframe><actuator>'
+    acting = '<position name="p" joint="x" timeconst=".1" ctrlrange="-1 1"/><intvelocity name="v" joint="x" {}/>'
+    file = written(tmp_path, LIFT, actuators=acting.format('actrange="-2 2"') + key)
+    laws = r"activations \(dyntype 'filterexact'\), which are the inputs, of p; .* 'integrator'\), .* of v$"
+    with pytest.warns(SystemDefinitionWarning, match=laws):
+        system = sc.LagrangianSystem.from_mjcf(file, actuators=True)
+    assert system.input_ranges == (("p", -1.0, 1.0), ("v", -2.0, 2.0))
+    assert system.keyframes["k"]["inputs"] == {"p": 0.5, "v": 0.25}
+
+
 REFUSED = {
     '<motor site="s"/>': "<motor> 'motor' names the site 's', which does not exist",
     '<position site="t" refsite="t" dampratio="1"/>': "a dampratio, which hinges and slides with gear, kp",
     '<position site="t" inheritrange="1"/>': "an inheritrange, which is read of joints with a range",
-    '<muscle joint="x"/>': "is not read as an actuator: general, motor, position, velocity are",
-    '<damper joint="x" kv="1"/>': "is not read as an actuator",
-    '<cylinder joint="x"/>': "is not read as an actuator",
-    '<general joint="x" dyntype="filter"/>': "dyntype='filter', which changes the motion and is not read",
-    '<position joint="x" timeconst=".1"/>': "timeconst='.1', which changes the motion",
+    '<muscle joint="x"/>': "is not read as an actuator: general, motor, position, velocity, intvelocity, damper",
+    '<general joint="x" dyntype="muscle"/>': "dyntype='muscle', which changes the motion and is not read",
+    '<general joint="x" delay="1"/>': "delay='1', which changes the motion",
     '<position joint="x" dampratio="1" kv="1"/>': "a dampratio, which hinges and slides with gear, kp",
     '<position joint="x" inheritrange="1"/>': "an inheritrange, which is read of joints with a range",
     '<velocity joint="x" dampratio="1"/>': "dampratio='1', which changes",

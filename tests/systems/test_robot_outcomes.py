@@ -91,6 +91,16 @@ ROWS: dict[str, tuple[dict[str, str], str | None]] = {
         },
         EQUAL,
     ),
+    "activations as inputs": (
+        {
+            "rest": WRENCHES.format('<intvelocity joint="x" kp="3" kv="2" actrange="-.1 .2"', "2")
+            + WRENCHES.format('<position joint="y" kp="3" timeconst=".1" ctrlrange="-.2 .1"', "2")
+            + WRENCHES.format('<cylinder joint="y" diameter="2" bias="1 2 3"', "3")
+            + WRENCHES.format('<general joint="x" dyntype="integrator" gainprm="2" actrange="-1 0"', "3")
+            + WRENCHES.format('<damper joint="x" kv="2" ctrlrange="0 1"', "2")
+        },
+        EQUAL,
+    ),
     "limits and dry friction": ({"a": A.format('range="-1 1" frictionloss=".1"')}, EQUAL),
     "ellipsoids in a medium": (
         FLUID | {"b": B + ELLIPSOIDS.format("sphere", ".1") + ELLIPSOIDS.format("ellipsoid", ".3 .1 .2")},

@@ -12,6 +12,7 @@ site, else 0. With the axes R of the site and K = hat(tau) R, which does not mov
 from collections.abc import Mapping, Sequence
 from itertools import chain
 
+import numpy as np
 from sympy import Add, Expr, Matrix, S
 
 from scvi_codegen.systems.formulas.intermediates import intermediate
@@ -44,10 +45,11 @@ Motion = tuple[Expr, Expr]
 """Length of an actuator and its rate, times the gear."""
 Range = tuple[float, float] | None
 Actuator = tuple[str, str, Range, Expr]  # name in the file, name and range of the input, Rayleigh function
+READ = "general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder"
 JOINTED = "joint", "jointinparent"
 ACTED = *JOINTED, "tendon", "site"
 NONE = (0.0, 0.0, 0.0)
-ABSENT = Kind(refused={"dyntype": "none", "timeconst": "0", "delay": "0"})
+ABSENT = Kind(refused={"dyntype": "none integrator filter filterexact", "delay": "0"})
 OF_SERVOS = Kind(refused={"dampratio": "0", "inheritrange": "0"})
 
 
@@ -137,9 +139,19 @@ def clamped(inner: Range, outer: Range, factor: float) -> Range:
     return (low, high) if inner is None else (min(max(inner[0], low), high), min(max(inner[1], low), high))
 
 
+def activation_of(element: Element) -> str:
+    """Return the law of the activation a, the state of an actuator that acts in place of its control u, or ``none``.
+
+    It is a' = u (``integrator``) or a' = (u - a)/timeconst (``filter``, ``filterexact``).
+    """
+    element.check_neutral(ABSENT)
+    filtered = element.tag == "position" and element.vector("timeconst", (0,), (1, 2)).any()
+    implied = {"intvelocity": "integrator", "cylinder": "filter", "general": element.text("dyntype", "none")}
+    return "filterexact" if filtered else implied.get(element.tag, "none")
+
+
 def _coefficients(element: Element) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return the coefficients of 1, length and velocity of gain and bias."""
-    element.check_neutral(ABSENT)
     if element.tag != "position":
         element.check_neutral(OF_SERVOS)
     if element.tag == "motor":
@@ -148,13 +160,20 @@ def _coefficients(element: Element) -> tuple[tuple[float, ...], tuple[float, ...
         element.refuse(f"has gains of <{element.text('kind')}> by its class: write them out")
     keys = (("gainprm", (1.0, *NONE)), ("biasprm", NONE))
     gain, bias = ((*map(float, element.vector(key, x, range(1, 11))), *NONE)[:3] for key, x in keys)
-    if element.tag == "position":
+    if element.tag in ("position", "intvelocity"):
         stiffness = element.number("kp", gain[0])
         return (stiffness, 0.0, 0.0), (0.0, -stiffness, -element.number("kv", 0))
     if element.tag == "velocity":
         return (element.number("kv", gain[0]), 0.0, 0.0), (0.0, 0.0, -element.number("kv", gain[0]))
+    if element.tag == "damper":
+        return (0.0, 0.0, -element.number("kv", 0)), NONE
+    if element.tag == "cylinder":
+        area = (
+            np.pi / 4 * element.number("diameter") ** 2 if element.has("diameter") else element.number("area", gain[0])
+        )
+        return (area, 0.0, 0.0), tuple(map(float, element.vector("bias", bias)))
     if element.tag != "general":
-        element.refuse("is not read as an actuator: general, motor, position, velocity are")
+        element.refuse(f"is not read as an actuator: {', '.join(READ)} are; remove it, or actuators=False")
     gain = gain if element.choice("gaintype", "fixed", "affine") == "affine" else (gain[0], 0.0, 0.0)
     bias = bias if element.choice("biastype", "none", "affine") == "affine" else NONE
     if bias[2] > 0 and bias[1] == -gain[0]:

@@ -26,6 +26,7 @@ from scvi_codegen.systems.multibody.trees.actuators import (
     JOINTED,
     Actuator,
     Range,
+    activation_of,
     actuator_of,
     clamped,
     motion_of,
@@ -146,6 +147,8 @@ class _MujocoModel:
         self.labels = set[str | None]()
         self.joints = dict[str, Element]()
         self.responses = dict[str, Vector]()
+        self.activated = set[str]()
+        """Inputs that are activations of actuators."""
         self.carriers, self.parents = {-1: -1}, dict[int, int]()
         """Of each body, by its link: the moving body that it is fixed to, and the one that this is connected with."""
         self.geoms: list[Geom] = []
@@ -364,11 +367,16 @@ class _MujocoModel:
             if any(pulls.values()) and (target[0] not in JOINTED or targets.count(target) > 1):
                 element.refuse("is one of several on a part with actuatorfrcrange, which is read of single ones only")
             inherited = self.inherited(element, target)
-            controls = None if "clampctrl" in self.disabled else self.bounds(element, "ctrl", inherited)
+            law, clamping = activation_of(element), "clampctrl" not in self.disabled
+            controls = self.bounds(element, "ctrl", inherited) if clamping and law != "integrator" else None
+            controls = clamped(controls, None if law == "none" else self.bounds(element, "act"), 1.0)
             ranges = controls, clamped(self.bounds(element, "force"), pulls.get(target), gear[0])
             inverse = inverses.get(target[1]) if target[0] in JOINTED else None
             actuator = actuator_of(self.links, element, motion, gear[0], names, *ranges, inverse)
             names[actuator[0]] = actuator[1]
+            if law != "none":
+                self.activated.add(actuator[1])
+                self.unread.add(f"the law of activations (dyntype '{law}'), which are the inputs, of", actuator[0])
             yield actuator
 
     def inherited(self, element: Element, target: tuple[str, str]) -> Sequence[float]:
@@ -393,8 +401,11 @@ class _MujocoModel:
                 key.refuse("is the second keyframe of this name: rename one")
             names.add(name)
             values: dict[str, Any] = {x: key.vector(x, (), [size]).tolist() for x, size in lengths.items()}
-            if controls:
-                values |= zip(controls, key.vector("ctrl", (0,) * len(controls), [len(controls)]).tolist(), strict=True)
+            states = [name for name in controls if name in self.activated]
+            for inputs, attribute in ((controls, "ctrl"), (states, "act")):
+                if inputs:
+                    given = key.vector(attribute, (0,) * len(inputs), [len(inputs)])
+                    values |= zip(inputs, given.tolist(), strict=True)
             yield name, values
             for joint, place in zip((link.joint for link in self.links), np.cumsum([0, *sizes]), strict=False):
                 if (

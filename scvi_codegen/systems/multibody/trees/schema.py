@@ -134,8 +134,9 @@ MJCF = {
     "actuator": Kind(children=" ".join(f"{tag}=actuated*" for tag in ACTUATORS.split())),
     "actuated": Kind(
         "name class joint jointinparent tendon gear armature damping gaintype gainprm biastype biasprm kp kv "
-        "ctrllimited ctrlrange forcelimited forcerange dyntype timeconst delay dampratio inheritrange site refsite",
-        "actdim actearly actlimited actrange area bias body cogging controller cranklength cranksite diameter dynprm "
+        "ctrllimited ctrlrange forcelimited forcerange dyntype timeconst delay dampratio inheritrange site refsite "
+        "actlimited actrange area bias diameter",
+        "actdim actearly body cogging controller cranklength cranksite dynprm "
         "ffrange force fpmax fvmax gain group imax inductance input instance interp ki lengthrange lmax lmin lugre "
         "motorconst nominal nsample plugin posrange range resistance saturation scale slewmax slidersite "
         "tausmooth thermal user velrange vmax",
@@ -150,7 +151,7 @@ MJCF = {
         defaults="pair",
     ),
     "keyframe": Kind(children="key*"),
-    "key": Kind("name qpos qvel ctrl", "act mpos mquat plastic time"),
+    "key": Kind("name qpos qvel ctrl act", "mpos mquat plastic time"),
 }
 """Kinds of elements of MJCF, by tag or by the name that their parent calls them."""
 
