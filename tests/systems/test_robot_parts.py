@@ -2,6 +2,7 @@
 
 import re
 
+import numpy as np
 import pytest
 from random_robots import errors_of_motion
 
@@ -91,6 +92,26 @@ def test_meshes_are_read_from_files(tmp_path):
         text = MESH.format(f'file="/away/{path.name}" scale=".1 .1 .1" class="main"', '<geom mesh="m" type="mesh"/>')
         file.write_text(text.replace('name="m" ', "").replace("<asset>", f"{settings}<asset>"))
         assert links_of_mjcf(file)[1][-1].inertia.mass == pytest.approx(6.0)
+
+
+def test_meshes_are_read_from_files_of_mujoco(tmp_path):
+    corners, faces = (np.array([*map(float, text.split())], "<f4") for text in (BOX, FACES))
+    counts = np.array([8, 8, 8, 12], "<i4")
+    data = b"".join(part.tobytes() for part in (counts, corners, corners, corners[:16], faces.astype("<i4")))
+    geom, file, moments = '<geom type="mesh" mesh="m" density="7"/>', tmp_path / "mesh.xml", []
+    for mesh in ('file="m.msh"', f'vertex="{BOX}" face="{FACES}"'):
+        (tmp_path / "m.msh").write_bytes(data)
+        file.write_text(MESH.format(f'{mesh} inertia="exact"', geom))
+        moments.append(links_of_mjcf(file)[1][-1].inertia.matrix.tolist())
+    assert moments[0] == moments[1]
+    file.write_text(MESH.format('file="m.msh" inertia="exact"', geom))
+    for wrong in (data[:10], data[:-4], data + b"0", b"\xff" * 16 + data[16:]):
+        (tmp_path / "m.msh").write_bytes(wrong)
+        with pytest.raises(SystemDefinitionError, match="whose first numbers are not the counts of MSH files"):
+            links_of_mjcf(file)
+    (tmp_path / "m.msh").write_bytes(data)
+    pytest.importorskip("mujoco", reason="pip install mujoco")
+    assert max(errors_of_motion(sc.LagrangianSystem.from_mjcf(file), file)) < 1e-7
 
 
 MESHES = {

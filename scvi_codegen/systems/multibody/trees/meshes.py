@@ -9,6 +9,7 @@ takes all volumes as positive, first from the centroid of the surface, whence th
 
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 from xml.etree.ElementTree import Element as Node
 
 import numpy as np
@@ -82,12 +83,29 @@ def _read(mesh: Element) -> tuple[Vector, NDArray[np.intp]]:
         file, settings = Path(mesh.text("file")), mesh.settings
         file = Path(file.name) if settings.choice("strippath", "false", "true") == "true" else file
         file = mesh.path(str(settings.text("meshdir", settings.text("assetdir", "")) / file))
-        data, trimesh = BytesIO(bytes_of(file)), imported("trimesh", "meshes")
-        try:
-            read = trimesh.load_scene(data, file_type=file.suffix[1:].lower(), process=False).to_geometry()
-        except Exception as error:  # noqa: BLE001 - of the readers of many formats
-            mesh.refuse(f"is in the file {file}, which cannot be read as STL, OBJ or another known format: {error}")
-        corners, faces = np.asarray(read.vertices).ravel(), np.ravel(getattr(read, "faces", ()))  # none: a point cloud
+        corners, faces = (_of_msh if file.suffix.lower() == ".msh" else _of_known_format)(mesh, file)
     if len(corners) < 12 or len(corners) % 3 or len(faces) % 3 or not set(faces) <= {*range(len(corners) // 3)}:
         mesh.refuse("needs at least 4 vertices, and faces of 3 of their numbers each")
     return corners.astype(np.float32).astype(float).reshape(-1, 3), faces.astype(int).reshape(-1, 3)
+
+
+def _of_known_format(mesh: Element, file: Path) -> tuple[Vector, NDArray[Any]]:
+    data, trimesh = BytesIO(bytes_of(file)), imported("trimesh", "meshes")
+    try:
+        read = trimesh.load_scene(data, file_type=file.suffix[1:].lower(), process=False).to_geometry()
+    except Exception as error:  # noqa: BLE001 - of the readers of many formats
+        mesh.refuse(f"is in the file {file}, which cannot be read as STL, OBJ or another known format: {error}")
+    return np.asarray(read.vertices).ravel(), np.ravel(getattr(read, "faces", ()))  # none: a point cloud
+
+
+def _of_msh(mesh: Element, file: Path) -> tuple[Vector, NDArray[Any]]:
+    """Return the numbers of MuJoCo's format: four counts, vertices, normals, texture coordinates, triangles.
+
+    https://mujoco.readthedocs.io/en/stable/XMLreference.html#asset-mesh
+    """
+    data = bytes_of(file)
+    counts = np.frombuffer(data[:16].ljust(16, b"\xff"), "<i4").astype(int)
+    ends = 16 + 4 * np.cumsum(counts * (3, 3, 2, 3))
+    if counts.min() < 0 or ends[3] != len(data):
+        mesh.refuse(f"is in the file {file} of {len(data)} bytes, whose first numbers are not the counts of MSH files")
+    return np.frombuffer(data[16 : ends[0]], "<f4"), np.frombuffer(data[ends[2] :], "<i4")
