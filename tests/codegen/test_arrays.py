@@ -135,6 +135,25 @@ def test_explicit_steps_on_lattices_add_the_value_of_another_row_at_once() -> No
     assert len(at_once.findall(rendered("calls", "stoermer-verlet").code)) == 1
 
 
+@pytest.mark.parametrize(
+    ("method", "coupling", "targets"),
+    [
+        ("stoermer-verlet", "(u[i+1, j] - u[i, j])**2", ["u[i, j]"]),
+        ("stoermer-verlet", "cos(u[i+1, j] - u[i, j])", ["u[i, j]", "u[i+1, j]"]),  # is not called twice
+        ("stoermer-verlet", "(u[i+1, j] - u[i-1, j])**2", ["u[i+1, j]", "u[i-1, j]"]),  # which reach no farther
+        ("stoermer-verlet", "(u[i, j+1] - u[i, j])**2", ["u[i, j+1]", "u[i, j]"]),  # are in one row
+        ("svi:2", "(u[i+1, j] - u[i, j])**2", ["u[i+1, j]", "u[i, j]"]),
+    ],
+)
+def test_explicit_steps_complete_cheap_forces_of_periodic_rows_at_once(
+    method: str, coupling: str, targets: list[str]
+) -> None:
+    lagrangian = f"sum(i in N, j in M, u_dot[i, j]**2/2) - sum(i in N periodic, j in M periodic, {coupling})"
+    system = either_system(name="plane", coordinates=["u[N, M]"], lagrangian=lagrangian)
+    (force,) = lower_arrays(system, as_method(method), prefix="arrays").loops.forces
+    assert sorted(map(str, force.writes)) == sorted(targets)
+
+
 @pytest.mark.parametrize(("mass", "is_equal"), [("g", 1), ("m[i]", 0)])
 def test_explicit_steps_store_opposite_forces_once_and_know_equal_masses(mass: str, is_equal: int) -> None:
     lagrangian = f"sum(i in N, {mass}*q_dot[i]**2/2) - sum(i in N periodic, (q[i+1] - q[i])**4)"

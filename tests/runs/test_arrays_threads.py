@@ -241,6 +241,30 @@ def test_coordinates_are_continued_behind_their_last_force(sums: str, boundary: 
             np.testing.assert_allclose(run.q, leapfrog(q, v, 0.02, 50, forces), rtol=0, atol=4e-14)
 
 
+@pytest.mark.tiers(0, 1)
+@pytest.mark.parametrize("along", ["M periodic", "0..M-2"])
+@pytest.mark.parametrize("sums", ["compensated", "plain"])
+def test_forces_on_a_torus_and_on_a_cylinder_are_those_of_numpy(sums: str, along: str) -> None:
+    """Springs with strengths, cubic ones along rows: from one element to several blocks, positions changed in place."""
+    text = f"sum(i in N periodic, j in {along}, s[i]*(u[i+1, j] - u[i, j])**2/2 + (u[i, j+1] - u[i, j])**4/4)"
+    kinetic = "sum(i in N, j in M, u_dot[i, j]**2/2 + cos(u[i, j]))"
+    system = lagrange("torus", ["u[N, M]"], f"{kinetic} - {text}", parameters={"s[N]": 1})
+    stepper = sc.compile_stepper(system, "stoermer-verlet", sums=sums)
+    for shape in ((1, 1), (1, 4), (2, 1), (2, 2), (3, 7), (21, 33), (70, 90)):
+        q, v = np.random.default_rng(shape[0]).normal(size=(2, *shape))
+        s, bound = np.arange(1.0, shape[0] + 1)[:, None] / shape[0], np.full(shape[1], 1.0)
+        bound[-1] = along == "M periodic"
+
+        def forces(u: Any, s: Any = s, bound: Any = bound) -> Any:
+            across, pull = s * bound * (np.roll(u, -1, axis=0) - u), bound * (np.roll(u, -1, axis=1) - u) ** 3
+            return across - np.roll(across, 1, axis=0) + pull - np.roll(pull, 1, axis=1) - np.sin(u)
+
+        for threads in (1, 2):
+            run = stepper.start(q, velocity=v, h=0.02, threads=threads, parameters={"s": s[:, 0]})
+            run.advance(50)
+            np.testing.assert_allclose(np.reshape(run.q, shape), leapfrog(q, v, 0.02, 50, forces), rtol=0, atol=4e-14)
+
+
 @pytest.mark.rotated
 def test_hamiltonians_and_velocity_dependent_forces_with_threads() -> None:
     text = "sum(i in N periodic, ((q[i+1] - q[i])**2 + (p[i+1] - p[i])**2)/2 - (q[i]**2 + p[i]**2)**2/4)"

@@ -12,7 +12,7 @@ from scvi_codegen.codegen.ir.equations import ConstrainedSteps
 from scvi_codegen.codegen.ir.kernel import Constant, Load, RolledKernel, exact_number
 from scvi_codegen.codegen.ir.program import Program, RolledTerms
 from scvi_codegen.codegen.lowering.stage_groups import rolled_kernel
-from scvi_codegen.systems.arrays.system import ArraySystem, entries_of, force_of
+from scvi_codegen.systems.arrays.system import ArraySystem, entries_of, force_of, gathered
 from scvi_codegen.systems.formulas.array_statements import ArrayForce
 from scvi_codegen.systems.formulas.arrays import ArrayTerm, term_of
 from scvi_codegen.systems.formulas.expressions import gradient
@@ -27,8 +27,16 @@ LONG_FORMULA = 1000
 """Nodes of the expressions from which on a comment does not contain a formula."""
 
 
-def rolled_terms(system: ArraySystem, constrained: ConstrainedSteps | None, *, newton: bool) -> RolledTerms:
-    """Return the kernels of the terms of a system of arrays; ``newton``: with the Jacobian of the forces."""
+def rolled_terms(
+    system: ArraySystem, constrained: ConstrainedSteps | None, *, newton: bool, explicit: bool
+) -> RolledTerms:
+    """Return the kernels of the terms of a system of arrays.
+
+    Args:
+        system, constrained: the system; its constrained steps, if any.
+        newton: with the Jacobian of the forces.
+        explicit: forces at one point at a time, of which those complete at once are preferred.
+    """
     potentials = [part for term in system.potentials for part in _parts(system, term)]
     arguments = (*system.state, *system.velocities)
     products, diagonals = _jacobian(system, potentials) if newton else ((), ())
@@ -43,7 +51,7 @@ def rolled_terms(system: ArraySystem, constrained: ConstrainedSteps | None, *, n
         frictions=frictions,
         heats=heats,
         forces=(
-            *(_potential(system, *part, number) for number, part in enumerate(potentials)),
+            *(_potential(system, *part, number, explicit=explicit) for number, part in enumerate(potentials)),
             *(
                 _added(system, f"force_{number}", force, arguments, f"forces {_shown(force)}", "Forces.")
                 for number, force in enumerate(system.applied_forces, len(potentials))
@@ -105,14 +113,28 @@ def _added(
     return rolled_kernel(system, name, formulas, force, u, targets=targets, text=text, purpose=purpose)
 
 
-def _potential(system: ArraySystem, term: ArrayTerm, axis: int | None, number: int) -> RolledKernel:
+def _potential(system: ArraySystem, term: ArrayTerm, axis: int | None, number: int, *, explicit: bool) -> RolledKernel:
     """Return the derivatives of a term by coordinates and momenta, and the term; ``axis``: of a circulant matrix."""
     force = _signed(system, force_of(term, system.state))
     purpose = "Derivatives with respect to its coordinates."
-    rolled = _added(system, f"force_{number}", force, system.state, _shown(term), purpose)
+    forces = dict.fromkeys((force, gathered(force) if explicit else force))
+    kernels = [_added(system, f"force_{number}", how, system.state, _shown(term), purpose) for how in forces]
+    rolled = min(kernels, key=_operations)
     u = entries_of(term, system.state)
     scalar = rolled_kernel(system, f"term_{number}", [term.formula], term, u, text="", purpose="The term.")
     return replace(rolled, scalar=scalar.kernel, circulant=axis)
+
+
+PASS, CALL = 4, 16
+"""Operations that take about as long as one more pass over the forces of a row, and as a division or a call."""
+
+
+def _operations(rolled: RolledKernel) -> int:
+    """Return the time of a term in operations of an element, with the passes over the rows that it adds to."""
+    inner, counts = {loop.index for loop in rolled.loops[-1:]}, rolled.kernel.operation_counts()
+    rows = {(target.array, *(place for place in target.places if place.index not in inner)) for target in rolled.writes}
+    calls = sum(count for name, count in counts.items() if name not in ("+", "-", "*", "neg"))
+    return sum(counts.values()) + (CALL - 1) * calls + PASS * len(rows)
 
 
 def _parts(system: ArraySystem, term: ArrayTerm) -> Iterator[tuple[ArrayTerm, int | None]]:

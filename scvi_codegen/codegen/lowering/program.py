@@ -238,7 +238,7 @@ def lower_arrays(
     fixed_point = iteration_of(of_tables, stages, velocities=velocities) if iterated else None
     if fixed_point:
         fixed_point = replace(fixed_point, constant_mass=None)  # each coordinate has its own
-    loops = rolled_terms(system, constrained, newton=solver == "newton")
+    loops = rolled_terms(system, constrained, newton=solver == "newton", explicit=not iterated)
     if loops.products and fixed_point and fixed_point.matrix:
         loops = replace(loops, shifts=shift_tables(fixed_point.matrix, fixed_point.lanes))
     check_solver_of_arrays(system, method, solver, splitting or constrained or fixed_point, loops)

@@ -60,6 +60,46 @@ def force_of(term: ArrayTerm, state: tuple[Array, ...]) -> ArrayForce:
     return ArrayForce(loops=term.loops, slots=term.slots, targets=targets)
 
 
+def gathered(force: ArrayForce) -> ArrayForce:
+    """Return forces with one target instead of targets that differ in periodic indices, so that no sum is continued.
+
+    The terms V(x_i, x_(i+1)) of all i act on x_i by V_1(x_i, x_(i+1)) + V_2(x_(i-1), x_i). ``force`` is returned if
+    distances from the index become larger, or are no numbers.
+    """
+    accesses, periodic = dict(force.slots), {loop.index for loop in force.loops if loop.periodic}
+    if any(access.sums or any(place.table or place.minus for place in access.places) for access in accesses.values()):
+        return force
+    slots, targets = dict[Symbol, Access](), dict[Access, Expr]()
+    for target, formula in force.targets:
+        by = {place.index: -place.base.number for place in target.places if place.index in periodic}
+        moved = {slot: _shifted(accesses[slot], by) for slot in formula.free_symbols & {*accesses}}
+        renamed = {slot: symbol(str(access)) for slot, access in moved.items()}
+        slots |= {renamed[slot]: access for slot, access in moved.items()}
+        here = _shifted(target, by)
+        targets[here] = targets.get(here, S.Zero) + _with_one_number(formula.xreplace(renamed))
+    if _farthest(slots.values()) > _farthest(accesses.values()):
+        return force
+    return replace(force, slots=tuple(sorted(slots.items(), key=str)), targets=tuple(targets.items()))
+
+
+def _shifted(access: Access, by: Mapping[str, int]) -> Access:
+    """Return an entry at other values of some indices."""
+    places = (replace(place, base=place.base + by.get(place.index, 0)) for place in access.places)
+    return replace(access, places=tuple(places))
+
+
+def _farthest(accesses: Iterable[Access]) -> int:
+    """Return the largest distance of entries from their indices."""
+    return max((abs(place.base.number) for access in accesses for place in access.places if place.index), default=0)
+
+
+def _with_one_number(formula: Expr) -> Expr:
+    """Return a sum in whose terms the common numbers of all factors are one: -w (2 x - 2 y)/2 is -w (x - y)."""
+    products = (sympy.Mul.make_args(term) for term in Add.make_args(formula))
+    primitive = (zip(*(factor.primitive() for factor in factors), strict=True) for factors in products)
+    return Add(*(sympy.Mul(*numbers, *factors) for numbers, factors in primitive))
+
+
 def entries_of(term: ArrayTerm | ArrayForce, arrays: Collection[Array]) -> tuple[tuple[Symbol, Access], ...]:
     """Return the accesses of certain arrays in a term, with their symbols."""
     return tuple(pair for pair in term.slots if pair[1].array in arrays)

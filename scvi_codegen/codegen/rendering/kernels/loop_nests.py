@@ -245,7 +245,9 @@ class Nest:
         first, end = self._span(loop)
         if not self.chunked and not self._offsets(loop):
             return _loop(loop, first, end, inner)
-        lines = [*self._part_passed_over(loop), f"lanes values[{len(self.stored)}][CHUNK];"] if self.chunked else []
+        lines = self._part_passed_over(loop) if self.chunked else []
+        if self.chunked and len(self.stored) > self.adds_at_once:
+            lines = [*lines, f"lanes values[{len(self.stored)}][CHUNK];"]
         lines += _loop(loop, "begin", "end", inner)
         if loop.near:
             lines += _loop(loop, "begin", "end", [line for of_target in behind for line in of_target])
@@ -296,7 +298,7 @@ class Nest:
         """Whether the first value is added where it is computed: only its target is in that row, at the same index."""
         loop, target, numbers = self.rolled.loops[-1], self.rolled.writes[0], [number for _, number in self.signed]
         rows = [] if loop.near or self.sharing is not Sharing.IN_TURN else self._targets_by_rows(loop)
-        alone = len(rows) > 1 and len(rows[0]) == 1 and numbers.count(numbers[0]) == 1
+        alone = rows != [] and not self.fused and len(rows[0]) == 1 and numbers.count(numbers[0]) == 1
         return alone and not target.sums and target.places[-1:] == (Place(index=loop.index),)
 
     def _targets_by_rows(self, loop: Loop) -> list[list[int]]:
