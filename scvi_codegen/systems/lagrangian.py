@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from scvi_codegen.common.atomic import naming_folders
 from scvi_codegen.common.collection import without_collection
-from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, warn
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import FORMULAS, MAPPED, NAMES, NUMBERS, TEXTS, ArgumentType, checks_arguments
 from scvi_codegen.systems.contact import Impacts
@@ -455,6 +455,7 @@ class LagrangianSystem(MechanicalSystem):
         from scvi_codegen.systems.multibody.trees.closures import conditions_of
         from scvi_codegen.systems.multibody.trees.contacts import contacts_of
         from scvi_codegen.systems.multibody.trees.energies import exact_number, system_of_tree
+        from scvi_codegen.systems.multibody.trees.keyframes import outside_limits
         from scvi_codegen.systems.multibody.trees.tendons import contacts_of_tendons, energies_of
 
         try:
@@ -472,6 +473,9 @@ class LagrangianSystem(MechanicalSystem):
             system: LagrangianSystem = system_of_tree(cls, name, links, gravity, actuated, *added, keys=keys)
         except SystemDefinitionError as error:
             raise SystemDefinitionError(f"{path}: {error}") from error
+        if beyond := outside_limits(links, system.keyframes):
+            remedy = "pass other positions, correct ref, qpos or range, or limits='ignore'"
+            warn(f"{path}: no run begins outside limits, as {beyond}: {remedy}", SystemDefinitionWarning)
         return system
 
     @classmethod

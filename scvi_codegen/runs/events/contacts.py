@@ -14,8 +14,8 @@ from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.systems.contacts.rows import ContactMode
 
 REFUSALS = {
-    1: "the run starts at t = {t:.17g} with the gap of contact {k} at {value:.6g}, which must not be negative: correct "
-    "the initial positions, or the sign of the gap",
+    1: "the run starts at t = {t:.17g} with the gap of contact {k} at {value:.6g}, which must not be negative: "
+    "correct the initial positions, the range of the joint, or the sign of the gap",
     3: "no impulses satisfy the law of impact with friction at t = {t:.17g}, contact {k}: reduce its friction",
     5: "contact {k} has an impossible coefficient at t = {t:.17g}, {value:.6g}: friction must not be negative, nor "
     "static friction at rest less than that of sliding; restitution must be 0 to 1",

@@ -327,7 +327,8 @@ class _MujocoModel:
 
     def read_limits(self, element: Element, part: str, name: str) -> tuple[tuple[float, float] | None, float]:
         """Return the range and the dry friction of a joint or tendon, in the units of the file, that are in force."""
-        limits = None if self.disabled & {"limit", "constraint"} else self.bounds(element)
+        unlimited = self.disabled & {"limit", "constraint"} or element.text("type", "") == "free"
+        limits = None if unlimited else self.bounds(element)
         friction = element.number("frictionloss", 0, 0) * (not self.disabled & {"frictionloss", "constraint"})
         present = {"limits": limits is not None, "friction": friction > 0}
         for what in (what for what in present if present[what] and what not in self.parts):
@@ -392,7 +393,7 @@ class _MujocoModel:
         return (middle - radius) * unit, (middle + radius) * unit
 
     def keyframes(self, controls: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Yield names and numbers of keyframes; positions outside limits are listed."""
+        """Yield names and numbers of keyframes."""
         sizes = [{"free": 7, "ball": 4, "fixed": 0}.get(link.joint.kind, 1) for link in self.links]
         lengths = {"qpos": sum(sizes), "qvel": sum(size - (size > 1) for size in sizes)}
         names = set[str]()
@@ -407,14 +408,6 @@ class _MujocoModel:
                     given = key.vector(attribute, (0,) * len(inputs), [len(inputs)])
                     values |= zip(inputs, given.tolist(), strict=True)
             yield name, values
-            for joint, place in zip((link.joint for link in self.links), np.cumsum([0, *sizes]), strict=False):
-                if (
-                    joint.limits
-                    and joint.kind in SINGLE
-                    and key.has("qpos")
-                    and not joint.limits[0] <= values["qpos"][place] <= joint.limits[1]
-                ):
-                    self.unread.add(f"the keyframe '{key.name}' within the limits of joints", joint.label)
 
     def equalities(self) -> Iterator[Element]:
         """Yield the equalities that are active."""
