@@ -98,6 +98,8 @@ ROWS: dict[str, tuple[dict[str, str], str | None]] = {
             + WRENCHES.format('<cylinder joint="y" diameter="2" bias="1 2 3"', "3")
             + WRENCHES.format('<general joint="x" dyntype="integrator" gainprm="2" actrange="-1 0"', "3")
             + WRENCHES.format('<damper joint="x" kv="2" ctrlrange="0 1"', "2")
+            + WRENCHES.format('<motor joint="y" group="3"', "2"),
+            "option": 'actuatorgroupdisable="1 3"',
         },
         EQUAL,
     ),

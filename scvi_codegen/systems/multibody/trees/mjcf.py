@@ -140,6 +140,8 @@ class _MujocoModel:
         self.disabled = {key for key in flags.node.attrib if flags.choice(key, "enable", "disable") == "disable"}
         self.gravity = option.vector("gravity", (0, 0, -9.81)) * ("gravity" not in self.disabled)
         passive = not {"spring", "damper"} <= self.disabled
+        self.idle = option.vector("actuatorgroupdisable", (), range(32))
+        """Groups of actuators without forces."""
         self.medium = [option.number(key, 0, 0) * passive for key in ("density", "viscosity")]
         self.links: list[Link] = []
         self.compensating: list[Element] = []
@@ -375,6 +377,8 @@ class _MujocoModel:
             inverse = inverses.get(target[1]) if target[0] in JOINTED else None
             actuator = actuator_of(self.links, element, motion, gear[0], names, *ranges, inverse)
             names[actuator[0]] = actuator[1]
+            if element.number("group", 0) in self.idle:
+                actuator = *actuator[:-1], S.Zero
             if law != "none":
                 self.activated.add(actuator[1])
                 self.unread.add(f"the law of activations (dyntype '{law}'), which are the inputs, of", actuator[0])

@@ -68,8 +68,8 @@ MJCF = {
         "lengthrange~",
     ),
     "option": Kind(
-        "gravity density viscosity",
-        "actuatorgroupdisable apirate ccd_iterations ccd_tolerance collision cone impratio integrator iterations "
+        "gravity density viscosity actuatorgroupdisable",
+        "apirate ccd_iterations ccd_tolerance collision cone impratio integrator iterations "
         "jacobian ls_iterations ls_tolerance magnetic mpr_iterations mpr_tolerance noslip_iterations noslip_tolerance "
         "o_friction o_margin o_solimp o_solref sdf_initpoints sdf_iterations sleep_tolerance solver timestep tolerance",
         {"wind": "0"},
@@ -135,9 +135,9 @@ MJCF = {
     "actuated": Kind(
         "name class joint jointinparent tendon gear armature damping gaintype gainprm biastype biasprm kp kv "
         "ctrllimited ctrlrange forcelimited forcerange dyntype timeconst delay dampratio inheritrange site refsite "
-        "actlimited actrange area bias diameter",
+        "actlimited actrange area bias diameter group",
         "actdim actearly body cogging controller cranklength cranksite dynprm "
-        "ffrange force fpmax fvmax gain group imax inductance input instance interp ki lengthrange lmax lmin lugre "
+        "ffrange force fpmax fvmax gain imax inductance input instance interp ki lengthrange lmax lmin lugre "
         "motorconst nominal nsample plugin posrange range resistance saturation scale slewmax slidersite "
         "tausmooth thermal user velrange vmax",
         None,
