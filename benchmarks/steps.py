@@ -31,6 +31,8 @@ Start = tuple[Array, Array]
 """Initial positions and velocities."""
 STEP_SECONDS = 0.1
 """Shortest time of a timed interval."""
+TURNS_SECONDS = 4.0
+"""Shortest time of contenders in turns: a shared processor is slower for seconds at a time."""
 RINGS, QUICK_RINGS = (1_000, 10_000, 100_000, 1_000_000), (1_000,)
 SCALED = {"svi:4": 0.1, "svi:8": 0.1, "stoermer-verlet": 0.02}
 """Step sizes of a ring by method."""
@@ -139,7 +141,8 @@ def run_by_hand(plan: Plan, report_activity: ReportActivity) -> ResultTable:
                 run = compile_stepper(chosen.system, method, sums=sums).start(q, velocity=velocity, h=h)
                 timed[sums] = functools.partial(run.advance, steps)
             times = dict.fromkeys(timed, float("inf"))
-            for _ in range(5 * plan.rounds):
+            end = time.monotonic() + (STEP_SECONDS if plan.quick else TURNS_SECONDS)
+            while time.monotonic() < end:
                 for name, work in timed.items():
                     began = time.process_time()
                     work()
