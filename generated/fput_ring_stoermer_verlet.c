@@ -170,17 +170,17 @@ static void add_force_0(const problem *arrays, const lanes *X, times t, double b
       u[0] = X[start_q + index_i + shift_i_plus_1];
       u[1] = X[start_q + index_i];
       force_0(u, t, parameters, value);
-      values[0][index_i - begin] = by * value[1];
+      values[0][index_i - begin] = value[1];
     }
     const section part_0 = {begin + shift_i_plus_1, end + shift_i_plus_1};
     const section part_1 = {begin, end};
     const section common_0 = overlap(part_0, part_1);
     lanes *restrict row_0 = F + start_q + 0;
-    add_ends(row_0, values[0], -1.0, part_0, common_0);
-    add_ends(row_0, values[0], +1.0, part_1, common_0);
+    add_ends(row_0, values[0], -by, part_0, common_0);
+    add_ends(row_0, values[0], by, part_1, common_0);
     const addend added[] = {{values[0] + (common_0.first - part_0.first), -1.0}, {values[0] +
         (common_0.first - part_1.first), +1.0}};
-    complete_sums(of, row_0, common_0, added, 2);
+    complete_sums(of, by, row_0, common_0, added, 2);
   }
 }
 

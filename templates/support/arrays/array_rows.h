@@ -62,9 +62,9 @@ static section block_of(const sweep *of, long long block)
   return rows;
 }
 
-/* Adds the last values to consecutive coordinates, and continues those of this block that are behind. */
-static inline __attribute__((always_inline)) void complete_sums(sweep *of, double *F, section here, const addend *added,
-    int addends)
+/* Adds `by` times the last values to consecutive coordinates, and continues those of this block that are behind. */
+static inline __attribute__((always_inline)) void complete_sums(sweep *of, double by, double *F, section here,
+    const addend *added, int addends)
 {
   double *const row = F + here.first;
   section inside = {here.end, here.end};
@@ -75,9 +75,9 @@ static inline __attribute__((always_inline)) void complete_sums(sweep *of, doubl
     inside.end = between(inside.first, inside.end / ALIGNED_NUMBERS * ALIGNED_NUMBERS, inside.end);
   }
   for (long long i = 0; i < between(here.first, inside.first, here.end) - here.first; i++)
-    row[i] = plus(row[i], added, addends, i);
+    row[i] = plus(row[i], by, added, addends, i);
   for (long long i = between(here.first, inside.end, here.end) - here.first; i < here.end - here.first; i++)
-    row[i] = plus(row[i], added, addends, i);
+    row[i] = plus(row[i], by, added, addends, i);
   if (inside.first == inside.end)
     return;
   const section before = {of->own.first, inside.first};
@@ -85,7 +85,7 @@ static inline __attribute__((always_inline)) void complete_sums(sweep *of, doubl
     continue_section(of->run, of->work, before, *of->then);
   for (int k = 0; k < addends; k++)
     moved[k] = (addend){added[k].values + (inside.first - here.first), added[k].sign};
-  continue_part(of->run, of->work, inside, *of->then, moved, addends, FRESH);
+  continue_part(of->run, of->work, inside, *of->then, by, moved, addends, FRESH);
   of->own.first = inside.end;
 }
 

@@ -56,39 +56,43 @@ typedef struct {
   double sign;
 } addend;
 
-static inline __attribute__((always_inline)) double plus(double x, const addend *added, int addends, long long i)
+/* x and `by` times the values. */
+static inline __attribute__((always_inline)) double plus(double x, double by, const addend *added, int addends,
+    long long i)
 {
   for (int k = 0; k < addends; k++)
-    x += added[k].sign * added[k].values[i];
+    x += (by * added[k].sign) * added[k].values[i];
   return x;
 }
 
-/* Continues `count` coordinates behind the last forces, `addends` values of each. Forces that were used in both steps
- * become 0 for the next ones, as they are before if `fresh`. */
+/* Continues `count` coordinates behind the last forces, `addends` values of each, which kicks multiply by `factor`.
+ * Forces that were used in both steps become 0 for the next ones, as they are before if `fresh`. */
 static inline __attribute__((always_inline)) void continue_coordinates(double *restrict q, double *restrict p,
     double *restrict dq, double *restrict dp, double *restrict X, double *restrict F,
-    const double *restrict inverse_mass, long long count, continuation by, const addend *added, int addends, int fresh)
+    const double *restrict inverse_mass, long long count, continuation by, double factor, const addend *added,
+    int addends, int fresh)
 {
+  const double drift = by.drift * inverse_mass[0]; /* of equal masses */
   const int forces = by.starts || (by.ends && ends_with_a_kick()); /* F, else increments that have them */
 #ifdef PLAIN_SUMS
   for (long long i = 0; i < count; i++) {
     if (forces)
       p[i] += (by.starts ? by.start : by.end) * F[i];
     else if (addends)
-      p[i] = plus(p[i], added, addends, i);
+      p[i] = plus(p[i], factor, added, addends, i);
     if (by.starts)
       F[i] = 0.0;
     if (by.moves)
-      q[i] += by.drift * (inverse_mass[EQUAL_MASSES ? 0 : i] * p[i]);
+      q[i] += (EQUAL_MASSES ? drift : by.drift * inverse_mass[i]) * p[i];
   }
 #else
   if (by.ends || by.starts || addends)
 #pragma GCC unroll 2
     for (long long i = 0; i < count; i++) { /* two registers at a time: counting took a sixth of the instructions */
-      double moving = p[i], more_p = forces ? dp[i] : plus(dp[i], added, addends, i);
-      double force = forces && !fresh ? plus(F[i], added, addends, i) : 0.0;
+      double moving = p[i], more_p = forces ? dp[i] : plus(dp[i], factor, added, addends, i);
+      double force = forces && !fresh ? plus(F[i], 1.0, added, addends, i) : 0.0;
       if (forces && fresh)
-        force = plus(added[0].sign * added[0].values[i], added + 1, addends - 1, i);
+        force = plus(added[0].sign * added[0].values[i], 1.0, added + 1, addends - 1, i);
       if (by.ends) {
         if (forces)
           more_p += by.end * force;
@@ -105,7 +109,7 @@ static inline __attribute__((always_inline)) void continue_coordinates(double *r
   if (by.moves)
 #pragma GCC unroll 2
     for (long long i = 0; i < count; i++) { /* apart, so that sums of more elements overlap in time */
-      double at = q[i], more_q = dq[i] + by.drift * (inverse_mass[EQUAL_MASSES ? 0 : i] * (p[i] + dp[i]));
+      double at = q[i], more_q = dq[i] + (EQUAL_MASSES ? drift : by.drift * inverse_mass[i]) * (p[i] + dp[i]);
       if (by.arrives) {
         add_increment(&at, &more_q);
         q[i] = at;
@@ -118,14 +122,14 @@ static inline __attribute__((always_inline)) void continue_coordinates(double *r
 
 /* Continues up to SECTION coordinates; the flags are constants of each loop. */
 static inline __attribute__((always_inline)) void continue_part(const run_memory *run, const work_arrays *work,
-    section here, continuation by, const addend *added, int addends, int fresh)
+    section here, continuation by, double factor, const addend *added, int addends, int fresh)
 {
   const long long first = here.first;
   const double *masses = run->inverse_mass + (work->equal_masses ? 0 : first);
 #define CONTINUE(ends, starts, moves, arrives)                                                                      \
   continue_coordinates(run->q + first, run->p + first, run->carry_q + first, run->carry_p + first, work->X + first, \
       work->F + first, masses, here.end - first,                                                                    \
-      (continuation){ends, starts, moves, arrives, by.end, by.start, by.drift}, added, addends, fresh)
+      (continuation){ends, starts, moves, arrives, by.end, by.start, by.drift}, factor, added, addends, fresh)
   if ((LEAPS > 2 || !ends_with_a_kick()) && by.moves && !by.arrives) {
     if (by.ends)
       CONTINUE(1, 1, 1, 0);
@@ -150,7 +154,7 @@ static void continue_section(const run_memory *run, const work_arrays *work, sec
 {
   for (section part = here; part.first < here.end; part.first = part.end) {
     part.end = here.end - part.first < SECTION ? here.end : part.first + SECTION;
-    continue_part(run, work, part, by, NULL, 0, 0);
+    continue_part(run, work, part, by, 0.0, NULL, 0, 0);
   }
 }
 

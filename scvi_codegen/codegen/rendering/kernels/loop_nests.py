@@ -330,7 +330,8 @@ class Nest:
             value += f" {sign} values[{number}][at - part_{k}.first]"
             moved = f"(common_{targets[0]}.first - part_{k}.first)"
             addends.append(f"{{values[{number}] + {moved}, {sign}1.0}}")
-            ends.append(f"add_ends(row_{targets[0]}, values[{number}], {sign}1.0, part_{k}, common_{targets[0]});")
+            factor = f"{sign.strip('+')}{'by' if self.fused else '1.0'}"
+            ends.append(f"add_ends(row_{targets[0]}, values[{number}], {factor}, part_{k}, common_{targets[0]});")
             row = self.place_of(replace(access, places=(*access.places[:-1], Place())))
         common = f"part_{targets[0]}"
         for k in targets[1:]:
@@ -340,7 +341,7 @@ class Nest:
         lines += ends
         if self.fused:
             lines.append(f"const addend added[] = {{{', '.join(addends)}}};")
-            return [*lines, f"complete_sums(of, row_{targets[0]}, common_{targets[0]}, added, {len(targets)});"]
+            return [*lines, f"complete_sums(of, by, row_{targets[0]}, common_{targets[0]}, added, {len(targets)});"]
         head = f"for (long long at = common_{targets[0]}.first; at < common_{targets[0]}.end; at++)"
         return [*lines, head, f"  row_{targets[0]}[at] = row_{targets[0]}[at]{value};"]
 

@@ -286,7 +286,7 @@ def _force_text(program: ArrayProgram, rolled: RolledKernel, fused_group: str) -
         at = counter(rolled.loops[-1])
         here, first = f"[{at} - begin]", len(rolled.reads)
         called = [f"u[{first + k}] = called[{k}][{at} - chunk];" for k in range(len(functions))]
-        (sign, at_once), by = nest.signed[0], [f"by * value[{k}]" for k in nest.stored]
+        (sign, at_once), by = nest.signed[0], [f"{'by * ' * (not fused)}value[{k}]" for k in nest.stored]
         innermost = [*called, call, *(added(0, f"{sign.strip('+')}{by[at_once]}") if nest.adds_at_once else [])]
         kept = [n for n in range(len(by)) if n != at_once or not nest.adds_at_once]
         innermost += [f"values[{n}]{here} = {by[n]};" for n in kept]
