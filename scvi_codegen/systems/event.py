@@ -70,6 +70,11 @@ SLIDING = (
     "friction, a relay). Use sc.friction(..), for forces along a slip also a method by its name ('svi:4'), or a smooth "
     "force such as tanh(u/width), or end the run there"
 )
+CORNER = (
+    "the motion rests in the corner {function} = 0 at t = {t:.17g}: the forces on both sides point to it and balance "
+    "there, as a constraint would. State that as constraints= or sc.contact(..), give a smooth potential such as "
+    "sqrt(u**2 + width**2) for abs(u), or start beside the corner"
+)
 
 
 @dataclass(frozen=True, slots=True)

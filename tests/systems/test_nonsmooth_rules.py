@@ -118,7 +118,7 @@ def test_a_relay_accumulates_and_its_equilibrium_is_named(steps: dict[str, float
     """x'' = -sign(x) - x'/2: amplitudes fall as 1/t; at x = 0, x' = 0 both sides point to the surface."""
     relay = made("x_dot**2/2", forces={"x": "-sign(x) - x_dot/2"})
     assert abs(relay.integrate([1.0], [0.0], t_end=15.0, **steps).q[-1, 0]) < 0.05
-    with pytest.raises(sc.EventError, match="slides on 'x' = 0 at t = 0"):
+    with pytest.raises(sc.EventError, match="rests in the corner 'x' = 0 at t = 0"):
         relay.integrate([0.0], [0.0], t_end=1.0, **steps)
 
 

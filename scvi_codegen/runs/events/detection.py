@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ from scvi_codegen.systems.event import (
     ACCUMULATED,
     BEHIND,
     CHATTERS,
+    CORNER,
     INSEPARABLE,
     JAMMED,
     PASSED,
@@ -173,6 +175,12 @@ class CrossingSearch:
             if number and not (name == "accumulated" and self.ended):
                 event = self.stepper.searched[abs(number) - 1]
                 message = PASSED if message is THROUGH and isinstance(event, Kink | Transition) else message
+                rates = {*(f"{name}_dot" for name in self.stepper.coordinates), *self.stepper.interface.momentum_names}
+                message = (
+                    CORNER
+                    if message is SLIDING and rates.isdisjoint(re.findall(r"\w+", str(event.function)))
+                    else message
+                )
                 modes = zip(self.stepper.modes, getattr(self.watch, "mode", ()), strict=False)
                 changed = next((f"parameter '{mode}'" for mode, value in modes if not math.isfinite(value)), "state")
                 recent = self.watch.recent if name == "chatters" else [of is event for of in self.stepper.searched]
