@@ -265,6 +265,20 @@ def test_forces_on_a_torus_and_on_a_cylinder_are_those_of_numpy(sums: str, along
             np.testing.assert_allclose(np.reshape(run.q, shape), leapfrog(q, v, 0.02, 50, forces), rtol=0, atol=4e-14)
 
 
+@pytest.mark.second
+def test_energies_of_lattices_whose_forces_are_complete_at_once_are_those_of_numpy() -> None:
+    """The entries of a term are not those of its forces, which reach in both directions."""
+    couplings = "(u[i+1, j] - u[i, j])**2/2 + (u[i, j+1] - u[i, j])**2/2", "s[i]*u[i, j]**2*u[i+1, j]/3"
+    text = "".join(f" - sum(i in N periodic, j in M periodic, {coupling})" for coupling in couplings)
+    system = lagrange("plane", ["u[N, M]"], f"sum(i in N, j in M, u_dot[i, j]**2/2){text}", parameters={"s[N]": 1})
+    u, v, s = np.random.default_rng(0).normal(size=(3, 5, 4))
+    stepper = sc.compile_stepper(system, "stoermer-verlet")
+    run = stepper.integrate({"u": u}, velocity={"u": v}, h=0.01, steps=1, parameters={"s": s[:, 0]})
+    next_u, s = np.roll(u, -1, axis=0), s[:, :1]
+    potential = (next_u - u) ** 2 / 2 + (np.roll(u, -1, axis=1) - u) ** 2 / 2 + s * u**2 * next_u / 3
+    assert run.energy()[0] == pytest.approx((v**2 / 2 + potential).sum(), rel=1e-14)
+
+
 @pytest.mark.rotated
 def test_hamiltonians_and_velocity_dependent_forces_with_threads() -> None:
     text = "sum(i in N periodic, ((q[i+1] - q[i])**2 + (p[i+1] - p[i])**2)/2 - (q[i]**2 + p[i]**2)**2/4)"

@@ -118,10 +118,10 @@ def _potential(system: ArraySystem, term: ArrayTerm, axis: int | None, number: i
     force = _signed(system, force_of(term, system.state))
     purpose = "Derivatives with respect to its coordinates."
     forces = dict.fromkeys((force, gathered(force) if explicit else force))
-    kernels = [_added(system, f"force_{number}", how, system.state, _shown(term), purpose) for how in forces]
+    kernels = {_added(system, f"force_{number}", how, system.state, _shown(term), purpose): how for how in forces}
     rolled = min(kernels, key=_operations)
-    u = entries_of(term, system.state)
-    scalar = rolled_kernel(system, f"term_{number}", [term.formula], term, u, text="", purpose="The term.")
+    u = entries_of(kernels[rolled], system.state)
+    scalar = rolled_kernel(system, f"term_{number}", [term.formula], kernels[rolled], u, text="", purpose="The term.")
     return replace(rolled, scalar=scalar.kernel, circulant=axis)
 
 

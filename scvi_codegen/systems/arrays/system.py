@@ -63,23 +63,23 @@ def force_of(term: ArrayTerm, state: tuple[Array, ...]) -> ArrayForce:
 def gathered(force: ArrayForce) -> ArrayForce:
     """Return forces with one target instead of targets that differ in periodic indices, so that no sum is continued.
 
-    The terms V(x_i, x_(i+1)) of all i act on x_i by V_1(x_i, x_(i+1)) + V_2(x_(i-1), x_i). ``force`` is returned if
-    distances from the index become larger, or are no numbers.
+    The terms V(x_i, x_(i+1)) of all i act on x_i by V_1(x_i, x_(i+1)) + V_2(x_(i-1), x_i). The entries of ``force`` are
+    kept, for V. ``force`` is returned if distances from the index become larger, or are no numbers.
     """
     accesses, periodic = dict(force.slots), {loop.index for loop in force.loops if loop.periodic}
     if any(access.sums or any(place.table or place.minus for place in access.places) for access in accesses.values()):
         return force
-    slots, targets = dict[Symbol, Access](), dict[Access, Expr]()
+    names, targets = {access: slot for slot, access in force.slots}, dict[Access, Expr]()
     for target, formula in force.targets:
         by = {place.index: -place.base.number for place in target.places if place.index in periodic}
         moved = {slot: _shifted(accesses[slot], by) for slot in formula.free_symbols & {*accesses}}
-        renamed = {slot: symbol(str(access)) for slot, access in moved.items()}
-        slots |= {renamed[slot]: access for slot, access in moved.items()}
+        renamed = {slot: names.setdefault(access, symbol(str(access))) for slot, access in moved.items()}
         here = _shifted(target, by)
         targets[here] = targets.get(here, S.Zero) + _with_one_number(formula.xreplace(renamed))
-    if _farthest(slots.values()) > _farthest(accesses.values()):
+    if _farthest(names) > _farthest(accesses.values()):
         return force
-    return replace(force, slots=tuple(sorted(slots.items(), key=str)), targets=tuple(targets.items()))
+    slots = sorted(((slot, access) for access, slot in names.items()), key=str)
+    return replace(force, slots=tuple(slots), targets=tuple(targets.items()))
 
 
 def _shifted(access: Access, by: Mapping[str, int]) -> Access:
