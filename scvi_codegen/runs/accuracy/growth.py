@@ -70,8 +70,8 @@ Bodies that are ejected move regularly from then on, which brings the mean close
 RIGHT, LOOSER, MOST_REPEATED, PARTS, DIGITS = 1e-10, 1e4, 2**16, 16, 15
 """Difference that leaves ten digits, and its ratio to the tolerance if that is larger; most steps of a repetition that
 confirms a growth, and number of its comparisons; digits of a double."""
-ALL_STEPS, SOME_STEPS, LOOSE_TOLERANCE = 1, 8, 1e-5
-"""One of how many steps measures the growth above this tolerance, where an orbit has few steps, and below."""
+SECOND, EIGHTH, LOOSE_TOLERANCE = 2, 8, 1e-5
+"""Every second step measures the growth above this tolerance, where an orbit has few steps; every eighth below."""
 
 
 def warn_of_error_growth(
@@ -127,7 +127,7 @@ def measured_growth(stepper: Integrator, plan: StepPlan, requested: bool | None)
         or not warnings_wanted()
     ):
         return 0
-    return SOME_STEPS if plan.tolerance is None or plan.tolerance <= LOOSE_TOLERANCE else ALL_STEPS
+    return EIGHTH if plan.tolerance is None or plan.tolerance <= LOOSE_TOLERANCE else SECOND
 
 
 def _by_factor(growth: float) -> str:

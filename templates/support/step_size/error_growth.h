@@ -8,7 +8,7 @@
  * vectors of eight lanes, or half as many; derivatives there are evaluated in SIMD lanes. The collocation equations
  *   dq_n = dq + c_n h dv + h^2 sum_j P_nj dq''_j,      dv_n = dv + h sum_j Q_nj dq''_j
  * are solved by Picard iterations (Hairer, Norsett & Wanner, Solving ODEs I, sec. I.8) from Taylor's polynomial at the
- * end of the step before; with four knots in two halves of a step if all are measured. In one of `measures_growth`
+ * end of the step before; with four knots in two halves of a large step. In one of `measures_growth`
  * steps the vector is projected on the energy surface (in the metric of the sizes of the motion): its part along the
  * gradient of the energy, which is conserved, grows by the error of the iterations only. Requires: the iteration, the
  * tables, the kernels point_derivatives and derivative_product; with VARIABLE_ACCELERATIONS energy_gradient. */
@@ -17,6 +17,7 @@
 #define LARGEST_GROWTH 100.0 /* logarithm: beyond it the growth is known; below the reciprocal numbers underflow */
 #define LARGEST_SQUARE 1e140 /* of sizes: the products of two are numbers */
 #define MOST_ITERATIONS 30
+#define OF_SMALL_STEPS 8 /* one in so many is measured (growth.py), more of large ones */
 #define LOG_2 0.6931471805599453
 
 #ifdef ENERGY_CONSERVED
@@ -314,11 +315,12 @@ static inline void sample_growth(run_memory *run, const step_data *step, const i
   if (q2 == 0 || v2 == 0)
     return;
 #ifdef ENERGY_CONSERVED
-  for (int i = 0; i < M; i++) {
-    along += by_v[i] * tangent_v[i] + by_q[i] * run->tangent[i][0];
+  for (int i = 0; i < M; i++)
     square += by_q[i] * by_q[i] * q2 + by_v[i] * by_v[i] * v2;
-  }
-  along /= square;
+  square = 1.0 / square; /* before the tangent vector is known, for which the next step waits */
+  for (int i = 0; i < M; i++)
+    along += by_v[i] * tangent_v[i] + by_q[i] * run->tangent[i][0];
+  along *= square;
   for (int i = 0; i < M; i++) {
     run->tangent[i][0] -= along * q2 * by_q[i];
     tangent_v[i] -= along * v2 * by_v[i];
@@ -364,7 +366,7 @@ static __attribute__((noinline)) void measure_growth(run_memory *run, const step
 #endif
     }
   }
-  if (run->measures_growth == 1 && KNOTS <= 4) {
+  if (run->measures_growth < OF_SMALL_STEPS && KNOTS <= 4) {
     advance_tangent(run, step, data, X, 1, 0.5 * step->h);
     advance_tangent(run, step, data, X, 2, 0.5 * step->h);
   } else
