@@ -20,6 +20,7 @@ from scvi_codegen.systems.formulas.intermediates import (
     intermediate,
     intermediates,
     product,
+    symbols_of,
     total,
     written_out,
     written_size,
@@ -89,6 +90,13 @@ def test_deep_formulas_take_linear_time():
     assert sum(kernel.operation_counts().values()) < 20_000
     with pytest.raises(SystemDefinitionError, match="written out"):
         written_out(formula)
+
+
+def test_symbols_of_shared_parts_take_linear_time():
+    shared = X
+    for _ in range(60):  # 2^60 nodes as a tree
+        shared = Add(shared, Mul(shared, Y, evaluate=False), evaluate=False)
+    assert symbols_of(shared + nested(5)) == {X, Y, Z}
 
 
 def test_replacements_are_those_of_their_own_rule():

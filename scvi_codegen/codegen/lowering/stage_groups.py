@@ -26,7 +26,7 @@ from scvi_codegen.systems.formulas.array_statements import ArrayForce
 from scvi_codegen.systems.formulas.arrays import ArrayTerm
 from scvi_codegen.systems.formulas.expressions import Tape, jacobian, tangents
 from scvi_codegen.systems.formulas.indices import Access
-from scvi_codegen.systems.formulas.intermediates import inner_of, separated
+from scvi_codegen.systems.formulas.intermediates import inner_of, separated, symbols_of
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
 from scvi_codegen.systems.symmetry.symmetry import work_rates
 from scvi_codegen.systems.system import MechanicalSystem
@@ -343,7 +343,7 @@ def _derivatives(group: StageGroup) -> tuple[tuple[Symbol, ...], dict[tuple[int,
     if len(group.arguments) <= MOST_WRITTEN_OUT or not any(map(inner_of, group.results)):
         return (), _partials(group)
     x = tuple(Symbol(f"x[{j}]", real=True) for j in range(len(group.arguments)))
-    changes = [(change, change.free_symbols) for change in tangents(group.results, group.arguments, x)]
+    changes = [(change, symbols_of(change)) for change in tangents(group.results, group.arguments, x)]
     columns = [*enumerate(x)]
     return x, {(i, j): row for i, (row, found) in enumerate(changes) for j, name in columns if name in found}
 

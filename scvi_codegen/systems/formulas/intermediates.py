@@ -12,8 +12,8 @@ symbols and replacements of an intermediate quantity are therefore computed once
 
 from __future__ import annotations
 
-from collections.abc import Collection, Container, Iterable, Mapping, Sequence
-from functools import cmp_to_key, lru_cache
+from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
+from functools import cache, cmp_to_key, lru_cache
 from itertools import count
 from typing import Any
 from weakref import WeakValueDictionary
@@ -135,6 +135,12 @@ def _contents(definition: Expr, *without: type) -> tuple[tuple[Intermediate, ...
     return tuple(quantities), frozenset(symbols), has_steps
 
 
+def symbols_of(expression: Expr) -> frozenset[Symbol]:
+    """Return the symbols of an expression and of all quantities in it, of each subexpression once."""
+    quantities, symbols, _ = _contents(expression)
+    return symbols.union(*(quantity._free for quantity in quantities))
+
+
 _LAST: list[Any] = [{}, {}]
 """The last rule of replacements, and the quantities replaced by it, which an equal rule replaces next."""
 
@@ -199,6 +205,18 @@ def _node(kind: type, number: tuple[Expr, ...], arguments: Sequence[Expr]) -> Ex
     return kind._from_args((*number, *sorted(arguments, key=_IN_ORDER)), is_commutative=True)  # type: ignore[attr-defined]
 
 
+def _independence(variables: Collection[Symbol]) -> Callable[[Expr], bool]:
+    """Return whether an expression contains none of the variables, as a function that visits each part once."""
+
+    @cache
+    def constant(node: Expr) -> bool:
+        if isinstance(node, Intermediate) or not node.args:
+            return bool(node.free_symbols.isdisjoint(variables))
+        return all(map(constant, node.args))
+
+    return constant
+
+
 def separated(expressions: Sequence[Expr], variables: Collection[Symbol]) -> tuple[list[Expr], dict[Expr, Symbol]]:
     """Return expressions as functions of variables and of new symbols, and the parts that these abbreviate.
 
@@ -207,6 +225,7 @@ def separated(expressions: Sequence[Expr], variables: Collection[Symbol]) -> tup
     """
     rebuilt: dict[Expr, Expr] = {}
     parts: dict[Expr, Symbol] = {}
+    constant = _independence(variables)
 
     def read(node: Expr) -> Expr:
         if node not in rebuilt:
@@ -216,18 +235,18 @@ def separated(expressions: Sequence[Expr], variables: Collection[Symbol]) -> tup
     def written(node: Expr) -> Expr:
         if node in variables:
             return node
-        if node.free_symbols.isdisjoint(variables):
+        if constant(node):
             factor, part = node.as_coeff_Mul()
             return node if part.is_number else factor * parts.setdefault(part, Symbol(f"_{len(parts)}", real=True))
         if isinstance(node, Intermediate):
             return intermediate(read(node.definition))
         if not (node.is_Add or node.is_Mul):
             return node.func(*map(read, node.args))
-        constant = [part for part in node.args if part.free_symbols.isdisjoint(variables)]
-        return node.func(read(node.func(*constant)), *(read(part) for part in node.args if part not in constant))
+        fixed = [part for part in node.args if constant(part)]
+        return node.func(read(node.func(*fixed)), *(read(part) for part in node.args if not constant(part)))
 
     for quantity in intermediates(*expressions):
-        if not quantity.free_symbols.isdisjoint(variables):
+        if not constant(quantity):
             read(quantity)
     return [*map(read, expressions)], parts
 
