@@ -479,7 +479,7 @@ def errors_of_motion(system: Any, path: Path) -> list[float]:
         mujoco.mj_integratePos(model, data.qpos, draw.uniform(-1, 1, model.nv) * scale, 1.0)
         data.qvel[:] = scale * draw.uniform(-1, 1, model.nv)
         data.ctrl[: len(controls)] = [*controls.values()]
-        for name, place in zip(controls, model.actuator_actadr, strict=True):
+        for name, place in zip(controls, model.actuator_actadr, strict=False):
             data.act[place : place + (place >= 0)] = held[name]  # which mj_forward does not clamp
         mujoco.mj_forward(model, data)
         energy, power, error = equations((data.qpos, data.qvel, data.qacc_smooth), constants)
