@@ -77,6 +77,10 @@ def test_activations_are_inputs(tmp_path):
 
 REFUSED = {
     '<motor site="s"/>': "<motor> 'motor' names the site 's', which does not exist",
+    '<motor joint="x" site="t"/>': "acts on joint and site: give one, or a site and its refsite",
+    '<motor joint="x" refsite="t"/>': "acts on joint and refsite: give one",
+    '<position joint="x" timeconst="-1"/>': "timeconst='-1', which must not be < 0",
+    '<damper joint="x" kv="-2"/>': "the kv -2, which must not be < 0",
     '<position site="t" refsite="t" dampratio="1"/>': "a dampratio, which hinges and slides with gear, kp",
     '<position site="t" inheritrange="1"/>': "an inheritrange, which is read of joints with a range",
     '<muscle joint="x"/>': "is not read as an actuator: general, motor, position, velocity, intvelocity, damper",

@@ -145,7 +145,10 @@ def activation_of(element: Element) -> str:
     It is a' = u (``integrator``) or a' = (u - a)/timeconst (``filter``, ``filterexact``).
     """
     element.check_neutral(ABSENT)
-    filtered = element.tag == "position" and element.vector("timeconst", (0,), (1, 2)).any()
+    constants = element.vector("timeconst", (0,), (1, 2))
+    if constants.min() < 0:
+        element.refuse(f"has timeconst='{element.text('timeconst')}', which must not be < 0")
+    filtered = element.tag == "position" and constants.any()
     implied = {"intvelocity": "integrator", "cylinder": "filter", "general": element.text("dyntype", "none")}
     return "filterexact" if filtered else implied.get(element.tag, "none")
 
@@ -166,7 +169,7 @@ def _coefficients(element: Element) -> tuple[tuple[float, ...], tuple[float, ...
     if element.tag == "velocity":
         return (element.number("kv", gain[0]), 0.0, 0.0), (0.0, 0.0, -element.number("kv", gain[0]))
     if element.tag == "damper":
-        return (0.0, 0.0, -element.number("kv", 0)), NONE
+        return (0.0, 0.0, -element.number("kv", 0, 0)), NONE
     if element.tag == "cylinder":
         area = (
             np.pi / 4 * element.number("diameter") ** 2 if element.has("diameter") else element.number("area", gain[0])

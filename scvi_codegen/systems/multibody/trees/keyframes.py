@@ -32,7 +32,7 @@ def outside_limits(links: Sequence[Link], states: Mapping[str, Mapping[str, Any]
     joints = (link.joint for link in links)
     ranges = [(joint.label, joint.name, *joint.limits) for joint in joints if joint.limits and joint.kind in SINGLE]
     beyond = [
-        f"'{state}' with joint '{label}' at {q[name]:g}, of the range {low:g} to {high:g}"
+        f"'{state}' with joint '{label}' at {q[name]:.9g}, of the range {low:g} to {high:g}"
         for state, q in ((state, values["q"]) for state, values in states.items())
         for label, name, low, high in ranges
         if name in q and not low <= q[name] <= high  # those that follow others are not in q
