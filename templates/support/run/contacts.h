@@ -11,6 +11,7 @@
  * Impacts obey the same conditions for impulses and velocities (C. Glocker, Set-Valued Force Laws, 2001); where forces
  * have none, those of an impact without collision may. Requires: parts/contacts.c.jinja. */
 #define CONTACT_START 0x1p-40 /* part of a step after its start at which such a mode ends */
+#define CONTACT_NEARLY_HELD 1e-4 /* part of the terms of its second rate, by which a gap accelerates that others hold */
 #define CONTACT_MISSED 128.0 /* effects of rounding beyond which a negative gap shows a missed transition */
 
 /* Whether a slip that vanishes along its former direction stops: in space it may pass near 0. */
@@ -132,6 +133,60 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
   return OK;
 }
 
+/* Time in which accelerations displace gaps by as much as rounding does, sqrt(2 u r / |r''|), by the terms of both and
+ * with the roundings of CONTACT_LOWEST: those of shorter parts of a step change momenta by more than forces. */
+static int least_part(const event_step *step, const event_sample *at, real *least)
+{
+  contact_terms of;
+  *least = 0.0;
+  TRY(terms_at(step, at, &of));
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int row = CONTACTS[k].normal;
+    if (row >= 0 && of.second_terms[row] > 0.0)
+      *least = fmax(*least, sqrt(2.0 * CONTACT_LOWEST * of.rounding[row] / of.second_terms[row]));
+  }
+  return OK;
+}
+
+/* Whether others nearly hold the gap of a closed contact, as where legs pass through straight, so that rounding
+ * determines its force: without that it accelerates little, and they push, with `strongest` at most. */
+static int is_nearly_held(const event_step *step, const contact_terms *of, int k, real *strongest)
+{
+  contact_mode mode[EVENT_CONTACTS];
+  real force[CONTACT_ROWS], after[CONTACT_ROWS];
+  const int row = CONTACTS[k].normal;
+  modes_at(of, step->watch->mode, mode);
+  int holds = row >= 0 && mode[k].closed;
+  mode[k] = CONTACT_IS_OPEN;
+  *strongest = 0.0;
+  if (holds)
+    solve_contacts(of, mode, of->second, force, after, NULL);
+  for (int j = 0; holds && j < EVENT_CONTACTS; j++) {
+    const real normal = CONTACTS[j].normal < 0 ? 0.0 : force[CONTACTS[j].normal];
+    holds = normal >= 0.0;
+    *strongest = fmax(*strongest, normal);
+  }
+  return holds && fabs(after[row]) <= CONTACT_NEARLY_HELD * of->second_terms[row];
+}
+
+/* Opens a contact that others nearly hold, that without which they push least; whether there is one, in *opens. */
+static int open_nearly_held(const event_step *step, event_sample *at, int *opens)
+{
+  contact_terms of;
+  contact_change now;
+  real strongest, least = INFINITY;
+  memset(&now, 0, sizeof now);
+  TRY(terms_at(step, at, &of));
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    if (is_nearly_held(step, &of, k, &strongest) && strongest < least) {
+      memset(now.leaves, 0, sizeof now.leaves);
+      now.leaves[k] = 1;
+      least = strongest;
+    }
+  *opens = least < INFINITY;
+  return *opens ? change_modes(step, at, &now) : OK;
+}
+
 #ifdef CONTACTS_IN_SPACE
 /* Follows slips in space from a state; new modes where their new directions make forces impossible. Those of dependent
  * contacts only differ in the rates by the rounding of directions while slips begin. */
@@ -173,6 +228,8 @@ static int has_just_left(const event_step *step, int k)
 static int change_contacts(const event_step *step, long long first, event_sample *at)
 {
   contact_change now;
+  contact_terms of;
+  real strongest;
   int changed = 0;
   memset(&now, 0, sizeof now);
   for (long long i = first; i < *step->filled; i++)
@@ -181,6 +238,11 @@ static int change_contacts(const event_step *step, long long first, event_sample
       const int k = transition[0];
       now.closes[k] |= transition[1] == CONTACT_CLOSES;
       now.lifts |= transition[1] == CONTACT_LIFTS;
+      if (transition[1] == CONTACT_LIFTS && step->found[i].before.hits > 0 &&
+          fabs(step->watch->time - step->found[i].before.last) <= fabs(step->whole)) { /* it has just lifted */
+        TRY(terms_at(step, at, &of));
+        now.leaves[k] = is_nearly_held(step, &of, k, &strongest);
+      }
       now.leaves[k] |= transition[1] == CONTACT_LEAVES || (transition[1] == CONTACT_CLOSES && has_just_left(step, k));
       now.stops[k] |= transition[1] == CONTACT_STOPS;
       now.begins[k] += (transition[1] == CONTACT_FORWARD || transition[1] == CONTACT_BEGINS) -
@@ -312,23 +374,32 @@ static int end_held_modes(const event_step *step, const event_sample *right)
   return OK;
 }
 
-/* Ends modes at the start of a step whose forces are outside of their cone there within rounding, and more at its end:
- * their functions have no zero. */
+/* Value below which a gap is negative by more than rounding. */
+static real least_gap(const event_step *step, const contact_terms *of, int transition)
+{
+  const int e = EVENT_FIRST[FIRST_TRANSITION + transition], row = CONTACTS[TRANSITION[transition][0]].normal;
+  return -CONTACT_MISSED * values_at(step, EVENT_DEGREE + 2)[e] - step->watch->history[e].slack -
+      (row < 0 ? 0.0 : CONTACT_ROUNDING * of->size[row]);
+}
+
+/* Ends modes at the start of a step whose forces or gaps are negative there within rounding, and more at its end: their
+ * functions have no zero. Of gaps in steps to whose end the present modes last. */
 static int end_modes_at_start(const event_step *step, const event_sample *right)
 {
   contact_terms of;
+  const int lasts = isinf(step->horizon->fraction);
   int outside[EVENT_CONTACTS], has_terms = 0;
   for (int i = 0; i < TRANSITIONS; i++) {
     const int e = EVENT_FIRST[FIRST_TRANSITION + i];
     const real before = values_at(step, 0)[e], after = values_at(step, EVENT_DEGREE)[e];
-    if (!(is_of_forces(i) && before < 0.0 && after < before))
+    if (!((is_of_forces(i) || (lasts && is_kept(i))) && before < 0.0 && after < before))
       continue;
     if (!has_terms) {
       TRY(terms_at(step, right, &of));
       find_outside(step, &of, CONTACT_OUTSIDE, outside);
     }
     has_terms = 1;
-    if (outside[TRANSITION[i][0]])
+    if (is_of_forces(i) ? outside[TRANSITION[i][0]] : after < least_gap(step, &of, i))
       TRY(add_transition(step, i, CONTACT_START));
   }
   return end_held_modes(step, right);
@@ -350,10 +421,9 @@ static int check_gaps(const event_step *step, const event_sample *right)
   TRY(terms_at(step, right, &of));
   find_outside(step, &of, CONTACT_OUTSIDE, outside);
   for (int i = 0; i < TRANSITIONS; i++) {
-    const int e = EVENT_FIRST[FIRST_TRANSITION + i], row = CONTACTS[TRANSITION[i][0]].normal;
-    const real rounding = CONTACT_MISSED * values_at(step, EVENT_DEGREE + 2)[e] + step->watch->history[e].slack +
-        (row < 0 ? 0.0 : CONTACT_ROUNDING * of.size[row]);
-    if (value[e] < 0.0 && (is_of_forces(i) ? outside[TRANSITION[i][0]] : is_kept(i) && value[e] < -rounding)) {
+    const int e = EVENT_FIRST[FIRST_TRANSITION + i];
+    const int is_less = is_of_forces(i) ? outside[TRANSITION[i][0]] : is_kept(i) && value[e] < least_gap(step, &of, i);
+    if (value[e] < 0.0 && is_less) {
       step->watch->through = FIRST_TRANSITION + i + 1;
       return NOT_CONVERGED;
     }

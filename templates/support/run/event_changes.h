@@ -412,10 +412,18 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       status = search_step(step, &left, &right);
 #ifdef EVENT_CONTACTS
     longest = INFINITY;
-    if (!adaptive && may_be_halved(step, status, part, fabs(step->whole))) {
+    if (!adaptive && may_be_halved(step, status, part, 0.0)) {
+      int opens = 0;
+      real least;
       *step->filled = first;
       longest = 0.5 * fabs(part);
-      continue;
+      TRY(least_part(step, &left, &least));
+      if (longest <= least) {
+        TRY(open_nearly_held(step, &left, &opens));
+        longest = INFINITY;
+      }
+      if (opens || longest < INFINITY)
+        continue;
     }
 #endif
 #ifdef EVENT_KINKS
