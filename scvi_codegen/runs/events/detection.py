@@ -175,12 +175,7 @@ class CrossingSearch:
             if number and not (name == "accumulated" and self.ended):
                 event = self.stepper.searched[abs(number) - 1]
                 message = PASSED if message is THROUGH and isinstance(event, Kink | Transition) else message
-                rates = {*(f"{name}_dot" for name in self.stepper.coordinates), *self.stepper.interface.momentum_names}
-                message = (
-                    CORNER
-                    if message is SLIDING and rates.isdisjoint(re.findall(r"\w+", str(event.function)))
-                    else message
-                )
+                message = CORNER if message is SLIDING and self._is_of_positions(event) else message
                 modes = zip(self.stepper.modes, getattr(self.watch, "mode", ()), strict=False)
                 changed = next((f"parameter '{mode}'" for mode, value in modes if not math.isfinite(value)), "state")
                 recent = self.watch.recent if name == "chatters" else [of is event for of in self.stepper.searched]
@@ -190,6 +185,11 @@ class CrossingSearch:
                 return EventError(message.format(**texts, t=t, g=behind))
         remark = modes_in_failure(self.stepper, self.watch)
         return step_failure(status, report, step=step, h=h, remark=remark, failures=self.binding.failures)
+
+    def _is_of_positions(self, event: Any) -> bool:
+        """Return whether neither velocities nor momenta occur in the function of an event."""
+        rates = {*(f"{name}_dot" for name in self.stepper.coordinates), *self.stepper.interface.momentum_names}
+        return rates.isdisjoint(re.findall(r"\w+", str(event.function)))
 
     def warn_of_accumulation(self) -> None:
         """Issue a :class:`EventWarning` if the run ended where crossings accumulate, and for choices of contacts."""

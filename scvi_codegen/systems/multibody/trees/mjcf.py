@@ -86,7 +86,7 @@ ORIENTATIONS = TURN.split()
 NO_MASS, LIGHT = 1e-15, 1e-14
 """Bodies with less mass are without forces of a medium, and boxes have no smaller sums of moments of inertia; geoms
 with less than the second have no axes."""
-GAINS, OF_SITES = {"kp", "kv", "gainprm", "biasprm"}, {"site", "refsite"}
+GAINS, OF_SITES = {"kp", "kv", "gainprm", "biasprm"}, ["site", "refsite"]
 AXES = dict(zip("xyz", np.eye(3), strict=True))
 Defaults = dict[str, dict[str, str]]
 """Attributes by kind of element."""
@@ -360,8 +360,9 @@ class _MujocoModel:
         inverses = {self.links[k].joint.label: m for k, m in mean_inverses(self.completed() if damped else (), damped)}
         for element, target in zip(elements, targets, strict=True):
             gear = np.append(element.vector("gear", (1,), range(1, 7)), np.zeros(5))[:6]
-            if len(several := [key for key in (*ACTED, "refsite") if element.has(key)]) > 1 and set(several) - OF_SITES:
-                element.refuse(f"acts on {' and '.join(several)}: give one, or a site and its refsite")
+            places = [key for key in (*ACTED, "refsite") if element.has(key)]
+            if places != OF_SITES and len(places) > 1:
+                element.refuse(f"acts on {' and '.join(places)}: give one, or a site and its refsite")
             if target in parts:
                 motion = motion_of(self.links, parts[target], gear, target[0] == "jointinparent")
             elif target[0] == "site":
@@ -411,8 +412,8 @@ class _MujocoModel:
             states = [name for name in controls if name in self.activated]
             for inputs, attribute in ((controls, "ctrl"), (states, "act")):
                 if inputs:
-                    given = key.vector(attribute, (0,) * len(inputs), [len(inputs)])
-                    values |= zip(inputs, given.tolist(), strict=True)
+                    numbers = key.vector(attribute, (0,) * len(inputs), [len(inputs)])
+                    values |= zip(inputs, numbers.tolist(), strict=True)
             yield name, values
 
     def equalities(self) -> Iterator[Element]:
