@@ -10,7 +10,7 @@ import scvi_codegen as sc
 from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning
 from scvi_codegen.runs.driver.segments import input_of
 
-LIFT = """<mujoco><option gravity="0 0 0"/><default><default class="a"><position kp="9"/></default></default>
+LIFT = """<mujoco><option gravity="0 0 0"/><default><default class="m"><muscle/></default></default>
 <worldbody><body><joint name="x" type="slide"/>
 <geom type="sphere" size=".1" mass="2"/><site name="t"/></body></worldbody><actuator>{actuators}</actuator></mujoco>"""
 ARM = """<mujoco><option><flag contact="disable"/></option><default><geom type="capsule" size=".04"/>
@@ -75,33 +75,49 @@ def test_activations_are_inputs(tmp_path):
     assert system.keyframes["k"]["inputs"] == {"p": 0.5, "v": 0.25}
 
 
-REFUSED = {
+INVALID = {
     '<motor site="s"/>': "<motor> 'motor' names the site 's', which does not exist",
-    '<motor joint="x" site="t"/>': "acts on joint and site: give one, or a site and its refsite",
+    '<motor joint="y"/>': ":3: <motor> 'motor' names the joint 'y', which does not exist",
+    '<motor tendon="y"/>': "<motor> 'motor' names the tendon 'y', which does not exist",
     '<motor joint="x" refsite="t"/>': "acts on joint and refsite: give one",
-    '<position joint="x" timeconst="-1"/>': "timeconst='-1', which must not be < 0",
-    '<damper joint="x" kv="-2"/>': "the kv -2, which must not be < 0",
-    '<position site="t" refsite="t" dampratio="1"/>': "a dampratio, which hinges and slides with gear, kp",
-    '<position site="t" inheritrange="1"/>': "an inheritrange, which is read of joints with a range",
+    '<motor joint="x" name="m"/><motor joint="x" name="m"/>': "<motor> 'm' is the second actuator of this name",
+    '<motor joint="x" ctrllimited="true"/>': "is limited to ctrlrange='0 0': the second number must be larger",
+    '<motor joint="x" actdim="1"/>': "<motor> 'motor' has the unknown attribute 'actdim'",
+    '<general joint="x" actdim="1"/>': "actdim='1', but 0 activations by its dyntype",
+    '<general joint="x" actrange="0 1"/>': "has actrange, the range of an activation, which its dyntype does not have",
+    '<position joint="x" timeconst="-1"/>': "the timeconst -1, which must not be < 0",
+    '<position joint="x" dampratio="1" kv="1"/>': "has kv and dampratio: one is needed",
+    '<position joint="x" inheritrange="1"/>': "an inheritrange, which is read of joints with a range",
+    '<velocity joint="x" dampratio="1"/>': "<velocity> 'velocity' has the unknown attribute 'dampratio'",
+    '<damper joint="x" kv="-2" ctrlrange="0 1"/>': "the kv -2, which must not be < 0",
+    '<damper joint="x" kv="2"/>': "<damper> 'damper' is limited to ctrlrange='0 0': the second number must be larger",
+    '<damper joint="x" kv="2" ctrlrange="-1 1"/>': "has ctrlrange='-1 1', which must not be < 0",
+}
+"""What MuJoCo refuses, too."""
+UNREAD = {
+    '<motor joint="x" site="t"/>': "acts on joint and site: give one, or a site and its refsite",
+    '<position site="t" refsite="t" dampratio="1"/>': "a dampratio, which hinges and slides with gear and kp >= 0",
+    '<position joint="x" gear="0" dampratio="1"/>': "a dampratio, which hinges and slides with gear and kp >= 0",
     '<muscle joint="x"/>': "is not read as an actuator: general, motor, position, velocity, intvelocity, damper",
     '<general joint="x" dyntype="muscle"/>': "dyntype='muscle', which changes the motion and is not read",
-    '<general joint="x" delay="1"/>': "delay='1', which changes the motion",
-    '<position joint="x" dampratio="1" kv="1"/>': "a dampratio, which hinges and slides with gear, kp",
-    '<position joint="x" inheritrange="1"/>': "an inheritrange, which is read of joints with a range",
-    '<velocity joint="x" dampratio="1"/>': "dampratio='1', which changes",
-    '<velocity joint="x" class="a"/>': "has gains of <position> by its class: write them out",
-    '<general joint="x" biasprm="0 -1 2" biastype="affine"/>': "biasprm='0 -1 2', a damping ratio of the mass matrix",
-    '<motor joint="y"/>': "<motor> 'motor' acts on no joint, tendon or site",
-    '<motor joint="x" name="m"/><motor joint="x" name="m"/>': "<motor> 'm' is the second actuator of this name",
-    '<general joint="x" gaintype="affine" gainprm="1 0 2" forcerange="-1 1"/>': "a gain that depends on the velocity",
+    '<general joint="x" class="m"/>': "has gaintype='muscle', which must be fixed or affine",
+    '<general joint="x" delay="1" nsample="1"/>': "delay='1', which changes the motion",
+    '<motor cranksite="t" slidersite="t" cranklength="1"/>': "<motor> 'motor' acts on no joint, tendon or site",
 }
 
 
-@pytest.mark.parametrize("actuator", REFUSED)
+@pytest.mark.parametrize("actuator", [*INVALID, *UNREAD])
 def test_other_actuators_are_refused_by_name(actuator, tmp_path):
     file = written(tmp_path, LIFT, actuators=actuator)
-    with pytest.raises(SystemDefinitionError, match=re.escape(REFUSED[actuator])):
+    with pytest.raises(SystemDefinitionError, match=re.escape((INVALID | UNREAD)[actuator])):
         sc.LagrangianSystem.from_mjcf(file, actuators=True)
+
+
+def test_what_is_no_actuator_is_refused_by_mujoco():
+    mujoco = pytest.importorskip("mujoco", reason="pip install mujoco")
+    for actuator in INVALID:
+        with pytest.raises(ValueError, match="Error"):
+            mujoco.MjModel.from_xml_string(LIFT.format(actuators=actuator))
 
 
 @pytest.mark.rotated

@@ -141,8 +141,9 @@ def test_what_is_not_read_of_geoms_is_named_in_one_warning(tmp_path):
     [
         ("", PAIR.format('friction=".7"'), "two coefficients of sliding friction, 0.7 and 1"),
         ("", '<contact><pair geom1="ball" geom2="flor"/></contact>', "geom 'flor', which does not exist.*floor"),
-        ("", '<tendon><fixed name="t" limited="true" range="2 1"/></tendon>', "<fixed> 't' has the limits 2 and 1"),
-        ('/></body><body><joint range="2 1" limited="true"/><geom size=".1"', "", "limits 0.0349066 and"),
+        ("", '<tendon><fixed name="t" limited="true" range="2 1"/></tendon>', "<fixed> 't' is limited to range='2 1'"),
+        ('/></body><body><joint range="2 1" limited="true"/><geom size=".1"', "", "is limited to range='2 1'"),
+        ('/></body><body><joint type="ball" range="0 0" limited="true"/><geom size=".1"', "", "limits 0 and 0"),
     ],
 )
 def test_what_contacts_cannot_be_is_refused_by_name(ball, rest, message, tmp_path):

@@ -1,8 +1,7 @@
 """Actuators of MJCF: forces of controls, which are inputs, along joints and tendons, and on sites.
 
-With l = gear times the length and the control u, F = (g0 + g1 l + g2 l_dot) u + b0 + b1 l + b2 l_dot = a + b l_dot acts
-along l, f = -dD/dv by the Rayleigh function D = -(a l_dot + b l_dot^2/2). If F is clamped, D = -(Q(a + b l_dot) -
-Q(a))/b with its integral Q. https://mujoco.readthedocs.io/en/stable/computation/index.html#actuation-model
+With l = gear times the length and the control u, F = (g0 + g1 l + g2 l_dot) u + b0 + b1 l + b2 l_dot, clamped to a
+range, acts along l. https://mujoco.readthedocs.io/en/stable/computation/index.html#actuation-model
 
 The gear of a site, ball or free joint is a wrench (f, tau) with l_dot = f . v + tau . w for the velocity v and angular
 velocity w, and l = f . x + tau . a, with the position x and rotation vector a, of ball joints and relative to another
@@ -13,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from itertools import chain
 
 import numpy as np
-from sympy import Add, Expr, Matrix, S
+from sympy import Expr, Matrix, S
 
 from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.formulas.kinks import positive_part
@@ -28,7 +27,7 @@ from scvi_codegen.systems.multibody.trees.energies import (
     rotation_of,
     rotation_vector,
 )
-from scvi_codegen.systems.multibody.trees.schema import Kind
+from scvi_codegen.systems.multibody.trees.schema import ACTUATORS, Kind
 from scvi_codegen.systems.multibody.trees.tendons import Tendon, length_of, rate_of
 from scvi_codegen.systems.multibody.trees.tree import (
     SINGLE,
@@ -44,13 +43,23 @@ from scvi_codegen.systems.multibody.trees.tree import (
 Motion = tuple[Expr, Expr]
 """Length of an actuator and its rate, times the gear."""
 Range = tuple[float, float] | None
-Actuator = tuple[str, str, Range, Expr]  # name in the file, name and range of the input, Rayleigh function
-READ = "general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder"
+Actuator = tuple[str, str, Range, tuple[Expr, Expr]]
+"""Name in the file, name and range of the input, force, and the rate along which it acts."""
 JOINTED = "joint", "jointinparent"
 ACTED = *JOINTED, "tendon", "site"
-NONE = (0.0, 0.0, 0.0)
 ABSENT = Kind(refused={"dyntype": "none integrator filter filterexact", "delay": "0"})
-OF_SERVOS = Kind(refused={"dampratio": "0", "inheritrange": "0"})
+TYPES: dict[str, tuple[str, ...]] = {
+    "general": (),
+    "motor": ("fixed", "none", "none"),
+    "position": ("fixed", "affine", "none"),
+    "intvelocity": ("fixed", "affine", "integrator"),
+    "velocity": ("fixed", "affine", "none"),
+    "damper": ("affine", "none", "none"),
+    "cylinder": ("fixed", "affine", "filter"),
+}
+"""Values of ``gaintype``, ``biastype`` and ``dyntype`` of ``<general>`` that other actuators set."""
+OF_LAWS = "kind", "gaintype", "gainprm", "biastype", "biasprm", "dyntype", "inheritrange"
+"""Attributes that an actuator inherits of classes that its own kind or ``<general>`` wrote, ``kind``."""
 
 
 def motion_of(links: Sequence[Link], part: Joint | Tendon, gear: Vector, in_parent: bool) -> Motion:
@@ -96,17 +105,13 @@ def actuator_of(
     ``inverse``: entry of M^-1 of a hinge or slide at the reference, for the damping 2 z sqrt(g0/inverse)/gear of
     a ratio z.
     """
-    gain, bias = _coefficients(element)
-    if ratio := element.number("dampratio", 0, 0):
-        if inverse is None or element.has("kv") or gain[0] < 0 or gear == 0:
-            element.refuse(
-                "has a dampratio, which hinges and slides with gear, kp >= 0 and no kv may have: give kv alone"
-            )
-        bias = (*bias[:2], -2 * ratio * (gain[0] / inverse) ** 0.5 / abs(gear))
+    gain, bias = _gain_and_bias(element)
+    if bias[2] > 0 and is_servo(element):
+        if inverse is None or gain[0] < 0 or gear == 0:
+            element.refuse("has a dampratio, which hinges and slides with gear and kp >= 0 may have: give kv")
+        bias[2] *= -2 * (gain[0] / inverse) ** 0.5 / abs(gear)
     if not (any(gain[1:]) or any(bias)):
         controls, forces = clamped(controls, forces, gain[0]), None
-    if forces is not None and gain[2]:
-        element.refuse("has a gain that depends on the velocity, and a range of the force: omit one")
     if others.get(label := element.node.get("name", "")):
         element.refuse("is the second actuator of this name: rename one")
     part = next(element.text(key) for key in ACTED if element.has(key))
@@ -115,20 +120,13 @@ def actuator_of(
     taken |= {*(inputs := [*filter(None, others.values())]), *input_parameters(inputs)}
     names = chain([identifier(label)], numbered(f"ctrl_{identifier(label)}"))
     name = next(x for x in names if taken.isdisjoint({x, *input_parameters([x])}))
-    a, b, c = (exact_number(g) * symbol(name) + exact_number(b) for g, b in zip(gain, bias, strict=True))
+    at, along, against = (exact_number(g) * symbol(name) + exact_number(b) for g, b in zip(gain, bias, strict=True))
     length, rate = motion[0], intermediate(motion[1])
-    return label, name, controls, _dissipation(a + b * length, c, rate, forces)
-
-
-def _dissipation(at_rest: Expr, slope: Expr, rate: Expr, forces: Range) -> Expr:
-    """Return the Rayleigh function of the force at_rest + slope rate, clamped to a range."""
-    if forces is None:
-        return -(at_rest * rate + slope * rate**2 / 2)
-    low, high = map(exact_number, forces)
-    if slope == 0:
-        return -rate * (at_rest - positive_part(at_rest - high) + positive_part(low - at_rest))
-    force = at_rest + slope * rate
-    return -(force**2 - Add(*(x * positive_part(x) for x in (force - high, low - force)))) / (2 * slope)
+    force = at + along * length + against * rate
+    if forces is not None:
+        low, high = map(exact_number, forces)
+        force += positive_part(low - force) - positive_part(force - high)
+    return label, name, controls, (force, rate)
 
 
 def clamped(inner: Range, outer: Range, factor: float) -> Range:
@@ -139,46 +137,77 @@ def clamped(inner: Range, outer: Range, factor: float) -> Range:
     return (low, high) if inner is None else (min(max(inner[0], low), high), min(max(inner[1], low), high))
 
 
+def coefficients_of(element: Element) -> list[Vector]:
+    """Return the coefficients of 1, length and velocity of gain and bias."""
+    defaults = ("gainprm", (1,)), ("biasprm", (0,))
+    return [np.append(element.vector(key, x, range(1, 11)), np.zeros(2))[:3] for key, x in defaults]
+
+
+def is_servo(element: Element) -> bool:
+    """Return whether the force is g0 (u - l) and damping, whose ratio is the third number of the bias if it is > 0."""
+    gain, bias = coefficients_of(element)
+    return bool(gain[0] == -bias[1]) and element.text("biastype", "none") == "affine"
+
+
+def inherited_by(tag: str, defaults: Mapping[str, str]) -> dict[str, str]:
+    """Return those attributes of a class that an actuator inherits."""
+    kept = tag == "general" or defaults.get("kind", "general") in ("general", tag)
+    return {key: value for key, value in defaults.items() if kept or key not in OF_LAWS}
+
+
+def as_general(element: Element) -> None:
+    """Write gain, bias and activation of an actuator, over inherited ones, as those of ``<general>``.
+
+    https://mujoco.readthedocs.io/en/stable/XMLreference.html#actuator
+    """
+    attributes, (gain, bias) = element.node.attrib, coefficients_of(element)
+    law = element.text("dyntype", "none") if attributes.get("kind") == "position" else "none"
+    if element.has("kv") and element.has("dampratio"):
+        element.refuse("has kv and dampratio: one is needed")
+    if element.tag == "motor":
+        gain[0] = 1
+    elif element.tag in ("position", "intvelocity"):
+        gain[0] = element.number("kp", gain[0])
+        ratio = element.number("dampratio", least=0) if element.has("dampratio") else bias[2]
+        bias[:] = 0, -gain[0], -element.number("kv", least=0) if element.has("kv") else ratio
+    elif element.tag == "velocity":
+        gain[0] = element.number("kv", gain[0])
+        bias[:] = 0, 0, -gain[0]
+    elif element.tag == "damper":
+        slope = gain[2] if element.text("gaintype", "fixed") == "affine" else 0.0
+        gain[:] = 0, 0, -element.number("kv", -slope, 0)
+        attributes["ctrllimited"] = "true"
+        if element.vector("ctrlrange", (0, 0), (2,)).min() < 0:
+            element.refuse(f"has ctrlrange='{element.text('ctrlrange')}', which must not be < 0")
+    elif element.tag == "cylinder":
+        area = element.number("area", gain[0])
+        gain[0] = np.pi / 4 * element.number("diameter") ** 2 if element.has("diameter") else area
+        bias = element.vector("bias", bias.tolist())
+    attributes |= zip(("gaintype", "biastype", "dyntype"), TYPES.get(element.tag, (element.tag,)), strict=False)
+    if element.tag == "position":
+        filtered = element.number("timeconst", law == "filterexact", 0)
+        attributes["dyntype"] = "filterexact" if filtered else "none"
+    attributes |= {"gainprm": " ".join(map(repr, gain.tolist())), "biasprm": " ".join(map(repr, bias.tolist()))}
+    attributes["kind"] = element.tag
+    for key in ("kp", "kv", "dampratio", "timeconst", "area", "diameter", "bias"):
+        attributes.pop(key, None)
+
+
 def activation_of(element: Element) -> str:
     """Return the law of the activation a, the state of an actuator that acts in place of its control u, or ``none``.
 
     It is a' = u (``integrator``) or a' = (u - a)/timeconst (``filter``, ``filterexact``).
     """
     element.check_neutral(ABSENT)
-    constants = element.vector("timeconst", (0,), (1, 2))
-    if constants.min() < 0:
-        element.refuse(f"has timeconst='{element.text('timeconst')}', which must not be < 0")
-    filtered = element.tag == "position" and constants.any()
-    implied = {"intvelocity": "integrator", "cylinder": "filter", "general": element.text("dyntype", "none")}
-    return "filterexact" if filtered else implied.get(element.tag, "none")
+    law = element.text("dyntype", "none")
+    if element.number("actdim", -1) not in (-1, law != "none"):
+        element.refuse(f"has actdim='{element.text('actdim')}', but {law != 'none':d} activations by its dyntype")
+    return law
 
 
-def _coefficients(element: Element) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return the coefficients of 1, length and velocity of gain and bias."""
-    if element.tag != "position":
-        element.check_neutral(OF_SERVOS)
-    if element.tag == "motor":
-        return (1.0, 0.0, 0.0), NONE
-    if element.text("kind", element.tag) != element.tag:
-        element.refuse(f"has gains of <{element.text('kind')}> by its class: write them out")
-    keys = (("gainprm", (1.0, *NONE)), ("biasprm", NONE))
-    gain, bias = ((*map(float, element.vector(key, x, range(1, 11))), *NONE)[:3] for key, x in keys)
-    if element.tag in ("position", "intvelocity"):
-        stiffness = element.number("kp", gain[0])
-        return (stiffness, 0.0, 0.0), (0.0, -stiffness, -element.number("kv", 0))
-    if element.tag == "velocity":
-        return (element.number("kv", gain[0]), 0.0, 0.0), (0.0, 0.0, -element.number("kv", gain[0]))
-    if element.tag == "damper":
-        return (0.0, 0.0, -element.number("kv", 0, 0)), NONE
-    if element.tag == "cylinder":
-        area = (
-            np.pi / 4 * element.number("diameter") ** 2 if element.has("diameter") else element.number("area", gain[0])
-        )
-        return (area, 0.0, 0.0), tuple(map(float, element.vector("bias", bias)))
-    if element.tag != "general":
-        element.refuse(f"is not read as an actuator: {', '.join(READ)} are; remove it, or actuators=False")
-    gain = gain if element.choice("gaintype", "fixed", "affine") == "affine" else (gain[0], 0.0, 0.0)
-    bias = bias if element.choice("biastype", "none", "affine") == "affine" else NONE
-    if bias[2] > 0 and bias[1] == -gain[0]:
-        element.refuse(f"has biasprm='{element.text('biasprm')}', a damping ratio of the mass matrix: give kv")
-    return gain, bias
+def _gain_and_bias(element: Element) -> list[Vector]:
+    if element.tag not in ACTUATORS:
+        element.refuse(f"is not read as an actuator: {', '.join(ACTUATORS)} are; remove it, or actuators=False")
+    gain, bias = coefficients_of(element)
+    varies = element.choice("gaintype", "fixed", "affine") == "affine"
+    return [gain * [1, varies, varies], bias * (element.choice("biastype", "none", "affine") == "affine")]

@@ -9,7 +9,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 from xml.etree import ElementTree
 from xml.parsers import expat
 
@@ -28,7 +28,7 @@ XACRO = re.compile(r"\$[({]")
 NAMED = 5
 """Number of names that a warning lists of each kind of parts."""
 
-
+Thing = TypeVar("Thing")
 Place = tuple[str, int, str, Any]
 """Path of a document, number of a line, the nearest element around it that has a name, and the outermost element."""
 
@@ -110,6 +110,12 @@ class Element:
         if value < least:
             self.refuse(f"has the {key} {value:g}, which must not be < {least:g}")
         return value
+
+    def among(self, key: str, kind: str, things: Mapping[str, Thing]) -> Thing:
+        """Return the thing of a kind that an attribute names, of those that exist by name."""
+        if (name := self.text(key)) not in things:
+            self.refuse(f"names the {kind} '{name}', which does not exist{closest(name, things)}")
+        return things[name]
 
     def children(self, *tags: str) -> list[Element]:
         """Return the children with one of the tags, in order; all of them without tags."""

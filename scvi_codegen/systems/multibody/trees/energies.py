@@ -34,7 +34,7 @@ G. Rodriguez, A. Jain, K. Kreutz-Delgado, A spatial operator algebra for manipul
 Robotics Research 10 (1991), 371-381; R. Featherstone, Rigid Body Dynamics Algorithms, Springer 2008, chapters 3, 4, 7.
 """
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from types import MappingProxyType
@@ -240,18 +240,14 @@ class Tree:
         """Return Rayleigh's function of the damping of joints."""
         return Add(*(self.of_rates(joint, joint.damping) for joint in self.joints.values()))
 
-    def forces_of_medium(self, rates: Sequence[Symbol]) -> Iterator[Expr]:
-        """Yield the force of the medium on each rate u, the sum of F dv/du over velocities v and their loads F."""
-        loads: dict[Symbol, Expr] = {}
-        power, at_rest = [S.Zero], not any(link.inertia.drag for link in self.links)
+    def loads_of_medium(self) -> Iterator[tuple[Expr, Expr]]:
+        """Yield forces and torques of the medium, with the velocities along which they act."""
+        at_rest = not any(link.inertia.drag for link in self.links)
         for link, (w, v) in zip(self.links, [] if at_rest else self.motions(free=True), strict=False):
             for pose, law in link.inertia.drag:
                 axes = exact_matrix(pose.rotation).T
                 spin, speed = (as_quantities(axes * x) for x in (w, v + w.cross(exact_vector(pose.position))))
-                for load, rate in zip(law(spin, speed), (*spin, *speed), strict=True):
-                    power.append(Symbol(f"_load_{len(loads)}", real=True) * rate)
-                    loads[Symbol(f"_load_{len(loads)}", real=True)] = intermediate(load)
-        yield from (part.xreplace(loads) for part in gradient_tuple(Add(*power), rates))
+                yield from zip(law(spin, speed), (*spin, *speed), strict=True)
 
     def contacts(self, law: Mapping[str, Any]) -> Iterator[ContactLike]:
         """Yield the contacts of joints with limits, and the dry friction of joints.
@@ -271,11 +267,14 @@ class Tree:
                 limit = exact_number(joint.dry_friction)
                 yield friction(rate, limit=limit, name=f"dry friction of joint '{joint.label}'")
 
-    def arguments(self, actuated: Collection[str] | bool) -> dict[str, Any]:
+    def arguments(
+        self, actuated: Collection[str] | bool, actuating: Iterable[tuple[Expr, Expr]] = ()
+    ) -> dict[str, Any]:
         """Return arguments of :meth:`LagrangianSystem.from_sympy`: coordinates, rotations, lagrangian, forces.
 
         Args:
             actuated: names of the joints on which an input ``tau_NAME`` acts, or ``True`` for all hinges and slides.
+            actuating: forces of actuators, with the rates along which they act.
 
         Raises:
             SystemDefinitionError: if a joint does not exist.
@@ -292,7 +291,8 @@ class Tree:
         turning = [rotation_of(joint) for joint in self.joints.values() if joint.kind in ("ball", "free")]
         names_of_q = [*chain.from_iterable(map(position_of, free)), *singles]
         spins = (rate for rotation in turning for rate in rotation.rates)
-        loads = self.forces_of_medium([*(symbol(name + DOT) for name in names_of_q), *spins])
+        rates = [*(symbol(name + DOT) for name in names_of_q), *spins]
+        loads = forces_on(rates, [*self.loads_of_medium(), *actuating])
         forces = {name: next(loads) + (symbol(f"tau_{name}") if name in driven else 0) for name in names_of_q}
         return {
             "coordinates": [*map(symbol, names_of_q)],
@@ -303,6 +303,14 @@ class Tree:
             "torques": {turn.name: load for turn in turning if any(load := [next(loads) for _ in range(3)])},
             "inputs": [f"tau_{name}" for name in driven],
         }
+
+
+def forces_on(rates: Sequence[Symbol], loads: Iterable[tuple[Expr, Expr]]) -> Iterator[Expr]:
+    """Yield the force on each rate u, the sum of F dv/du over loads F and the velocities v along which they act."""
+    held = {symbol(f"_load_{k}"): pair for k, pair in enumerate(loads)}
+    power = Add(*(load * along for load, (_, along) in held.items()))
+    values = {load: intermediate(value) for load, (value, _) in held.items()}
+    yield from (part.xreplace(values) for part in gradient_tuple(power, rates))
 
 
 def rotation_of(joint: Joint) -> Rotation:
@@ -408,11 +416,9 @@ def system_of_tree(
             return kind(**fields)
         return kind(**fields, dual_energy=_in_quaternions(dual_energy(tree), **fields))
 
-    arguments = tree.arguments(actuated)
+    arguments = tree.arguments(actuated, [acting for *_, acting in actuators])
     formula = arguments.pop("lagrangian") + tendons[0] - tendons[1]
-    arguments["dissipation"] = (
-        Add(arguments["dissipation"], tendons[2], *(actuator[-1] for actuator in actuators)) or None
-    )
+    arguments["dissipation"] = Add(arguments["dissipation"], tendons[2]) or None
     arguments["inputs"] += [name for _, name, *_ in actuators]
     try:
         return system_from_sympy(made, "Lagrangian", formula, name=name, constraints=constraints, **arguments)

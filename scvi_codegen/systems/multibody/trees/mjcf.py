@@ -28,7 +28,11 @@ from scvi_codegen.systems.multibody.trees.actuators import (
     Range,
     activation_of,
     actuator_of,
+    as_general,
     clamped,
+    coefficients_of,
+    inherited_by,
+    is_servo,
     motion_of,
     motion_of_sites,
 )
@@ -86,7 +90,7 @@ ORIENTATIONS = TURN.split()
 NO_MASS, LIGHT = 1e-15, 1e-14
 """Bodies with less mass are without forces of a medium, and boxes have no smaller sums of moments of inertia; geoms
 with less than the second have no axes."""
-GAINS, OF_SITES = {"kp", "kv", "gainprm", "biasprm"}, ["site", "refsite"]
+OF_SITES = ["site", "refsite"]
 AXES = dict(zip("xyz", np.eye(3), strict=True))
 Defaults = dict[str, dict[str, str]]
 """Attributes by kind of element."""
@@ -196,7 +200,7 @@ class _MujocoModel:
             pull = self.bounds(tendon, "actuatorfrc")
             if armature and self.responses:
                 tendon.refuse(f"has armature, which is not read with the springdamper of '{min(self.responses)}'")
-            own = tendon.name, pull, limits and checked_limits(tendon, *limits), friction
+            own = tendon.name, pull, limits, friction
             yield Tendon(factors, points, stiffness, damping, armature, slack, *own)
 
     def read(self, world: Element) -> None:
@@ -270,13 +274,10 @@ class _MujocoModel:
         if self.disabled & {"contact", "constraint"}:
             return
         sections = self.root.children("contact")
-        named = {geom.element.node.get("name"): k for k, geom in enumerate(self.geoms)}
+        named = {geom.element.node.get("name", ""): k for k, geom in enumerate(self.geoms)}
         written = set[tuple[int, ...]]()
         for pair in (pair for section in sections for pair in section.children("pair")):
-            for name in (names := [pair.text(key) for key in ("geom1", "geom2")]):
-                if name not in named:
-                    pair.refuse(f"names the geom '{name}', which does not exist{closest(name, [*filter(None, named)])}")
-            first, second = sorted(named[name] for name in names)
+            first, second = sorted(pair.among(key, "geom", named) for key in ("geom1", "geom2"))
             written.add((first, second))
             yield Pair.of_element(pair, self.geoms[first], self.geoms[second])
         excluded = {
@@ -341,6 +342,8 @@ class _MujocoModel:
         """Return the attribute ``range`` with a prefix, by default the inherited one, if it is in force."""
         limited = element.choice(f"{prefix}limited", "auto", "true", "false")
         low, high = map(float, element.vector(f"{prefix}range", inherited, (2,)))
+        if limited == "true" and not low < high and element.text("type", "") != "ball":
+            element.refuse(f"is limited to {prefix}range='{low:g} {high:g}': the second number must be larger")
         automatic = low < high and element.settings.choice("autolimits", "true", "false") == "true"
         return (low, high) if limited == "true" or (limited == "auto" and automatic) else None
 
@@ -349,39 +352,42 @@ class _MujocoModel:
         elements = [*self.entries("actuator")] if "actuators" in self.parts and "actuation" not in self.disabled else []
         names = {name: "" for element in elements if (name := element.node.get("name"))}
         targets = [next(((x, element.text(x)) for x in ACTED if element.has(x)), ("", "")) for element in elements]
-        parts: dict[tuple[str, str], Joint | Tendon] = {("tendon", tendon.name): tendon for tendon in tendons}
-        moving = [link.joint for link in self.links if link.joint.kind != "fixed"]
-        parts |= {(key, joint.label): joint for key in JOINTED for joint in moving}
+        paths = {tendon.name: tendon for tendon in tendons}
+        joints = {link.joint.label: link.joint for link in self.links if link.joint.kind != "fixed"}
         pulls = {("tendon", tendon.name): tendon.pull for tendon in tendons}
         for key, label in ((key, label) for key in JOINTED for label in self.singles if elements):
             pulls[key, label] = self.bounds(self.joints[label], "actuatorfrc")
-        rated = (label for x, (_, label) in zip(elements, targets, strict=True) if x.number("dampratio", 0, 0))
-        damped = self.singles.keys() & {*rated}
+        rated = (is_servo(element) and coefficients_of(element)[1][2] > 0 for element in elements)
+        damped = self.singles.keys() & {label for (_, label), damps in zip(targets, rated, strict=True) if damps}
         inverses = {self.links[k].joint.label: m for k, m in mean_inverses(self.completed() if damped else (), damped)}
         for element, target in zip(elements, targets, strict=True):
             gear = np.append(element.vector("gear", (1,), range(1, 7)), np.zeros(5))[:6]
             places = [key for key in (*ACTED, "refsite") if element.has(key)]
             if places != OF_SITES and len(places) > 1:
                 element.refuse(f"acts on {' and '.join(places)}: give one, or a site and its refsite")
-            if target in parts:
-                motion = motion_of(self.links, parts[target], gear, target[0] == "jointinparent")
-            elif target[0] == "site":
-                ends = [self.place(element, key) for key in ("site", "refsite") if element.has(key)]
-                motion = motion_of_sites(self.links, ends, gear)
+            if not target[0]:
+                element.refuse("acts on no joint, tendon or site, which are the parts that are read")
+            if target[0] == "site":
+                motion = motion_of_sites(self.links, [self.place(element, key) for key in places], gear)
             else:
-                element.refuse("acts on no joint, tendon or site of the model, which are the parts that are read")
+                things: Mapping[str, Joint | Tendon] = paths if target[0] == "tendon" else joints
+                part = element.among(target[0], target[0].removesuffix("inparent"), things)
+                motion = motion_of(self.links, part, gear, target[0] == "jointinparent")
             if any(pulls.values()) and (target[0] not in JOINTED or targets.count(target) > 1):
                 element.refuse("is one of several on a part with actuatorfrcrange, which is read of single ones only")
-            inherited = self.inherited(element, target)
-            law, clamping = activation_of(element), "clampctrl" not in self.disabled
-            controls = self.bounds(element, "ctrl", inherited) if clamping and law != "integrator" else None
-            controls = clamped(controls, None if law == "none" else self.bounds(element, "act"), 1.0)
+            law, inherited = activation_of(element), self.inherited(element, target)
+            controls = self.bounds(element, "ctrl", inherited)
+            activations = self.bounds(element, "act", inherited if law == "integrator" else (0, 0))
+            if law == "none" and activations:
+                element.refuse("has actrange, the range of an activation, which its dyntype does not have")
+            unclamped = law == "integrator" or "clampctrl" in self.disabled
+            controls = clamped(None if unclamped else controls, activations, 1.0)
             ranges = controls, clamped(self.bounds(element, "force"), pulls.get(target), gear[0])
             inverse = inverses.get(target[1]) if target[0] in JOINTED else None
             actuator = actuator_of(self.links, element, motion, gear[0], names, *ranges, inverse)
             names[actuator[0]] = actuator[1]
             if element.number("group", 0) in self.idle:
-                actuator = *actuator[:-1], S.Zero
+                actuator = *actuator[:-1], (S.Zero, S.Zero)
             if law != "none":
                 self.activated.add(actuator[1])
                 self.unread.add(f"the law of activations (dyntype '{law}'), which are the inputs, of", actuator[0])
@@ -389,12 +395,12 @@ class _MujocoModel:
 
     def inherited(self, element: Element, target: tuple[str, str]) -> Sequence[float]:
         """Return the range of a control by ``inheritrange``, this multiple of that of the joint; (0, 0) without."""
-        if not (share := element.number("inheritrange", 0, 0)):
+        if not (share := element.number("inheritrange", 0, 0)) or not is_servo(element):
             return 0.0, 0.0
         single = self.singles.get(label := target[1]) if target[0] in JOINTED else None
         low, high = self.joints[label].vector("range", (0, 0), (2,)) if single else (0.0, 0.0)
-        if low == high or element.has("ctrlrange"):
-            element.refuse("has an inheritrange, which is read of joints with a range and without ctrlrange")
+        if low == high or element.has("ctrlrange") or element.has("actrange"):
+            element.refuse("has an inheritrange, which is read of joints with a range, without ctrlrange and actrange")
         middle, radius = (low + high) / 2, (high - low) / 2 * share
         unit = _unit(element) if single and single.kind == "hinge" else 1.0
         return (middle - radius) * unit, (middle + radius) * unit
@@ -484,9 +490,7 @@ class _MujocoModel:
         """Return the length of the joint or tendon that an attribute names."""
         if key.startswith("joint"):
             return symbol(self.single(element, key).name)
-        if (name := element.text(key)) not in paths:
-            element.refuse(f"names the tendon '{name}', which does not exist{closest(name, paths)}")
-        return length_of(self.links, paths[name])
+        return length_of(self.links, element.among(key, "tendon", paths))
 
     def single(self, element: Element, key: str) -> Joint:
         """Return the hinge or slide that an attribute names."""
@@ -753,7 +757,7 @@ def _apply_defaults(root: Element) -> None:
         if name not in classes:
             element.refuse(f"is of the class '{name}', which does not exist{closest(name, classes)}")
         if kind.defaults:
-            element.node.attrib.update(_over(classes[name].get(kind.defaults, {}), element.node.attrib))
+            _inherit(element, classes[name], kind.defaults)
         element.check_neutral(kind)
 
 
@@ -771,14 +775,22 @@ def _classes(root: Element) -> dict[str, Defaults]:
                 if kind is not None and kind.defaults:
                     if wrong := {"class", "name"} & {*child.node.attrib}:
                         child.refuse(f"has {min(wrong)}, which defaults do not have")
-                    own = child.node.attrib | ({"kind": child.tag} if GAINS & {*child.node.attrib} else {})
-                    classes[name] |= {kind.defaults: _over(classes[name].get(kind.defaults, {}), own)}
+                    _inherit(child, classes[name], kind.defaults)
+                    classes[name] |= {kind.defaults: child.node.attrib}
             for child in element.children("default"):
                 if child.text("class") in classes:
                     child.refuse(f"is the second of the class '{child.text('class')}': one is allowed")
                 classes[child.text("class")] = dict(classes[name])
                 pending.append((child, child.text("class")))
     return classes
+
+
+def _inherit(element: Element, defaults: Defaults, kind: str) -> None:
+    """Give an element the attributes of a class that it has not."""
+    own, inherited = element.node.attrib, defaults.get(kind, {})
+    own.update(_over(inherited_by(element.tag, inherited) if kind == "actuator" else inherited, own))
+    if kind == "actuator":
+        as_general(element)
 
 
 def _over(defaults: dict[str, str], attributes: dict[str, str]) -> dict[str, str]:

@@ -51,7 +51,24 @@ TENDON = Kind(
     "tendon",
 )
 EQUALITY = Kind("name class active", f"{SOFTNESS} tendon1 tendon2 polycoef flex cell", defaults="equality")
-ACTUATORS = "general motor position velocity intvelocity orientation pid damper cylinder muscle adhesion dcmotor plugin"
+ACTUATORS = {
+    "general": "actdim actlimited actrange biasprm biastype dynprm dyntype gainprm gaintype inheritrange",
+    "motor": "",
+    "position": "dampratio inheritrange kp kv timeconst",
+    "velocity": "kv",
+    "intvelocity": "actlimited actrange dampratio inheritrange kp kv",
+    "damper": "kv",
+    "cylinder": "area bias diameter timeconst",
+}
+"""Actuators that are read, with the attributes that not all of them have."""
+ACTUATED = (
+    "name class joint jointinparent tendon site refsite gear armature damping ctrllimited ctrlrange forcelimited "
+    "forcerange delay group",
+    "actearly body cranklength cranksite ffrange input interp lengthrange nsample slidersite user velrange",
+)
+OTHERS = "orientation pid muscle adhesion dcmotor plugin"
+"""Actuators that are not read."""
+ACTING = f"{'{0} '.join(ACTUATORS)}{{0}} {'=other_actuator{0} '.join(OTHERS.split())}=other_actuator{{0}}"
 
 MJCF = {
     "mujoco": Kind(
@@ -84,7 +101,7 @@ MJCF = {
     "default": Kind(
         "class",
         children="default* joint geom site equality=any_equality tendon=spatial mesh texture~ material~ "
-        f"camera~ light~ pair {' '.join(f'{tag}=actuated' for tag in ACTUATORS.split())}",
+        f"camera~ light~ pair {ACTING.format('')}",
     ),
     "asset": Kind(children="model=asset_model* mesh* hfield~ skin~ texture~ material~"),
     "mesh": Kind(
@@ -131,15 +148,13 @@ MJCF = {
     "tendon": Kind(children="spatial* fixed*"),
     "spatial": TENDON,
     "fixed": TENDON,
-    "actuator": Kind(children=" ".join(f"{tag}=actuated*" for tag in ACTUATORS.split())),
-    "actuated": Kind(
-        "name class joint jointinparent tendon gear armature damping gaintype gainprm biastype biasprm kp kv "
-        "ctrllimited ctrlrange forcelimited forcerange dyntype timeconst delay dampratio inheritrange site refsite "
-        "actlimited actrange area bias diameter group",
-        "actdim actearly body cogging controller cranklength cranksite dynprm "
-        "ffrange force fpmax fvmax gain imax inductance input instance interp ki lengthrange lmax lmin lugre "
-        "motorconst nominal nsample plugin posrange range resistance saturation scale slewmax slidersite "
-        "tausmooth thermal user velrange vmax",
+    "actuator": Kind(children=ACTING.format("*")),
+    **{tag: Kind(f"{ACTUATED[0]} {own}", ACTUATED[1], defaults="actuator") for tag, own in ACTUATORS.items()},
+    "other_actuator": Kind(
+        ACTUATED[0],
+        f"{ACTUATED[1]} {' '.join(ACTUATORS.values())} cogging controller force fpmax fvmax gain imax inductance "
+        "instance ki lmax lmin lugre motorconst nominal plugin posrange range resistance saturation scale slewmax "
+        "tausmooth thermal vmax",
         None,
         "config~",
         "actuator",
