@@ -119,9 +119,19 @@ MESHES = {
     "format": ('file="leg.xml"', "cannot be read as STL, OBJ"),
     "mesh outside": ('file="../m.stl"', "outside the folder of the document"),
     "orientation": (BOXES.replace("0 2 1", "0 1 2") + ' inertia="exact"', "has triangles with opposite orientations"),
-    "volume": (f'vertex="{BOX}" face="0 1 2" inertia="exact"', "has the volume"),
+    "volume": (
+        'vertex="0 0 0 1 0 0 0 1 0 0 0 1" face="0 1 2 0 3 1 0 2 3 1 3 2" inertia="exact"',
+        "has the volume -0.166667: turn its triangles",
+    ),
     "corner": (BOXES.replace("0 2 1", "0 2 99"), "and faces of 3 of their numbers each"),
-    "flat": ('vertex="0 0 0 1 0 0 0 1 0 1 1 0"', "has no convex hull"),
+    "flat": ('vertex="0 0 0 1 0 0 0 1 0 1 1 0"', "is flat or too narrow for a convex hull: give faces"),
+    "flat faces": (
+        'vertex="0 0 .3 1 0 .1 0 1 .2 1 1 0" face="0 1 2 1 3 2"',
+        "is flat, without a volume: use inertia='shell'",
+    ),
+    "line": ('vertex="0 0 0 1 1 0 2 2 0 3 3 0" face="0 1 2 1 3 2" inertia="shell"', "has the volume 0"),
+    "far": (f'vertex="{BOX.replace("-.25", "1e38")}" face="{FACES}"', "not finite or not smaller than 1e+15"),
+    "infinite": (f'vertex="{BOX.replace("-.25", "inf")}" face="{FACES}"', "which must be numbers"),
 }
 
 

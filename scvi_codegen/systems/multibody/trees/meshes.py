@@ -16,21 +16,24 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from scvi_codegen.common.errors import closest, imported
+from scvi_codegen.common.errors import imported
 from scvi_codegen.systems.formulas.rotations import matrix_of
 from scvi_codegen.systems.multibody.trees.document import Element, bytes_of
 from scvi_codegen.systems.multibody.trees.tree import Inertia, Vector
+
+LARGEST = 1e15
+"""Bound of the coordinates of corners, beside which 1 is not lost to rounding."""
+FLAT = 1e-7
+"""Volumes that are smaller parts of the power 3/2 of the surface are due to the single precision of corners."""
 
 
 def inertia_of(geom: Element, computed: dict[Node, Inertia]) -> Inertia:
     """Return the inertia of the ``<mesh>`` of a geom, of density 1, whose name is by default that of its file."""
     meshes = [mesh for assets in geom.document.children("asset") for mesh in assets.children("mesh")]
     names = {mesh.node.get("name", Path(mesh.node.get("file", "")).stem): mesh for mesh in meshes}
-    if (name := geom.text("mesh")) not in names:
-        geom.refuse(f"names the mesh '{name}', which is not in <asset>{closest(name, names)}")
-    node = names[name].node
-    computed[node] = computed.get(node) or _inertia(names[name])
-    return computed[node]
+    mesh = geom.among("mesh", "mesh", names)
+    computed[mesh.node] = computed.get(mesh.node) or _inertia(mesh)
+    return computed[mesh.node]
 
 
 def _inertia(mesh: Element) -> Inertia:
@@ -41,7 +44,8 @@ def _inertia(mesh: Element) -> Inertia:
         try:
             rule, faces = "shell" if rule == "shell" else "convex", scipy.spatial.ConvexHull(corners).simplices
         except (scipy.spatial.QhullError, ValueError) as error:
-            mesh.refuse(f"has no convex hull: {str(error).strip().splitlines()[0]}")
+            problem = "is flat or too narrow for a convex hull: give faces and inertia='shell'"
+            mesh.refuse(f"{problem} ({str(error).strip().splitlines()[0]})")
     merged = np.unique(corners, axis=0, return_inverse=True)[1].reshape(-1)[faces]
     sides = np.concatenate([merged[:, [i, (i + 1) % 3]] for i in range(3)])
     if rule == "exact" and len(np.unique(sides, axis=0)) < len(sides):
@@ -50,7 +54,10 @@ def _inertia(mesh: Element) -> Inertia:
     with np.errstate(all="ignore"):
         axes = np.array(matrix_of([*map(float, turn / np.linalg.norm(turn))]), dtype=float)
         corners = (corners - mesh.vector("refpos", (0, 0, 0))) @ axes * scale
-        inertia = _integrals(corners[faces][:, :: -1 if np.prod(scale) < 0 else 1], rule)
+        triangles = corners[faces][:, :: -1 if np.prod(scale) < 0 else 1]
+        inertia, surface = _integrals(triangles, rule), _integrals(triangles, "shell").mass
+    if not (abs(inertia.mass) > FLAT * surface**1.5 or rule == "shell"):
+        mesh.refuse("is flat, without a volume: use inertia='shell', or a thin box")
     if not inertia.mass > 0:
         mesh.refuse(f"has the volume {inertia.mass:g}: turn its triangles, or use inertia='convex' or 'shell'")
     return inertia
@@ -86,6 +93,8 @@ def _read(mesh: Element) -> tuple[Vector, NDArray[np.intp]]:
         corners, faces = (_of_msh if file.suffix.lower() == ".msh" else _of_known_format)(mesh, file)
     if len(corners) < 12 or len(corners) % 3 or len(faces) % 3 or not set(faces) <= {*range(len(corners) // 3)}:
         mesh.refuse("needs at least 4 vertices, and faces of 3 of their numbers each")
+    if not (np.abs(corners) < LARGEST).all():
+        mesh.refuse(f"has vertices that are not finite or not smaller than {LARGEST:g}: use other units of length")
     return corners.astype(np.float32).astype(float).reshape(-1, 3), faces.astype(int).reshape(-1, 3)
 
 
