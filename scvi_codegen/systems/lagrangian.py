@@ -473,7 +473,7 @@ class LagrangianSystem(MechanicalSystem):
             system: LagrangianSystem = system_of_tree(cls, name, links, gravity, actuated, *added, keys=keys)
         except SystemDefinitionError as error:
             raise SystemDefinitionError(f"{path}: {error}") from error
-        if beyond := outside_limits(links, system.keyframes):
+        if beyond := outside_limits(system.contacts, system.keyframes):
             remedy = "pass other positions, correct ref, qpos or range, or limits='ignore'"
             warn(f"{path}: no run begins outside limits, as {beyond}: {remedy}", SystemDefinitionWarning)
         return system

@@ -25,6 +25,9 @@ A, B = '<joint name="x" axis="1 2 3" {}/>', '<joint name="y" axis="0 1 0" {}/>'
 PATH = '<tendon><spatial name="t" stiffness="3"><site site="w"/>{}<site site="e"/></spatial></tendon>'
 MUSCLE, SERVO = '<actuator><muscle joint="x"/></actuator>', '<actuator><position name="u" joint="x" kv="1"/></actuator>'
 RATIOS = '<actuator><position joint="{}" kp="3" dampratio=".7" gear="2" inheritrange=".8"/></actuator>'
+CLASSES = """<default><default class="p"><position kp="4" kv="1" inheritrange="1"/></default><default class="g">
+<general gainprm="2 3" biasprm="1 -2" gaintype="affine"/><intvelocity kp="3" dampratio=".7"/></default>
+<default class="d"><damper kv="2"/></default></default>"""
 WRENCHES = '<actuator>{} gear="{}"/></actuator>'
 ELLIPSOIDS = (
     '<geom type="{}" size="{}" pos=".1 0 .2" euler=".3 .2 .1" fluidshape="ellipsoid" fluidcoef=".3 .2 1 .7 .6"/>'
@@ -100,6 +103,30 @@ ROWS: dict[str, tuple[dict[str, str], str | None]] = {
             + WRENCHES.format('<damper joint="x" kv="2" ctrlrange="0 1"', "2")
             + WRENCHES.format('<motor joint="y" group="3"', "2"),
             "option": 'actuatorgroupdisable="1 3"',
+        },
+        EQUAL,
+    ),
+    "actuators over classes of others": (
+        {
+            "rest": CLASSES
+            + WRENCHES.format('<velocity joint="x" class="p"', "2")
+            + WRENCHES.format('<general joint="y" class="p"', "-1")
+            + WRENCHES.format('<motor joint="y" class="p"', "3")
+            + WRENCHES.format('<damper joint="y" class="p" ctrlrange="0 1" kv=".5" forcerange="-.1 .2"', "3")
+            + WRENCHES.format('<cylinder joint="y" class="p" bias="1 2 3"', "3")
+            + WRENCHES.format('<general joint="x" class="g" actrange="-.1 .2"', "2")
+            + WRENCHES.format('<position joint="x" class="g" kp="5"', "2")
+            + WRENCHES.format('<position joint="y" class="p" kv=".7"', "2")
+            + WRENCHES.format('<velocity joint="x" class="d" kv="2" ctrlrange="0 1"', "2"),
+            "a": A.format('range="-1 .5"'),
+            "b": B.format('range="-1 .7"'),
+        },
+        EQUAL,
+    ),
+    "forces of gains of velocities in ranges": (
+        {
+            "rest": WRENCHES.format('<damper joint="x" kv="2" ctrlrange="0 1" forcerange="-.1 .2"', "2")
+            + WRENCHES.format('<general joint="y" gaintype="affine" gainprm="1 2 3" forcerange="-.3 .3"', "2")
         },
         EQUAL,
     ),
@@ -246,18 +273,35 @@ def test_the_link_world_needs_no_declaration(tmp_path):
     assert systems[0] == systems[1]
 
 
+HINGE = {"a": A.format('range="10 60"')}
+BALL = {"a": '<joint name="x" type="ball" range="0 60"/>', "b": ""}
+ROPE = {"rest": '<tendon><fixed name="t" range="-1 1"><joint joint="x" coef="2"/></fixed></tendon>'}
+OUTSIDE = {
+    "reference": (HINGE, "2 0", "qpos0", "lower limit of joint 'x'", -np.pi / 18),
+    "hinge": (HINGE, "2 0", "far", "upper limit of joint 'x'", np.pi / 3 - 2),
+    "ball": (
+        {"a": '<joint name="x" type="ball" range="0 60"/>', "b": ""},
+        "0 1 0 0",
+        "far",
+        "limit of joint 'x'",
+        -np.sqrt(3),
+    ),
+    "tendon": (ROPE, "2 0", "far", "upper limit of tendon 't'", -3.0),
+}
+"""Parts, place, state, limit, and the gap there; of a ball (cos a - cos 60)/sin 60, here for a half turn."""
+
+
 @pytest.mark.second
-def test_outcome_of_states_outside_limits(tmp_path):
-    file, keys = tmp_path / "robot.xml", '<keyframe><key name="far" qpos="2 0"/></keyframe>'
-    parts = {"compiler": "", "option": "", "a": A.format('range="10 60"'), "b": B.format(""), "rest": keys}
+@pytest.mark.parametrize("kind", OUTSIDE)
+def test_outcome_of_states_outside_limits(kind, tmp_path):
+    file, (parts, place, state, limit, gap) = tmp_path / "robot.xml", OUTSIDE[kind]
+    parts = {"compiler": "", "option": "", "a": A.format(""), "b": B.format(""), "rest": ""} | parts
+    parts["rest"] += f'<keyframe><key name="far" qpos="{place}"/></keyframe>'
     file.write_text(MJCF.format(**parts, box=BOX, faces=FACES))
-    beyond = "begins outside limits, as 'qpos0' with joint 'x' at 0, of the range 0.174533 to 1.0472, 'far' .* at 2, of"
-    with pytest.warns(SystemDefinitionWarning, match=beyond):
+    with pytest.warns(SystemDefinitionWarning, match=f"'{state}' with the {limit} of the range .* at {gap:.6g}"):
         system = sc.LagrangianSystem.from_mjcf(file, limits="contact")
-    stepper = sc.compile_stepper(system, "svi:2")
-    for name in ("qpos0", "far"):
-        with pytest.raises(ContactError, match=r"limit of joint 'x' of the range .*1.0472\) at -.*, the range"):
-            stepper.integrate(**system.keyframes[name], h=0.01, steps=2)
+    with pytest.raises(ContactError, match=f"{limit} of the range .* at {gap:.6g}"):
+        sc.compile_stepper(system, "svi:2").integrate(**system.keyframes[state], h=0.01, steps=2)
 
 
 @pytest.mark.second

@@ -4,8 +4,17 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import islice
 from typing import Any
 
+import numpy as np
+
+from scvi_codegen.common.precision import mp
+from scvi_codegen.systems.contact import Contact
+from scvi_codegen.systems.formulas.expressions import Tape
+from scvi_codegen.systems.formulas.rotations import Rotation, matrix_of
+from scvi_codegen.systems.formulas.symbols import symbol
 from scvi_codegen.systems.multibody.trees.document import NAMED
-from scvi_codegen.systems.multibody.trees.tree import SINGLE, Link
+
+SMALL = 1e-9
+"""Size of negative gaps with which runs begin."""
 
 
 def keyframe(links: Iterable[Any], inputs: Sequence[str], numbers: Mapping[str, Any]) -> dict[str, Any]:
@@ -27,14 +36,19 @@ def keyframe(links: Iterable[Any], inputs: Sequence[str], numbers: Mapping[str, 
     return {"q": q, "velocity": velocity, **controls}
 
 
-def outside_limits(links: Sequence[Link], states: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the states, and their joints, that are outside the limits of joints; no text without any."""
-    joints = (link.joint for link in links)
-    ranges = [(joint.label, joint.name, *joint.limits) for joint in joints if joint.limits and joint.kind in SINGLE]
-    beyond = [
-        f"'{state}' with joint '{label}' at {q[name]:.9g}, of the range {low:g} to {high:g}"
-        for state, q in ((state, values["q"]) for state, values in states.items())
-        for label, name, low, high in ranges
-        if name in q and not low <= q[name] <= high  # those that follow others are not in q
-    ]
+def outside_limits(contacts: Iterable[Any], states: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the states and the limits of joints and tendons whose gaps are negative there; no text without any."""
+    limits = [item for item in contacts if isinstance(item, Contact) and "limit of " in item.name]
+    gaps: list[Any] = [item.gap for item in limits]
+    variables = sorted(set().union(*(gap.free_symbols for gap in gaps)), key=str)
+    tape, beyond = Tape(gaps, variables), list[str]()
+    for state, q in ((state, values["q"]) for state, values in states.items()):
+        numbers = {symbol(name): x for name, x in q.items()}
+        for name, x in q.items():
+            if np.ndim(x):
+                turn = np.array(x if np.ndim(x) > 1 else matrix_of([*map(float, x / np.linalg.norm(x))]))
+                numbers |= zip(Rotation(name, "").entries, turn.flat, strict=True)
+        values = map(float, tape([mp.mpf(float(numbers[x])) for x in variables]))
+        outside = [(item, gap) for item, gap in zip(limits, values, strict=True) if gap < -SMALL]
+        beyond += [f"'{state}' with the {item.name} at {gap:.6g}" for item, gap in outside]
     return ", ".join(beyond[:NAMED]) + (f" and {len(beyond) - NAMED} more" if beyond[NAMED:] else "")
