@@ -34,8 +34,8 @@ WORDS = ("name", "impacts")
 """Arguments that are no formulas."""
 
 
-MOST_CONTACTS = 64
-"""Contacts of a system."""
+MOST_ROWS = 192
+"""Gaps and slips of a system: runs keep matrices of as many rows and columns, of 295 kB each, on the stack."""
 
 
 def _number(formula: Formula) -> float | None:
@@ -177,6 +177,11 @@ def slips_of(item: Any) -> tuple[Any, ...]:
     if item.slip is None:
         return ()
     return item.slip if isinstance(item.slip, tuple) else (item.slip,)
+
+
+def rows_of(contacts: Iterable[ContactLike]) -> int:
+    """Return the number of gaps and slips of contacts."""
+    return sum(isinstance(item, Contact) + len(slips_of(item)) for item in contacts)
 
 
 def _number_or_text(value: Any) -> float | str:

@@ -219,6 +219,19 @@ def test_balls_close_at_once_by_one_formula() -> None:
     assert run.q[-1, :12] == pytest.approx(np.sqrt(2 / G) + v**2 / (2 * mu * G), abs=1e-12)
 
 
+@pytest.mark.rotated
+def test_a_hundred_balls_bounce_or_rest() -> None:
+    start, e = np.linspace(1.0, 1.5, 100), np.tile([0.0, 0.5], 50)
+    floor = sc.contact("y[i] for i in 100", restitution="e[i]")
+    lagrangian = f"sum(i in 100, y_dot[i]**2/2 - {G}*y[i])"
+    balls = sc.LagrangianSystem.from_text("balls", ["y[100]"], lagrangian, contacts=[floor], parameters={"e[100]": e})
+    run = sc.compile_stepper(balls, "svi:2").integrate(start, velocity=0 * start, h=0.05, t_end=0.6)
+    landed = np.sqrt(2 * start / G)
+    after = 0.6 - landed  # before the second impacts, which are after as much time again
+    assert run.q[-1] == pytest.approx(np.where(e > 0, e * G * landed * after - G * after**2 / 2, 0), abs=1e-12)
+    assert run.contact_modes[-1][1] == tuple(np.where(e > 0, "open", "slip"))
+
+
 @pytest.mark.parametrize(
     ("law", "after"), [("sequential", [0, 0, 0, 0, 1]), ("simultaneous", [-0.6, 0.4, 0.4, 0.4, 0.4])]
 )

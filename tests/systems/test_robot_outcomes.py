@@ -310,6 +310,6 @@ def test_outcome_of_too_many_contacts(tmp_path):
     floor, joint = '<geom type="plane" size="1 1 1"/>', '<joint type="free" limited="true"/>'
     file.write_text(f"<mujoco><worldbody>{floor}<body>{joint}{feet}</body></worldbody></mujoco>")
     with pytest.raises(
-        SystemDefinitionError, match="the robot has 65 contacts, 65 of them of geoms and tendons, of at"
+        SystemDefinitionError, match="has 195 gaps and slips of contacts, 195 of them of geoms and tend"
     ):
         sc.LagrangianSystem.from_mjcf(file, limits="contact", contacts="planes")

@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.systems.contact import (
-    MOST_CONTACTS,
+    MOST_ROWS,
     WORDS,
     Contact,
     ContactLike,
     Friction,
     Impacts,
+    rows_of,
     slips_of,
     static_limit,
 )
@@ -113,9 +114,9 @@ class _Binding:
         """Return the system with these contacts."""
         expressions, rows = [], []
         elements = [element for item in contacts for element in self._elements(item)]
-        if len(elements) > MOST_CONTACTS:
+        if (count := rows_of(elements)) > MOST_ROWS:
             raise SystemDefinitionError(
-                f"'{self.system.name}' has {len(elements)} contacts, of at most {MOST_CONTACTS}: leave some out"
+                f"'{self.system.name}' has {count} gaps and slips of contacts, of at most {MOST_ROWS}: leave some out"
             )
         for number, item in enumerate(elements, 1):
             named = mapped(item, partial(self._read, item))

@@ -44,7 +44,7 @@ import numpy as np
 from sympy import Abs, Add, Expr, Matrix, Rational, S, Symbol, atan2, cos, eye, sin, sqrt, zeros
 
 from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
-from scvi_codegen.systems.contact import MOST_CONTACTS, ContactLike, contact, friction
+from scvi_codegen.systems.contact import MOST_ROWS, ContactLike, contact, friction, rows_of
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
 from scvi_codegen.systems.formulas.intermediates import intermediate, product, total
 from scvi_codegen.systems.formulas.rotations import Rotation, RotationNames
@@ -399,11 +399,11 @@ def system_of_tree(
             raise SystemDefinitionError(f"{problem}, or integrate it as it is written by check_inertias=False")
         warn(problem, SystemDefinitionWarning)
     contacts = *tree.contacts(law), *touching
-    if len(contacts) > MOST_CONTACTS:
+    if (rows := rows_of(contacts)) > MOST_ROWS:
         raise SystemDefinitionError(
-            f"the robot has {len(contacts)} contacts, {len(touching)} of them of geoms and tendons, of at most "
-            f"{MOST_CONTACTS}: leave some out by contype='0' conaffinity='0' of geoms, <exclude>, limits='ignore' or "
-            "friction='ignore'"
+            f"the robot has {rows} gaps and slips of contacts, {rows_of(touching)} of them of geoms and tendons, of at "
+            f"most {MOST_ROWS}: leave some out by contype='0' conaffinity='0' or condim='1' of geoms, <exclude>, "
+            "limits='ignore' or friction='ignore'"
         )
 
     def made(**fields: Any) -> Any:
