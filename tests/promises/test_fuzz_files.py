@@ -231,7 +231,7 @@ def kinds() -> dict[str, Kind]:
             lambda folder: sc.LagrangianSystem.from_mjcf(folder / "figure.xml"),
         ),
         "random mjcf": Kind(
-            {"model.xml": (robot := Mjcf(3)).document.encode(), "included.xml": robot.included.encode()},
+            {path.name: path.read_bytes() for path in Mjcf(3).write(folder).parent.glob("*.xml")},
             lambda folder: sc.LagrangianSystem.from_mjcf(folder / "model.xml"),
         ),
         "random urdf": Kind(

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy
-from random_robots import errors_of_motion, motion_by_mujoco
+from random_robots import motion_by_mujoco
 from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
@@ -419,37 +419,6 @@ def test_names_become_identifiers(tmp_path):
     assert [str(q) for q in system.coordinates] == [*expected.values()]
     assert (system.name, system.inputs) == ("names", ("tau_left_hip_3",))
     assert str(system.constraints[0]) == "(-joint_1_knee + left_hip_2)"
-
-
-HINGES = '<joint name="1-a" axis="1 2 3" springref="10"/>', '<joint name="t" ref="7" axis="0 1 0"/>'
-FIXED = '<tendon><fixed {}><joint joint="1-a" coef=".5"/><joint joint="t" coef="-2"/></fixed></tendon>'
-SPATIAL = '<tendon><spatial {}><site site="w"/><site site="s"/><site site="e"/></spatial></tendon>'
-BALLS = '<joint name="a b" type="ball" stiffness="3 2 1" damping="1 2 3"/>', '<joint name="exp" type="ball"/>'
-MOTIONS = {
-    "slack tendon": (*HINGES, FIXED.format('stiffness="3 2 1" springlength=".1 .2" damping="1 2 3"')),
-    "tendon of balls": (*BALLS, SPATIAL.format('stiffness="3" springlength=".2" armature=".4" damping=".2"')),
-    "free body": ('<joint name="α" type="free" stiffness="3 2 1" damping="1 2 3"/>', HINGES[1], ""),
-    "free in a medium": ('<freejoint name="f"/><geom size=".2"/>', BALLS[1], '<option density="9" viscosity="1"/>'),
-    "bounds of inertias": (*HINGES, '<compiler boundmass="30" boundinertia=".2"/>'),
-    "balanced inertia": (
-        HINGES[0],
-        HINGES[1] + '<inertial pos=".1 0 0" mass="1" diaginertia=".1 .2 .9"/>',
-        '<compiler balanceinertia="true"/>',
-    ),
-}
-"""What test_random_robots.py does not draw."""
-
-
-@pytest.mark.tiers(0, 1)
-@pytest.mark.parametrize("case", MOTIONS)
-def test_equations_of_motion_are_those_of_mujoco(case, tmp_path):
-    pytest.importorskip("mujoco", reason="pip install mujoco")
-    file, (one, two, rest) = tmp_path / "model.xml", MOTIONS[case]
-    file.write_text(f"""<mujoco><option gravity="0 1 -9"><flag contact="disable"/></option><worldbody>
-<site name="w" pos=".1 .5 .2"/><body name="a" pos=".1 .2 .3" euler="10 20 30">{one}<geom size=".1" pos=".3 .1 0"/>
-<site name="s" pos=".3 .1 .1"/><body name="b" pos=".3 0 0">{two}<geom type="box" size=".1 .2 .3" pos=".3 0 .1"/>
-<site name="e" pos=".2 .2 .1"/></body></body></worldbody>{rest}</mujoco>""")
-    assert max(errors_of_motion(sc.LagrangianSystem.from_mjcf(file, actuators=True), file)) < 1e-12
 
 
 LEG = """<body pos="0 0 -.2"><joint name="hip{0}"/><geom pos="0 0 -.225" size=".05 .225"/><body pos="0 0 -.7">

@@ -1,21 +1,24 @@
-"""Random robots in MJCF and URDF over the attributes that are read, and their energies by MuJoCo and Pinocchio.
+"""Random robots in MJCF and URDF over all that is read, and their motions by MuJoCo and Pinocchio.
 
-``python tests/tools/random_robots.py`` records the energies for tests on machines without these programs.
+``python tests/tools/random_robots.py`` records the motions for tests on machines without these programs.
 """
 
 import json
 import random
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 RECORDED = Path(__file__).parents[1] / "systems" / "robots" / "random.json"
 SEEDS = 8
-"""Number of robots of each format whose energies are recorded."""
+"""Number of robots of each format whose motions are recorded."""
 TURNS = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
 SHAPES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}
-State = dict[str, list[float]]
-"""Position (or quaternion) and velocity of each joint, one after the other, by its name."""
+Motion = dict[str, Any]
+"""Labels of joints and MuJoCo's kinds; positions, velocities and accelerations at rest and at a random state; energies
+of both, powers of forces and residuals of equalities at the second; and the values of inputs by name."""
 
 
 class Draw:
@@ -47,16 +50,21 @@ def element(tag: str, attributes: dict[str, str], *inner: str) -> str:
     return f"<{tag}{written}>{''.join(inner)}</{tag}>"
 
 
-class Mjcf:
-    """Random model; ``document`` is its text, ``included`` that of a file that it includes."""
+BOX = "-1 -.5 -.25 0 -.5 -.25 -1 .5 -.25 0 .5 -.25 -1 -.5 .25 0 -.5 .25 -1 .5 .25 0 .7 .25"
+FACES = "0 2 1 1 2 3 4 5 6 5 7 6 0 1 4 1 5 4 2 6 3 3 6 7 0 4 2 2 4 6 1 3 5 3 7 5"
+PART = """<mujoco model="part"><compiler angle="{angle}" eulerseq="{sequence}"/><default><geom size=".2"/></default>
+<worldbody><body name="p" pos="{place}" euler="{turn}"><joint name="pj" axis="{axis}" ref=".3" stiffness="2 1"/>
+<geom pos="{center}"/><site name="ps" pos=".1 0 0"/></body></worldbody></mujoco>"""
 
-    depth = 2
+
+class Mjcf:
+    """Random model: its text, and those of a file that it includes and of one that it attaches."""
 
     def __init__(self, seed: int) -> None:
-        self.draw, self.seed = Draw(seed), seed
-        draw = self.draw
+        self.draw = draw = Draw(seed)
         self.joints: dict[str, str] = {}
-        self.bodies = 0
+        self.bodies, self.depth = 0, draw.one(1, 1, 1, 2)
+        self.clamped = draw.maybe(0.3)  # torques, and then no actuators of tendons
         self.fromto = draw.maybe(0.3)  # geoms then have no pos
         self.classes = ["main", "a", "b", "c"]
         compiler = draw.some(0.4, angle=draw.one("radian", "degree"), settotalmass="7")
@@ -75,11 +83,16 @@ class Mjcf:
             option,
             defaults,
             element("worldbody", {}, '<include file="included.xml"/>', element("site", {"name": "s"} | self.site())),
+            element("asset", {}, *self.meshes(), '<model name="part" file="part.xml"/>'),
+            element("option", draw.some(0.2, density=draw.numbers(1, 0, 2), viscosity=draw.numbers(1, 0))),
             element("equality", {}, *self.equalities()),
-            element("actuator", {}, *self.actuators()),
-            *self.sections(),
+            element("tendon", {}, *self.tendons()),
+            element("actuator", {}, *self.motors(), *self.servos()),
+            element("keyframe", {}, element("key", draw.some(0.5, name="k"))),
         ]
         self.document = element("mujoco", {}, *sorted(sections, key=lambda _: draw.random()))
+        kinds = {"angle": draw.one("radian", "degree"), "sequence": draw.one("xyz", "ZYX")}
+        self.part = PART.format(**kinds, **{key: draw.numbers(3, 0.1) for key in ("place", "turn", "axis", "center")})
 
     def default(self) -> str:
         draw = self.draw
@@ -108,20 +121,13 @@ class Mjcf:
         )
         return attributes | ({} if self.fromto else draw.some(0.5, pos=draw.numbers(3)))
 
-    def spring(self, kind: str) -> dict[str, str]:
-        return {"stiffness": "0" if kind == "ball" else self.draw.numbers(1, -1, 3)}
-
     def forces(self, kind: str) -> dict[str, str]:
-        """Return further attributes of a joint."""
-        return {}
-
-    def further(self, name: str) -> list[str]:
-        """Return further parts of a body."""
-        return []
-
-    def sections(self) -> list[str]:
-        """Return further sections."""
-        return []
+        """Return springs, dampers and limits of a joint."""
+        draw = self.draw
+        damping = {"damping": draw.numbers(draw.one(1, 2, 3), 0)} if draw.maybe(0.3) else {}
+        stiffness = draw.numbers(draw.one(1, 2, 3), -(kind != "ball"), 3) if draw.maybe() else "0"
+        limits = draw.some(0.3, range="0 0.2" if kind == "ball" else "0.1 0.2")
+        return {"stiffness": stiffness, **damping, **limits, **draw.some(0.5 * self.clamped, actuatorfrcrange="-1 2")}
 
     def site(self) -> dict[str, str]:
         return self.draw.turn(0.4) | self.draw.some(0.5, pos=self.draw.numbers(3))
@@ -142,10 +148,8 @@ class Mjcf:
             if kind == "hinge" and "ball" in kinds[:k]:
                 continue
             self.joints[f"j{name}{k}"] = kind
-            spring = self.spring(kind)
-            own = {"name": f"j{name}{k}", "type": kind, **self.joint(), **self.klass("class"), **spring}
-            own |= self.forces(kind)
-            parts.append(element("joint", own))
+            own = {"name": f"j{name}{k}", "type": kind, **self.joint(), **self.klass("class")}
+            parts.append(element("joint", own | self.forces(kind)))
         if free:
             self.joints[f"j{name}"] = "free"
             bare = f'<freejoint name="j{name}"/>'
@@ -167,60 +171,21 @@ class Mjcf:
         parts += [self.body(depth - 1) for _ in range(depth > 0 and 1 + draw.maybe(0.3))]
         parts.append(element("site", {"name": f"s{name}"} | self.site()))
         own = {"name": name, "pos": draw.numbers(3), **draw.turn(), **self.klass("childclass")}
-        return element("body", own | draw.some(0.2, gravcomp=draw.numbers(1)), *parts)
+        return element("body", own | draw.some(0.2, gravcomp=draw.numbers(1, 0)), *parts)
 
     def equalities(self) -> list[str]:
         draw = self.draw
         last = f"b{self.bodies - 1}"
         pairs = [{"site1": "s", "site2": f"s{last}"}, {"body1": last, "anchor": draw.numbers(3)}]
         made = [element("connect", draw.one(*pairs) | draw.some(0.3, active="false"))] if draw.maybe() else []
-        singles = [name for name, kind in self.joints.items() if kind in ("hinge", "slide")]
+        singles = self.singles()
         if len(singles) > 1 and draw.maybe():
             own = {"joint1": singles[0], "joint2": singles[1], "polycoef": draw.numbers(draw.one(2, 3, 5))}
             made.append(element("joint", own | self.klass("class")))
         return made
 
-    def actuators(self) -> list[str]:
-        names = [name for name, kind in self.joints.items() if kind in ("hinge", "slide") and self.draw.maybe(0.4)]
-        return [element("motor", {"joint": name} | self.actuator() | self.klass("class")) for name in names]
-
-    def write(self, folder: Path) -> Path:
-        (folder / "included.xml").write_text(self.included)
-        (folder / "model.xml").write_text(self.document)
-        return folder / "model.xml"
-
-
-BOX = "-1 -.5 -.25 0 -.5 -.25 -1 .5 -.25 0 .5 -.25 -1 -.5 .25 0 -.5 .25 -1 .5 .25 0 .7 .25"
-FACES = "0 2 1 1 2 3 4 5 6 5 7 6 0 1 4 1 5 4 2 6 3 3 6 7 0 4 2 2 4 6 1 3 5 3 7 5"
-PART = """<mujoco model="part"><compiler angle="{angle}" eulerseq="{sequence}"/><default><geom size=".2"/></default>
-<worldbody><body name="p" pos="{place}" euler="{turn}"><joint name="pj" axis="{axis}" ref=".3" stiffness="2 1"/>
-<geom pos="{center}"/><site name="ps" pos=".1 0 0"/></body></worldbody></mujoco>"""
-
-
-class Whole(Mjcf):
-    """Random model over all parts that are read: meshes, tendons, springs, media, macros, actuators, limits, keys."""
-
-    depth = 1
-
-    def __init__(self, seed: int) -> None:
-        self.clamped = seed % 3 == 0  # torques, and then no actuators of tendons
-        super().__init__(20000 + seed)
-        self.included = self.included.replace('gravcomp="-', 'gravcomp="')  # which MuJoCo ignores if all are < 0
-        kinds = {"angle": self.draw.one("radian", "degree"), "sequence": self.draw.one("xyz", "ZYX")}
-        numbers = {key: self.draw.numbers(3, 0.1) for key in ("place", "turn", "axis", "center")}
-        self.part = PART.format(**kinds, **numbers)
-
-    def spring(self, kind: str) -> dict[str, str]:
-        return {}
-
-    def forces(self, kind: str) -> dict[str, str]:
-        draw = self.draw
-        damping = {"damping": draw.numbers(draw.one(1, 2, 3), 0)} if draw.maybe(0.3) else {}
-        stiffness = draw.numbers(draw.one(1, 2, 3), 0, 3) if draw.maybe() else "0"
-        limits = draw.some(0.3, range="0 0.2" if kind == "ball" else "0.1 0.2")
-        return {"stiffness": stiffness, **damping, **limits, **draw.some(0.5 * self.clamped, actuatorfrcrange="-1 2")}
-
     def further(self, name: str) -> list[str]:
+        """Return further parts of a body: meshes, copies, and a part of another model."""
         draw, parts = self.draw, list[str]()
         if draw.maybe(0.3):
             shape = {"type": "mesh", "mesh": draw.one("m0", "m1"), "size": "0.1", **draw.turn()}
@@ -240,53 +205,54 @@ class Whole(Mjcf):
         joint = {"name": f"rj{self.bodies}", "type": "hinge", "axis": self.draw.numbers(3, 0.1), "stiffness": "1"}
         return element("body", own, element("joint", joint), element("geom", shape))
 
-    def sections(self) -> list[str]:
-        draw, (first, *_) = self.draw, [*self.singles(), ""]
-        meshes = []
-        for k, rule in enumerate((draw.one("convex", "exact"), draw.one("legacy", "shell"))):
-            at = draw.some(0.5, scale=draw.numbers(3, 0.3), refpos=draw.numbers(3), refquat=draw.numbers(4, 0.2))
-            meshes.append(element("mesh", {"name": f"m{k}", "vertex": BOX, "face": FACES, "inertia": rule, **at}))
-        medium = draw.some(0.2, density=draw.numbers(1, 0, 2), viscosity=draw.numbers(1, 0))
-        forces = draw.some(0.6, stiffness=draw.numbers(draw.one(1, 2), 0, 2), damping=draw.numbers(1, 0))
-        forces |= draw.some(0.3, springlength=draw.one(".1", ".1 .3"))
-        start = int(draw.random() * self.bodies)
-        sites = (element("site", {"site": f"sb{(start + k) % self.bodies}"}) for k in range(2))
-        path = element("spatial", {"name": "path", **forces}, '<site site="s"/>', *sites)
-        factors = (element("joint", {"joint": name, "coef": draw.numbers(1)}) for name in self.singles())
-        tendons = [path] + ([element("fixed", {"name": "sum", **forces}, *factors)] if first else [])
-        bounds = draw.some(0.5, ctrlrange="-.3 .2") | draw.some(0.3, forcerange="-.2 .4", gear=draw.numbers(1, 1, 3))
-        servo = draw.one(("position", {"kp": "3", "kv": "1"}), ("velocity", {"kv": "2"}), ("motor", {}))
-        plain = {"armature": "0", "damping": "0", **servo[1], **bounds}
-        acting = [] if self.clamped else [element(servo[0], {"name": "servo", "tendon": "path", **plain})]
-        affine = {"gaintype": "fixed", "biastype": "affine", "biasprm": "1 -2 -.5", "gainprm": "2", **bounds}
-        acting += (
-            [element("general", {"name": "force", "joint": first, **affine})] if first and not self.clamped else []
-        )
-        if not self.clamped:
-            ends = {"site": f"sb{start}"} | draw.some(0.5, refsite=draw.one("s", f"sb{(start + 1) % self.bodies}"))
-            acting.append(element(servo[0], {"name": "wrench", **plain, **ends, "gear": draw.numbers(draw.one(3, 6))}))
-        return [
-            element("asset", {}, *meshes, '<model name="part" file="part.xml"/>'),
-            element("option", medium),
-            element("tendon", {}, *(each for each in tendons if draw.maybe(0.6) or each is path)),
-            element("actuator", {}, *acting),
-            element("keyframe", {}, element("key", draw.some(0.5, name="k"))),
-        ]
-
     def singles(self) -> list[str]:
         return [name for name, kind in self.joints.items() if kind in ("hinge", "slide")]
 
+    def meshes(self) -> list[str]:
+        draw, meshes = self.draw, []
+        for k, rule in enumerate((draw.one("convex", "exact"), draw.one("legacy", "shell"))):
+            at = draw.some(0.5, scale=draw.numbers(3, 0.3), refpos=draw.numbers(3), refquat=draw.numbers(4, 0.2))
+            meshes.append(element("mesh", {"name": f"m{k}", "vertex": BOX, "face": FACES, "inertia": rule, **at}))
+        return meshes
+
+    def tendons(self) -> list[str]:
+        draw = self.draw
+        forces = draw.some(0.6, stiffness=draw.numbers(draw.one(1, 2), 0, 2), damping=draw.numbers(1, 0))
+        forces |= draw.some(0.3, springlength=draw.one(".1", ".1 .3"))
+        self.ends = [f"sb{int(draw.random() * self.bodies)}", f"sb{int(draw.random() * self.bodies)}"]
+        sites = (element("site", {"site": name}) for name in ("s", *dict.fromkeys(self.ends)))
+        factors = [element("joint", {"joint": name, "coef": draw.numbers(1)}) for name in self.singles()]
+        combined = [element("fixed", {"name": "sum", **forces}, *factors)] if factors and draw.maybe(0.6) else []
+        return [element("spatial", {"name": "path", **forces}, *sites), *combined]
+
+    def motors(self) -> list[str]:
+        names = [name for name in self.singles() if self.draw.maybe(0.4)]
+        return [element("motor", {"joint": name} | self.actuator() | self.klass("class")) for name in names]
+
+    def servos(self) -> list[str]:
+        """Return actuators of a tendon, a joint, and a site."""
+        draw = self.draw
+        bounds = draw.some(0.5, ctrlrange="-.3 .2") | draw.some(0.3, forcerange="-.2 .4", gear=draw.numbers(1, 1, 3))
+        servo = draw.one(("position", {"kp": "3", "kv": "1"}), ("velocity", {"kv": "2"}), ("motor", {}))
+        plain = {"armature": "0", "damping": "0", **servo[1], **bounds}
+        affine = {"gaintype": draw.one("fixed", "affine"), "biastype": "affine", "biasprm": "1 -2 -.5"}
+        affine |= {"gainprm": draw.numbers(3), **bounds}
+        ends = {"site": self.ends[0]} | draw.some(0.5, refsite="s") | {"gear": draw.numbers(draw.one(3, 6))}
+        made = [element(servo[0], {"name": "servo", "tendon": "path", **plain})]
+        made += [element("general", {"name": "force", "joint": name, **affine}) for name in self.singles()[:1]]
+        return [] if self.clamped else [*made, element(servo[0], {"name": "wrench", **plain, **ends})]
+
     def write(self, folder: Path) -> Path:
-        (folder / "part.xml").write_text(self.part)
-        return super().write(folder)
+        for name, text in (("included", self.included), ("part", self.part), ("model", self.document)):
+            (folder / f"{name}.xml").write_text(text)
+        return folder / "model.xml"
 
 
 class Urdf:
     """Random robot; ``floating`` is whether its base is free."""
 
     def __init__(self, seed: int) -> None:
-        self.draw, self.seed = Draw(1000 + seed), seed
-        draw = self.draw
+        self.draw = draw = Draw(1000 + seed)
         self.floating = draw.maybe()
         self.joints = {"l0": "free"} if self.floating else {}
         self.mimics: dict[str, tuple[str, float, float]] = {}
@@ -328,122 +294,94 @@ class Urdf:
         return folder / "robot.urdf"
 
 
-def state_of(robot: Mjcf | Urdf) -> State:
-    """Return a random state: free joints have position, unit quaternion, velocity, and angular velocity of the body."""
-    draw = Draw(robot.seed + 5000)
-    state: State = {}
-    for name, kind in robot.joints.items():
-        place = [*map(float, draw.numbers(3 if kind == "free" else 1).split())]
-        if kind == "ball":
-            place = []
-        if kind in ("ball", "free"):
-            turn = [*map(float, draw.numbers(4, 0.2).split())]
-            place += [each / sum(a * a for a in turn) ** 0.5 for each in turn]
-        rates = {"free": 6, "ball": 3}.get(kind, 1)
-        state[name] = [*place, *map(float, draw.numbers(rates).split())]
-    return state
-
-
-def by_mujoco(robot: Mjcf, state: State, path: Path) -> list[float]:
-    """Return T - V - (-V at q = 0), the power of damping, and the sorted absolute values of the constraints."""
+def by_mujoco(system: Any, path: Path) -> Motion:
+    """Return the motion by MuJoCo, with accelerations without equalities, at random inputs of a system."""
     import mujoco
-    import numpy as np
 
     model = mujoco.MjModel.from_xml_path(str(path))
-    data = mujoco.MjData(model)
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
     model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
-    disabled = model.opt.disableflags
-    lifts = model.body_gravcomp * model.body_mass
-    if disabled & mujoco.mjtDisableBit.mjDSBL_SPRING and disabled & mujoco.mjtDisableBit.mjDSBL_DAMPER:
-        lifts *= 0
-    if disabled & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
-        lifts *= 0
-    potentials = []
+    data, draw = mujoco.MjData(model), np.random.default_rng(1)
+    controls = dict(zip(system.actuators.values(), draw.uniform(-2, 2, len(system.actuators)).tolist(), strict=True))
+    held = controls | {name: min(max(controls[name], low), high) for name, low, high in system.input_ranges}
+    lifts, off, states, energies = model.body_gravcomp * model.body_mass, mujoco.mjtDisableBit, [], []
+    passive = off.mjDSBL_SPRING | off.mjDSBL_DAMPER  # without energies of lifts in MuJoCo
+    lifted = not (model.opt.disableflags & passive == passive or model.opt.disableflags & off.mjDSBL_GRAVITY)
     for scale in (0.0, 1.0):
-        for name, kind in robot.joints.items():
-            joint, values = model.joint(name), state[name]
-            count = {"free": 7, "ball": 4}.get(kind, 1)
-            at, rate = joint.qposadr[0], joint.dofadr[0]
-            identity = [0.0] * (count - 4) + [1.0, 0.0, 0.0, 0.0] if count > 1 else [0.0]
-            data.qpos[at : at + count] = values[:count] if scale else identity
-            data.qvel[rate : rate + len(values) - count] = scale * np.array(values[count:])
+        mujoco.mj_resetData(model, data)
+        mujoco.mj_integratePos(model, data.qpos, draw.uniform(-1, 1, model.nv) * scale, 1.0)
+        data.qvel[:] = scale * draw.uniform(-1, 1, model.nv)
+        data.ctrl[: len(controls)] = [*controls.values()]
+        for name, place in zip(controls, model.actuator_actadr, strict=False):
+            data.act[place : place + (place >= 0)] = held[name]  # which mj_forward does not clamp
         mujoco.mj_forward(model, data)
-        potentials.append(data.energy[0] + lifts @ data.xipos @ model.opt.gravity)
-    rows = np.array(data.efc_pos)[: data.ne]
-    power = data.qfrc_damper @ data.qvel
-    return [data.energy[1] - potentials[1] + potentials[0], power, *sorted(abs(rows))]
+        states.append([part.tolist() for part in (data.qpos, data.qvel, data.qacc_smooth)])
+        energies.append(float(data.energy[1] - data.energy[0] - lifts @ data.xipos @ model.opt.gravity * lifted))
+    powers = (data.qfrc_damper + data.qfrc_fluid + data.qfrc_actuator) * data.qvel
+    labels = [model.joint(k).name for k in range(model.njnt)]
+    residuals = np.abs(data.efc_pos[: data.ne]).tolist()
+    own = {"labels": labels, "kinds": model.jnt_type.tolist(), "states": states, "energies": energies, "inputs": held}
+    return own | {"powers": powers.tolist(), "residuals": residuals}
 
 
-def by_pinocchio(robot: Urdf, state: State, path: Path) -> list[float]:
-    """Return T - V - (-V at q = 0) and the power of damping."""
-    import numpy as np
-    import pinocchio
-
-    base = [pinocchio.JointModelFreeFlyer()] if robot.floating else []
-    model = pinocchio.buildModelFromUrdf(str(path), *base)
-    data = model.createData()
-    damped = np.array(model.damping)
-    potentials = []
-    for scale in (0.0, 1.0):
-        q, v = pinocchio.neutral(model), np.zeros(model.nv)
-        for name in model.names[1:]:
-            joint = model.joints[model.getJointId(name)]
-            if name == "root_joint":
-                x, turn, rates, spin = (state["l0"][i:j] for i, j in ((0, 3), (3, 7), (7, 10), (10, 13)))
-                if scale:
-                    rotation = pinocchio.Quaternion(*turn).toRotationMatrix()
-                    q[joint.idx_q : joint.idx_q + 7] = [*x, *turn[1:], turn[0]]
-                    v[joint.idx_v : joint.idx_v + 6] = [*(rotation.T @ rates), *spin]
-                continue
-            leader, factor, offset = robot.mimics.get(name, (name, 1.0, 0.0))
-            angle, rate = scale * factor * state[leader][0] + offset, scale * factor * state[leader][1]
-            q[joint.idx_q : joint.idx_q + joint.nq] = [np.cos(angle), np.sin(angle)] if joint.nq == 2 else [angle]
-            v[joint.idx_v] = rate
-        energy = pinocchio.computeKineticEnergy(model, data, q, v)
-        potentials.append(pinocchio.computePotentialEnergy(model, data, q))
-    return [energy - potentials[1] + potentials[0], -damped @ v**2]
-
-
-def motion_by_pinocchio(robot: Urdf, state: State, path: Path) -> tuple[list[str], tuple[Any, Any, Any]]:
-    """Return joints, the base first, and their positions, velocities and accelerations in MuJoCo's order.
+def by_pinocchio(path: Path, floating: bool, mimics: Mapping[str, tuple[str, float, float]]) -> Motion:
+    """Return the motion by Pinocchio; ``mimics``: leader, factor and offset of joints that follow.
 
     With v = G u, where G has the factors of joints that follow others, u' = (G^T M G)^-1 G^T (f - n(q, v)).
     """
-    import numpy as np
     import pinocchio
 
-    model = pinocchio.buildModelFromUrdf(str(path), *[pinocchio.JointModelFreeFlyer()] * robot.floating)
-    data, q, free = model.createData(), pinocchio.neutral(model), 6 * robot.floating
-    names = [name for name in model.names[1:] if name not in robot.mimics and name != "root_joint"]
-    follows, u = np.zeros((model.nv, free + len(names))), np.zeros(free + len(names))
+    model = pinocchio.buildModelFromUrdf(str(path), *[pinocchio.JointModelFreeFlyer()] * floating)
+    data, free = model.createData(), 6 * floating
+    names = [name for name in model.names[1 + floating :] if name not in mimics]
+    follows, offsets = np.zeros((model.nv, free + len(names))), np.zeros(model.nv)
     follows[:free, :free] = np.eye(free)
-    if robot.floating:
-        turn = state["l0"][3:7]
-        rotation = pinocchio.Quaternion(*turn).toRotationMatrix()
-        q[:7], u[:3], u[3:6] = [*state["l0"][:3], *turn[1:], turn[0]], rotation.T @ state["l0"][7:10], state["l0"][10:]
-    for name in model.names[1 + robot.floating :]:
-        joint = model.joints[model.getJointId(name)]
-        leader, factor, offset = robot.mimics.get(name, (name, 1.0, 0.0))
-        angle, place = factor * state[leader][0] + offset, free + names.index(leader)
-        q[joint.idx_q : joint.idx_q + joint.nq] = [np.cos(angle), np.sin(angle)] if joint.nq == 2 else [angle]
-        follows[joint.idx_v, place], u[place] = factor, state[leader][1]
-    v = follows @ u
-    mass, bias = pinocchio.crba(model, data, q), pinocchio.nonLinearEffects(model, data, q, v)
-    mass = np.triu(mass) + np.triu(mass, 1).T
-    changes = np.linalg.solve(follows.T @ mass @ follows, follows.T @ (-model.damping * v - bias))
-    if robot.floating:
-        changes[:3] = rotation @ (changes[:3] + np.cross(u[3:6], u[:3]))
-        u[:3] = state["l0"][7:10]
-    places = [*(state["l0"][:7] if robot.floating else []), *(state[name][0] for name in names)]
-    return [*(["l0"] if robot.floating else []), *names], (np.array(places), u, changes)
+    for name in model.names[1 + floating :]:
+        leader, factor, offset = mimics.get(name, (name, 1.0, 0.0))
+        place = model.joints[model.getJointId(name)].idx_v
+        follows[place, free + names.index(leader)], offsets[place] = factor, offset
+    draw, states, energies = np.random.default_rng(1), [], []
+    for scale in (0.0, 1.0):
+        moved, u = scale * draw.uniform(-1, 1, (2, free + len(names)))
+        q, v = pinocchio.integrate(model, pinocchio.neutral(model), follows @ moved + offsets), follows @ u
+        mass, bias = pinocchio.crba(model, data, q), pinocchio.nonLinearEffects(model, data, q, v)
+        mass = np.triu(mass) + np.triu(mass, 1).T
+        changes = np.linalg.solve(follows.T @ mass @ follows, follows.T @ (-model.damping * v - bias))
+        place = moved[free:]
+        if floating:
+            rotation = pinocchio.Quaternion(*q[[6, 3, 4, 5]]).toRotationMatrix()
+            changes[:3] = rotation @ (changes[:3] + np.cross(u[3:6], u[:3]))
+            u[:3], place = rotation @ u[:3], np.concatenate([q[[0, 1, 2, 6, 3, 4, 5]], place])
+        states.append([part.tolist() for part in (place, u, changes)])
+        energies.append(
+            pinocchio.computeKineticEnergy(model, data, q, v) - pinocchio.computePotentialEnergy(model, data, q)
+        )
+    labels, powers = ["l0"] * floating + names, (-model.damping * v**2).tolist()
+    own = {"labels": labels, "kinds": [0] * floating + [3] * len(names), "states": states, "energies": energies}
+    return own | {"powers": powers, "residuals": [], "inputs": {}}
+
+
+def errors(system: Any, motion: Motion) -> list[float]:
+    """Return relative errors of T - V (but for a constant), power, equations of motion, and equalities."""
+    equations = equations_of(system, motion["labels"], motion["kinds"])
+    inputs = motion["inputs"]
+    constants = [inputs.get(name.removesuffix("_0"), 0.0) for name in ("t", *map(str, system.parameters))]
+    (rest, *_), (energy, power, error, residuals) = (equations(state, constants) for state in motion["states"])
+    theirs, powers = np.array(motion["energies"]), np.array(motion["powers"])
+    sizes = np.abs(theirs).max() + 1, np.abs(powers).sum() + 1, 1
+    differences = (energy - theirs[1]) - (rest - theirs[0]), power - powers.sum(), error
+    others = [*motion["residuals"], *[np.inf] * (not motion["residuals"])]  # dependent equations are omitted
+    lost = float(len(motion["residuals"]) > 0 and not residuals)
+    gaps = (min(abs(abs(value) - other) for other in others) for value in residuals)
+    return [*(float(abs(x) / size) for x, size in zip(differences, sizes, strict=True)), max([lost, *map(float, gaps)])]
+
+
+def errors_of_motion(system: Any, path: Path) -> list[float]:
+    """Return the first three of these errors of an MJCF file."""
+    return errors(system, by_mujoco(system, path))[:3]
 
 
 def flow(kinds: Any, q: Any, v: Any) -> Any:
     """Return the rates of MuJoCo's positions q of joints of these kinds at its velocities v."""
-    import numpy as np
-
     rates, k = [], 0
     for kind in kinds:
         count = (3, 0, 1, 1)[kind]
@@ -456,47 +394,11 @@ def flow(kinds: Any, q: Any, v: Any) -> Any:
     return np.array(rates)
 
 
-def errors_of_motion(system: Any, path: Path) -> list[float]:
-    """Return relative errors of T - V (but for a constant), power and equations of motion at a random state of MuJoCo.
-
-    The accelerations are MuJoCo's without equalities.
-    """
-    import mujoco
-    import numpy as np
-
-    model = mujoco.MjModel.from_xml_path(str(path))
-    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
-    data, draw = mujoco.MjData(model), np.random.default_rng(1)
-    equations = equations_of(system, [*system.joint_names], model.jnt_type)
-    controls = dict(zip(system.actuators.values(), draw.uniform(-2, 2, len(system.actuators)), strict=True))
-    held = controls | {name: min(max(controls[name], low), high) for name, low, high in system.input_ranges}
-    constants = [held.get(name.removesuffix("_0"), 0.0) for name in ("t", *map(str, system.parameters))]
-    energies, lifts, off = [], model.body_gravcomp * model.body_mass, mujoco.mjtDisableBit
-    passive = off.mjDSBL_SPRING | off.mjDSBL_DAMPER  # without energies of lifts in MuJoCo
-    lifted = not (model.opt.disableflags & passive == passive or model.opt.disableflags & off.mjDSBL_GRAVITY)
-    for scale in (0.0, 1.0):
-        mujoco.mj_resetData(model, data)
-        mujoco.mj_integratePos(model, data.qpos, draw.uniform(-1, 1, model.nv) * scale, 1.0)
-        data.qvel[:] = scale * draw.uniform(-1, 1, model.nv)
-        data.ctrl[: len(controls)] = [*controls.values()]
-        for name, place in zip(controls, model.actuator_actadr, strict=False):
-            data.act[place : place + (place >= 0)] = held[name]  # which mj_forward does not clamp
-        mujoco.mj_forward(model, data)
-        energy, power, error = equations((data.qpos, data.qvel, data.qacc_smooth), constants)
-        lift = lifts @ data.xipos @ model.opt.gravity * lifted
-        energies.append(energy - data.energy[1] + data.energy[0] + lift)
-    powers = (data.qfrc_damper + data.qfrc_fluid + data.qfrc_actuator) * data.qvel
-    sizes = np.abs(data.energy).max() + 1, np.abs(powers).sum() + 1, 1
-    errors = energies[1] - energies[0], power - powers.sum(), error
-    return [float(abs(x) / size) for x, size in zip(errors, sizes, strict=True)]
-
-
 def equations_of(system: Any, labels: Sequence[str], kinds: Sequence[int]) -> Any:
     """Return a function of positions, velocities and accelerations of joints of these labels and MuJoCo's kinds.
 
-    It returns L, the power of forces, and the error of d/dt L_v - L_q - f relative to |f| + |L_q| + 1.
+    It returns L, the power of forces, the error of d/dt L_v - L_q - f relative to |f| + |L_q| + 1, and the constraints.
     """
-    import numpy as np
     from sympy import S
 
     from scvi_codegen.common.precision import mp
@@ -511,12 +413,12 @@ def equations_of(system: Any, labels: Sequence[str], kinds: Sequence[int]) -> An
     m, variables = system.dimension, (*system.coordinates, *system.velocities)
     slopes, forces = gradient(system.lagrangian, variables), system.forces or [S.Zero] * m
     tape = Tape(
-        [system.lagrangian, *(slopes.get(k, S.Zero) for k in range(2 * m)), *forces],
+        [system.lagrangian, *(slopes.get(k, S.Zero) for k in range(2 * m)), *forces, *system.constraints],
         (*variables, system.time, *system.parameters),
     )
 
     def equations(motion: Sequence[Any], constants: Sequence[float]) -> tuple[Any, Any, Any]:
-        places, rates, changes = motion
+        places, rates, changes = map(np.array, motion)
         rate = flow(kinds, places, rates)
         second = flow(kinds, places, changes)
         second += flow(kinds, rate, rates) - flow(kinds, 0 * rate, rates)
@@ -526,9 +428,9 @@ def equations_of(system: Any, labels: Sequence[str], kinds: Sequence[int]) -> An
             moved = [x + h * y + h * h / 2 * z for x, y, z in zip(q, v, a, strict=True)]
             sides.append(tape([*moved, *(y + h * z for y, z in zip(v, a, strict=True)), *map(mp.mpf, constants)]))
         before, (energy, *values), after = (np.array(side) for side in sides)
-        torques, along, acting = values[:m], ((after - before) / (2 * step))[1 + m : 1 + 2 * m], values[2 * m :]
+        torques, along, acting = values[:m], ((after - before) / (2 * step))[1 + m : 1 + 2 * m], values[2 * m : 3 * m]
         size = max(map(abs, torques)) + max(map(abs, acting)) + 1
-        return energy, np.dot(acting, v), np.abs(along - torques - acting).max() / size
+        return energy, np.dot(acting, v), np.abs(along - torques - acting).max() / size, list(values[3 * m :])
 
     return equations
 
@@ -536,7 +438,6 @@ def equations_of(system: Any, labels: Sequence[str], kinds: Sequence[int]) -> An
 def motion_by_mujoco(path: Path, place: Any, rates: Any, span: float) -> Any:
     """Return qpos after a time span, by DOP853 of M a = f + J^T l, J a = -dJ/dt v, with dependent equations."""
     import mujoco
-    import numpy as np
     from scipy.integrate import solve_ivp
 
     model = mujoco.MjModel.from_xml_path(str(path))
@@ -561,11 +462,13 @@ def motion_by_mujoco(path: Path, place: Any, rates: Any, span: float) -> Any:
 if __name__ == "__main__":
     import tempfile
 
+    import scvi_codegen as sc
+
     with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
-        recorded: dict[str, list[list[float]]] = {"mjcf": [], "urdf": []}
+        recorded: dict[str, list[Motion]] = {"mjcf": [], "urdf": []}
         for seed in range(SEEDS):
-            for kind, make, reference in (("mjcf", Mjcf, by_mujoco), ("urdf", Urdf, by_pinocchio)):
-                robot = make(seed)
-                recorded[kind].append(reference(robot, state_of(robot), robot.write(folder)))  # type: ignore[operator]
-    RECORDED.write_text(json.dumps(recorded, indent=1) + "\n")
+            path = Mjcf(seed).write(Path(scratch))
+            recorded["mjcf"].append(by_mujoco(sc.LagrangianSystem.from_mjcf(path, actuators=True), path))
+            robot = Urdf(seed)
+            recorded["urdf"].append(by_pinocchio(robot.write(Path(scratch)), robot.floating, robot.mimics))
+    RECORDED.write_text(json.dumps(recorded) + "\n")
