@@ -202,7 +202,7 @@ def test_equations_across_the_plane_of_a_mechanism_are_omitted(tmp_path):
     [
         ('<connect body1="ba" anchor="0 0 0"/>', "names the body 'ba', which does not exist; did you mean 'bar'"),
         ('<weld site1="end" site2="top"/>', "names the site 'end', which does not exist"),
-        ('<joint joint1="d"/>', "names the joint 'd', which is no hinge or slide"),
+        ('<joint joint1="d"/>', "names the hinge or slide 'd', which does not exist"),
         ('<tendon tendon1="t"/>', "<tendon> 'tendon' names the tendon 't', which does not exist"),
         ('<weld body1="bar" relpose="1 2 3"/>', "must be 7 finite numbers"),
     ],

@@ -16,7 +16,7 @@ from random_robots import motion_by_mujoco
 import scvi_codegen as sc
 from scvi_codegen.common.errors import ContactError, SystemDefinitionError, SystemDefinitionWarning
 from scvi_codegen.systems.formulas.expressions import evaluate
-from scvi_codegen.systems.multibody.trees.mjcf import SHAPES
+from scvi_codegen.systems.multibody.trees.shapes import SHAPES
 
 ROBOTS = Path(__file__).parent / "robots"
 
@@ -119,7 +119,7 @@ MJCF = {
     "free inside": ('type="ball"', 'type="free"', "inside another body"),
     "composite": ("</worldbody>", "<composite/></worldbody>", "write out what it makes"),
     "axes": ('eulerseq="zyx"', 'eulerseq="zy"', "is not three of the letters"),
-    "name": ('name="slip"', 'name="flex"', "<joint> 'flex' is the second joint of this name"),
+    "name": ('name="slip"', 'name="flex"', "<joint> 'flex' is defined twice: rename one"),
     "include": ("<option", '<include file="none.xml"/><option', "none.xml cannot be read"),
     "include of a device": ("<option", '<include file="/dev/zero"/><option', "names '/dev/zero' outside the folder"),
     "include of a folder": ("<option", '<include file="."/><option', "it is no regular file"),
@@ -136,7 +136,7 @@ MJCF = {
     "tendon of a class": (
         "</mujoco>",
         '<default><tendon damping="1"/></default><tendon><fixed><joint joint="no" coef="1"/></fixed></tendon></mujoco>',
-        "names the joint 'no', which is no hinge or slide",
+        "names the hinge or slide 'no', which does not exist",
     ),
     "actuator of a tendon": (
         "</mujoco>",

@@ -1,4 +1,6 @@
-"""Contacts of the spheres of links with planes of the world.
+"""Geoms of MJCF that may touch, and contacts of the spheres of links with planes of the world.
+
+https://mujoco.readthedocs.io/en/stable/computation/index.html#selection and #parameters
 
 A sphere of radius r at the point x of a link, above the plane through o with the unit normal n, has the gap n . (x - o)
 - r. It slips with the velocity of the point of the link at x - r n: with the axes R of the link, in a direction e,
@@ -8,19 +10,26 @@ A sphere of radius r at the point x of a link, above the plane through o with th
 Directions in which it cannot slip, as those across the plane of a planar robot, are omitted.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from itertools import product
+from typing import Any, NamedTuple
 
+import numpy as np
 from sympy import Matrix
 
 from scvi_codegen.systems.contact import ContactLike, contact
 from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.formulas.symbols import symbol
-from scvi_codegen.systems.multibody.trees.closures import frames_in_common
+from scvi_codegen.systems.multibody.trees.closures import at_reference, frames_in_common
+from scvi_codegen.systems.multibody.trees.document import Element
 from scvi_codegen.systems.multibody.trees.energies import exact_number
+from scvi_codegen.systems.multibody.trees.shapes import shape_of, size_of
 from scvi_codegen.systems.multibody.trees.tendons import rate_of
 from scvi_codegen.systems.multibody.trees.tree import Link, Pose, Vector
+
+PARTS = {"capsule": "end", "box": "corner"}
+"""Names of the spheres of geoms that have several."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +49,80 @@ class Touch:
     radius: float
     plane: Pose
     friction: float | None
+
+
+class Geom(NamedTuple):
+    """Shape of a body: its element, its link, and its pose in the frame of that."""
+
+    element: Element
+    link: int
+    pose: Pose
+
+    @property
+    def shape(self) -> str:
+        """Type of the geom."""
+        return shape_of(self.element)
+
+    @property
+    def title(self) -> str:
+        """Name for messages; of one without a name its line and its body."""
+        _, line, around, _ = self.element.places[self.element.node]
+        name = self.element.node.get("name")
+        return f"geom '{name}'" if name else f"geom in line {line} of {around or 'the world'}"
+
+    @property
+    def types(self) -> tuple[int, int]:
+        """``contype`` and ``conaffinity``."""
+        return int(self.element.number("contype", 1)), int(self.element.number("conaffinity", 1))
+
+    def spheres(self) -> list[tuple[Vector, float]]:
+        """Return the spheres, corners with radius 0, of which the geom is the convex hull; none of other shapes."""
+        if self.shape not in ("sphere", *PARTS):
+            return []
+        size = size_of(self.element, self.shape)
+        if self.shape == "box":
+            return [(np.array(signs) * size, 0.0) for signs in product((-1, 1), repeat=3)]
+        ends = (0,) if self.shape == "sphere" else (-1, 1)
+        return [(np.array([0.0, 0.0, end * size[-1]]), size[0]) for end in ends]
+
+
+class Pair(NamedTuple):
+    """Two geoms that may touch, the number of their directions of friction, and its coefficient."""
+
+    geoms: tuple[Geom, Geom]
+    dimensions: int
+    friction: float
+
+    @classmethod
+    def of(cls, first: Geom, second: Geom) -> "Pair":
+        """Return the pair with the friction of the geom of the higher priority, or the larger values of both."""
+        priority = [geom.element.number("priority", 0) for geom in (first, second)]
+        leading = [geom.element for geom, its in zip((first, second), priority, strict=True) if its == max(priority)]
+        dimensions = max(int(element.number("condim", 3)) for element in leading)
+        friction = max(element.vector("friction", (1,), (1, 2, 3))[0] for element in leading)
+        return cls((first, second), dimensions, float(friction))
+
+    @classmethod
+    def of_element(cls, pair: Element, first: Geom, second: Geom) -> "Pair":
+        """Return the pair that an element defines."""
+        friction = np.append(pair.vector("friction", (1, 1), range(1, 6)), 1)
+        dimensions = int(pair.number("condim", 3))
+        if friction[0] != friction[1] and dimensions > 1:
+            pair.refuse(
+                f"has two coefficients of sliding friction, {friction[0]:g} and {friction[1]:g}: write one twice"
+            )
+        return cls((first, second), dimensions, float(friction[0]))
+
+    def touches(self, links: Sequence[Link]) -> Iterator[Touch]:
+        """Yield the contacts of spheres with a plane, which is fixed to the world."""
+        plane, body = sorted(self.geoms, key=lambda geom: geom.shape != "plane")
+        friction = self.friction if self.dimensions > 1 else None
+        spheres = body.spheres() if plane.shape == "plane" else []
+        for number, (center, radius) in enumerate(spheres, start=1):
+            at = body.pose.position + body.pose.rotation @ center
+            world = at_reference(links, plane.link) @ plane.pose
+            part = f"{PARTS[body.shape]} {number} of " if len(spheres) > 1 else ""
+            yield Touch(f"{part}{body.title} on {plane.title}", body.link, at, radius, world, friction)
 
 
 def contacts_of(links: Sequence[Link], touches: Iterable[Touch], law: Mapping[str, Any]) -> list[ContactLike]:

@@ -111,9 +111,9 @@ class Element:
             self.refuse(f"has the {key} {value:g}, which must not be < {least:g}")
         return value
 
-    def among(self, key: str, kind: str, things: Mapping[str, Thing]) -> Thing:
+    def among(self, key: str, kind: str, things: Mapping[str, Thing], default: str | None = None) -> Thing:
         """Return the thing of a kind that an attribute names, of those that exist by name."""
-        if (name := self.text(key)) not in things:
+        if (name := self.text(key, default)) not in things:
             self.refuse(f"names the {kind} '{name}', which does not exist{closest(name, things)}")
         return things[name]
 

@@ -9,9 +9,10 @@ import numpy as np
 from scvi_codegen.common.precision import mp
 from scvi_codegen.systems.contact import Contact
 from scvi_codegen.systems.formulas.expressions import Tape
-from scvi_codegen.systems.formulas.rotations import Rotation, matrix_of
+from scvi_codegen.systems.formulas.rotations import Rotation
 from scvi_codegen.systems.formulas.symbols import symbol
 from scvi_codegen.systems.multibody.trees.document import NAMED
+from scvi_codegen.systems.multibody.trees.tree import rotation_by
 
 SMALL = 1e-9
 """Size of negative gaps with which runs begin."""
@@ -46,7 +47,7 @@ def outside_limits(contacts: Iterable[Any], states: Mapping[str, Mapping[str, An
         numbers = {symbol(name): x for name, x in q.items()}
         for name, x in q.items():
             if np.ndim(x):
-                turn = np.array(x if np.ndim(x) > 1 else matrix_of([*map(float, x / np.linalg.norm(x))]))
+                turn = np.array(x) if np.ndim(x) > 1 else rotation_by(np.array(x))
                 numbers |= zip(Rotation(name, "").entries, turn.flat, strict=True)
         values = map(float, tape([mp.mpf(float(numbers[x])) for x in variables]))
         outside = [(item, gap) for item, gap in zip(limits, values, strict=True) if gap < -SMALL]

@@ -17,9 +17,8 @@ import scipy
 from numpy.typing import NDArray
 
 from scvi_codegen.common.errors import imported
-from scvi_codegen.systems.formulas.rotations import matrix_of
 from scvi_codegen.systems.multibody.trees.document import Element, bytes_of
-from scvi_codegen.systems.multibody.trees.tree import Inertia, Vector
+from scvi_codegen.systems.multibody.trees.tree import Inertia, Vector, rotation_by
 
 LARGEST = 1e15
 """Bound of the coordinates of corners, beside which 1 is not lost to rounding."""
@@ -52,8 +51,7 @@ def _inertia(mesh: Element) -> Inertia:
         mesh.refuse("has triangles with opposite orientations: turn them, or use inertia='convex'")
     scale, turn = mesh.vector("scale", (1, 1, 1)), mesh.vector("refquat", (1, 0, 0, 0), (4,))
     with np.errstate(all="ignore"):
-        axes = np.array(matrix_of([*map(float, turn / np.linalg.norm(turn))]), dtype=float)
-        corners = (corners - mesh.vector("refpos", (0, 0, 0))) @ axes * scale
+        corners = (corners - mesh.vector("refpos", (0, 0, 0))) @ rotation_by(turn) * scale
         triangles = corners[faces][:, :: -1 if np.prod(scale) < 0 else 1]
         inertia, surface = _integrals(triangles, rule), _integrals(triangles, "shell").mass
     if not (abs(inertia.mass) > FLAT * surface**1.5 or rule == "shell"):

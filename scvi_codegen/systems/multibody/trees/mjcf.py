@@ -4,9 +4,8 @@ Attributes and defaults are those of https://mujoco.readthedocs.io/en/stable/XML
 :mod:`scvi_codegen.systems.multibody.trees.schema` lists which are read.
 """
 
-import re
-from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import combinations, zip_longest
@@ -18,8 +17,6 @@ from xml.etree import ElementTree
 import numpy as np
 from sympy import Expr, S
 
-from scvi_codegen.common.errors import closest
-from scvi_codegen.systems.formulas.rotations import matrix_of
 from scvi_codegen.systems.formulas.symbols import symbol
 from scvi_codegen.systems.multibody.trees.actuators import (
     ACTED,
@@ -28,72 +25,38 @@ from scvi_codegen.systems.multibody.trees.actuators import (
     Range,
     activation_of,
     actuator_of,
-    as_general,
     clamped,
     coefficients_of,
-    inherited_by,
     is_servo,
     motion_of,
     motion_of_sites,
 )
 from scvi_codegen.systems.multibody.trees.closures import Closure, Coupling, at_reference
-from scvi_codegen.systems.multibody.trees.contacts import Touch
-from scvi_codegen.systems.multibody.trees.document import Element, Unread, checked_limits, root_of
+from scvi_codegen.systems.multibody.trees.contacts import Geom, Pair, Touch
+from scvi_codegen.systems.multibody.trees.document import Element, Unread, checked_limits
 from scvi_codegen.systems.multibody.trees.fluid import box, ellipsoid, principal_axes
-from scvi_codegen.systems.multibody.trees.geoms import Geom, Pair
-from scvi_codegen.systems.multibody.trees.macros import Macros
-from scvi_codegen.systems.multibody.trees.meshes import inertia_of
-from scvi_codegen.systems.multibody.trees.schema import MJCF, TURN
+from scvi_codegen.systems.multibody.trees.shapes import (
+    AXES,
+    ORIENTATIONS,
+    SHAPES,
+    inertia_of_geom,
+    of_quaternion,
+    pose_of,
+    shape_of,
+    size_of,
+    unit_of_angles,
+)
+from scvi_codegen.systems.multibody.trees.sources import document_of, merged
 from scvi_codegen.systems.multibody.trees.tendons import Tendon, length_of, mean_inverses, reference_length
-from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about, named
+from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, named
 
-Sizes = Vector
-
-
-def _solid(size: Sizes, volume: float, share: float) -> tuple[float, Vector]:
-    return volume * float(np.prod(size)), (np.sum(size**2) - size**2) / share
-
-
-def _cylinder(size: Sizes) -> tuple[float, Vector]:
-    r, half = size
-    across = r**2 / 4 + half**2 / 3
-    return 2 * np.pi * r**2 * half, np.array([across, across, r**2 / 2])
-
-
-def _capsule(size: Sizes) -> tuple[float, Vector]:
-    """Return those of a cylinder with two half spheres, whose centers lie 3 r/8 beyond its ends."""
-    r, half = size
-    tube, moments = _cylinder(size)
-    ball = 4 / 3 * np.pi * r**3
-    across = 2 / 5 * r**2 + half**2 + 3 / 4 * half * r
-    caps = np.array([across, across, 2 / 5 * r**2])
-    return tube + ball, (tube * moments + ball * caps) / (tube + ball)
-
-
-SHAPES: dict[str, tuple[int, Callable[[Sizes], tuple[float, Vector]]]] = {
-    "sphere": (1, lambda size: _solid(np.repeat(size[0], 3), 4 / 3 * np.pi, 5)),
-    "ellipsoid": (3, lambda size: _solid(size, 4 / 3 * np.pi, 5)),
-    "box": (3, lambda size: _solid(size, 8.0, 3)),
-    "cylinder": (2, _cylinder),
-    "capsule": (2, _capsule),
-}
-"""By shape: the number of its sizes, and a function of these that returns the volume and the three principal moments of
-inertia by mass, about the center and the axes x, y, z. Sizes are the radius; half axes; half lengths; radius and half
-length along z, of a capsule without its caps."""
-
-
-WEIGHTLESS = ("plane", "hfield")
 PARTS = {"limits": "limits", "friction": "dry friction"}
 SLIDING = 3
 """Dimension of contacts with sliding friction; of higher ones friction opposes rotations, too."""
-ORIENTATIONS = TURN.split()
 NO_MASS, LIGHT = 1e-15, 1e-14
 """Bodies with less mass are without forces of a medium, and boxes have no smaller sums of moments of inertia; geoms
 with less than the second have no axes."""
 OF_SITES = ["site", "refsite"]
-AXES = dict(zip("xyz", np.eye(3), strict=True))
-Defaults = dict[str, dict[str, str]]
-"""Attributes by kind of element."""
 
 
 def links_of_mjcf(path: str | PathLike[str], parts: Collection[str] = ()) -> tuple[Any, ...]:
@@ -105,7 +68,7 @@ def links_of_mjcf(path: str | PathLike[str], parts: Collection[str] = ()) -> tup
         SystemDefinitionError: naming file and element, if something is malformed or unknown, or changes the motion and
             is not read.
     """
-    root = _document(Path(path))
+    root = document_of(Path(path))
     model = _MujocoModel(root, parts)
     acting = [*model.actuators(tendons := [*model.tendons()])]
     keys = dict(model.keyframes([x[1] for x in acting]))
@@ -114,33 +77,13 @@ def links_of_mjcf(path: str | PathLike[str], parts: Collection[str] = ()) -> tup
     return root.node.get("model") or Path(path).stem, model.completed(), model.gravity, *others
 
 
-def _document(path: Path, around: tuple[Path, ...] = ()) -> Element:
-    """Return a document, a part of those ``around``, with included files and explicit attributes, without macros."""
-    root, around = root_of(path, "mujoco"), (*around, path.resolve())
-    _include(root)
-    settings = _merged(root, "compiler", root.children("compiler"))
-    root.node.insert(0, settings.node)
-    root.places.update(settings.places)
-    _apply_defaults(root)
-    models = {}
-    for asset in (model for assets in root.children("asset") for model in assets.children("model")):
-        if (file := asset.path(asset.text("file"))).resolve() in around:
-            asset.refuse(f"names '{file}', which contains this document")
-        model = _document(file, around)
-        models[asset.node.get("name", model.node.get("model", ""))] = model
-    Macros(root, models, _MujocoModel.pose)
-    return root
-
-
 class _MujocoModel:
     """Links of a document whose attributes are explicit."""
 
     def __init__(self, root: Element, parts: Collection[str]) -> None:
         self.root, self.unread, self.parts = root, Unread(), parts
-        option = _merged(root, "option", root.children("option"))
-        flags = _merged(
-            root, "flag", [flag for element in root.children("option") for flag in element.children("flag")]
-        )
+        option = merged(root, "option", root.children("option"))
+        flags = merged(root, "flag", [flag for element in root.children("option") for flag in element.children("flag")])
         self.disabled = {key for key in flags.node.attrib if flags.choice(key, "enable", "disable") == "disable"}
         self.gravity = option.vector("gravity", (0, 0, -9.81)) * ("gravity" not in self.disabled)
         passive = not {"spring", "damper"} <= self.disabled
@@ -150,7 +93,6 @@ class _MujocoModel:
         self.links: list[Link] = []
         self.compensating: list[Element] = []
         self.meshes: dict[ElementTree.Element, Inertia] = {}
-        self.labels = set[str | None]()
         self.joints = dict[str, Element]()
         self.responses = dict[str, Vector]()
         self.activated = set[str]()
@@ -158,13 +100,13 @@ class _MujocoModel:
         self.carriers, self.parents = {-1: -1}, dict[int, int]()
         """Of each body, by its link: the moving body that it is fixed to, and the one that this is connected with."""
         self.geoms: list[Geom] = []
-        self.places: dict[tuple[str, str], tuple[int, Pose]] = {("body", "world"): (-1, Pose())}
-        """Link and pose in it of bodies and sites, by tag and name."""
+        self.places = defaultdict[str, dict[str, tuple[int, Pose]]](dict, body={"world": (-1, Pose())})
+        """Link and pose in it of bodies, joints and sites, and number and pose of geoms, by tag and name."""
         for world in root.children("worldbody"):
             self.read(world)
         self.links = named(self.links)
-        for (tag, name), (place, pose) in self.places.items():
-            if tag == "site" and place >= 0:
+        for name, (place, pose) in self.places["site"].items():
+            if place >= 0:
                 self.links[place] = replace(self.links[place], frames=(*self.links[place].frames, (name, pose)))
         self.singles = {link.joint.label: link.joint for link in self.links if link.joint.kind in SINGLE}
         self.read_actuators()
@@ -200,8 +142,8 @@ class _MujocoModel:
             pull = self.bounds(tendon, "actuatorfrc")
             if armature and self.responses:
                 tendon.refuse(f"has armature, which is not read with the springdamper of '{min(self.responses)}'")
-            own = tendon.name, pull, limits, friction
-            yield Tendon(factors, points, stiffness, damping, armature, slack, *own)
+            own = slack, tendon.name, pull, limits, friction
+            yield Tendon(factors, points, stiffness, damping, armature, *own)
 
     def read(self, world: Element) -> None:
         """Add links, places and shapes of a world body and of all bodies in it, parents first."""
@@ -209,24 +151,25 @@ class _MujocoModel:
         while pending:
             element, link, at = pending.pop()
             if element.tag == "body":
-                link, at = self.add(element, link, at @ self.pose(element)), Pose()
+                link, at = self.add(element, link, at @ pose_of(element)), Pose()
                 self.put(element, link, at)
             elif element.tag == "frame":
-                at = at @ self.pose(element)
+                at = at @ pose_of(element)
             if element.tag != "frame":
                 for geom, frame in self.contents(element, "geom"):
-                    self.geoms.append(Geom(geom, link, at @ frame @ self.pose(geom)))
+                    self.put(geom, len(self.geoms), frame)
+                    self.geoms.append(Geom(geom, link, at @ frame @ pose_of(geom)))
             for site in element.children("site"):
-                self.put(site, link, at @ self.pose(site))
+                self.put(site, link, at @ pose_of(site))
             pending += [(child, link, at) for child in reversed(element.children("frame", "body"))]
 
     def put(self, element: Element, link: int, at: Pose) -> None:
-        """Store the place of a body or site, if it has a name."""
-        key = element.tag, element.node.get("name", "")
-        if key in self.places:
+        """Store the place of a body, joint, geom or site, if it has a name."""
+        places, name = self.places[element.tag.removeprefix("free")], element.node.get("name")
+        if name in places:
             element.refuse("is defined twice: rename one")
-        if key[1]:
-            self.places[key] = link, at
+        if name:
+            places[name] = link, at
 
     def add(self, body: Element, parent: int, pose: Pose) -> int:
         """Add a link for each joint of a body and one that carries its inertia; return the position of the last."""
@@ -238,9 +181,7 @@ class _MujocoModel:
             at = np.zeros(3) if free else frame.position + frame.rotation @ joint.vector("pos", (0, 0, 0))
             moved = pose @ Pose(at - anchor)
             label = joint.node.get("name") or (name if count == 0 else f"{name}_{count + 1}")
-            if joint.has("name") and label in self.labels:
-                joint.refuse("is the second joint of this name: rename one")
-            self.labels.add(joint.node.get("name"))
+            self.put(joint, len(self.links), Pose())
             self.joints[label] = joint
             self.links.append(Link(label, parent, self.joint(joint, label, moved, frame, parent), Inertia()))
             parent, pose, anchor = len(self.links) - 1, Pose(), at
@@ -266,7 +207,7 @@ class _MujocoModel:
             if element.tag in tags:
                 yield element, at
             elif element.tag == "frame" or element is body:
-                inner = at @ self.pose(element) if element.tag == "frame" else at
+                inner = at @ pose_of(element) if element.tag == "frame" else at
                 pending += [(child, inner) for child in reversed(element.children("frame", *tags))]
 
     def pairs(self) -> Iterator[Pair]:
@@ -274,10 +215,9 @@ class _MujocoModel:
         if self.disabled & {"contact", "constraint"}:
             return
         sections = self.root.children("contact")
-        named = {geom.element.node.get("name", ""): k for k, geom in enumerate(self.geoms)}
         written = set[tuple[int, ...]]()
         for pair in (pair for section in sections for pair in section.children("pair")):
-            first, second = sorted(pair.among(key, "geom", named) for key in ("geom1", "geom2"))
+            first, second = sorted(self.place(pair, key)[0] for key in ("geom1", "geom2"))
             written.add((first, second))
             yield Pair.of_element(pair, self.geoms[first], self.geoms[second])
         excluded = {
@@ -402,7 +342,7 @@ class _MujocoModel:
         if low == high or element.has("ctrlrange") or element.has("actrange"):
             element.refuse("has an inheritrange, which is read of joints with a range, without ctrlrange and actrange")
         middle, radius = (low + high) / 2, (high - low) / 2 * share
-        unit = _unit(element) if single and single.kind == "hinge" else 1.0
+        unit = unit_of_angles(element) if single and single.kind == "hinge" else 1.0
         return (middle - radius) * unit, (middle + radius) * unit
 
     def keyframes(self, controls: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -443,12 +383,9 @@ class _MujocoModel:
                 equality.refuse("is not read: remove it or write a constraint")
 
     def place(self, element: Element, key: str) -> tuple[int, Pose]:
-        """Return the link and the pose in it of the body or site that an attribute names."""
-        kind, name = key.rstrip("12").removeprefix("ref"), element.text(key, "world" if key == "body2" else None)
-        if (kind, name) not in self.places:
-            names = [other for tag, other in self.places if tag == kind]
-            element.refuse(f"names the {kind} '{name}', which does not exist{closest(name, names)}")
-        return self.places[kind, name]
+        """Return the place of the body, site or geom that an attribute names."""
+        kind = key.rstrip("12").removeprefix("ref")
+        return element.among(key, kind, self.places[kind], "world" if key == "body2" else None)
 
     def closure(self, equality: Element) -> Closure:
         """Return a connection or weld of two sites, or of bodies, by default as in the reference configuration."""
@@ -465,7 +402,7 @@ class _MujocoModel:
         if kind == "body" and turning:
             pose = equality.vector("relpose", (0, 1, 0, 0, 0, 0, 0), (7,))
             if pose[3:].any():
-                at = Pose(pose[:3], _of_quaternion(equality, pose[3:]))
+                at = Pose(pose[:3], of_quaternion(equality, pose[3:]))
             else:
                 at = at_reference(self.links, first).inverse @ at_reference(self.links, second)
         elif kind == "body":
@@ -494,10 +431,7 @@ class _MujocoModel:
 
     def single(self, element: Element, key: str) -> Joint:
         """Return the hinge or slide that an attribute names."""
-        name = element.text(key)
-        if name not in self.singles:
-            element.refuse(f"names the joint '{name}', which is no hinge or slide{closest(name, self.singles)}")
-        return self.singles[name]
+        return element.among(key, "hinge or slide", self.singles)
 
     def joint(self, joint: Element, name: str, pose: Pose, frame: Pose, parent: int) -> Joint:
         """Return a joint of a link, whose pose is that in its parent."""
@@ -505,7 +439,7 @@ class _MujocoModel:
         kind = "free" if bare else joint.choice("type", "hinge", "slide", "ball", "free")
         if kind == "free" and parent >= 0:
             joint.refuse("is free, but its body is inside another body")
-        turn = _unit(joint) if kind in ("hinge", "ball") else 1.0
+        turn = unit_of_angles(joint) if kind in ("hinge", "ball") else 1.0
         rest, zero = (joint.number(key, 0) for key in ("springref", "ref"))
         if joint.choice("actuatorgravcomp", "false", "true") == "true":
             self.compensating.append(joint)
@@ -541,12 +475,13 @@ class _MujocoModel:
         inertials = [*self.contents(body, "inertial")]
         if len(inertials) > 1:
             inertials[1][0].refuse("is the second of its body: one is allowed")
-        of: Callable[[Element], Inertia] = self.inertial
-        parts = inertials
         if rule == "true" or (rule == "auto" and not inertials):
             low, high = body.settings.vector("inertiagrouprange", (0, 5), (2,))
-            of, parts = self.geom, [x for x in self.contents(body, "geom") if low <= x[0].number("group", 0) <= high]
-        return [(of(part).seen_from(frame), (frame @ self.pose(part)).rotation) for part, frame in parts]
+            geoms = (x for x in self.contents(body, "geom") if low <= x[0].number("group", 0) <= high)
+            parts = [(inertia_of_geom(geom, self.meshes), geom, frame) for geom, frame in geoms]
+        else:
+            parts = [(self.inertial(element), element, frame) for element, frame in inertials]
+        return [(inertia.seen_from(frame), (frame @ pose_of(part)).rotation) for inertia, part, frame in parts]
 
     @staticmethod
     def bounded(body: Element, inertia: Inertia) -> Inertia:
@@ -569,40 +504,7 @@ class _MujocoModel:
             matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         else:
             matrix = np.diag(inertial.vector("diaginertia", (0, 0, 0)))
-        return Inertia(inertial.number("mass", least=0), matrix=matrix).seen_from(self.pose(inertial))
-
-    def geom(self, geom: Element) -> Inertia:
-        """Return the inertia of a geom of uniform density."""
-        shape = geom.text("type", "mesh" if geom.has("mesh") else "sphere")
-        density, mass = geom.number("density", 1000, 0), geom.number("mass", np.nan, 0)
-        if shape in WEIGHTLESS or mass == 0:
-            return Inertia()
-        shell = geom.choice("shellinertia", "false", "true") == "true"
-        if shape == "mesh" and not shell:
-            inertia = inertia_of(geom, self.meshes)
-            return inertia.scaled(density if np.isnan(mass) else mass / inertia.mass).seen_from(self.pose(geom))
-        if shape not in SHAPES or geom.has("mesh") or shell:
-            geom.refuse(f"is a {shape} whose inertia is not computed: give its body an <inertial>")
-        size = self.size(geom, shape)
-        with np.errstate(all="ignore"):
-            volume, moments = SHAPES[shape][1](size)
-        if not (0 < volume < np.inf and np.isfinite(moments).all()):
-            geom.refuse(f"has size='{geom.text('size')}', whose volume is {volume:g}: use other units of length")
-        mass = density * volume if np.isnan(mass) else mass
-        return Inertia(mass, matrix=mass * np.diag(moments)).seen_from(self.pose(geom))
-
-    @staticmethod
-    def size(geom: Element, shape: str) -> Vector:
-        """Return the sizes of a geom, by ``size`` and ``fromto``."""
-        count, size = SHAPES[shape][0], geom.vector("size", sizes=(1, 2, 3))
-        if geom.has("fromto"):
-            ends = geom.vector("fromto", sizes=(6,))
-            if shape == "sphere":
-                geom.refuse("has fromto, which needs a shape with an axis")
-            size = np.array([size[0]] * (count - 1) + [float(np.linalg.norm(ends[3:] - ends[:3])) / 2])
-        if len(size) < count or (size[:count] <= 0).any():
-            geom.refuse(f"is a {shape} and has size='{geom.text('size')}': {count} numbers > 0 are needed")
-        return size[:count]
+        return Inertia(inertial.number("mass", least=0), matrix=matrix).seen_from(pose_of(inertial))
 
     def drag(self, body: Element, inertia: Inertia) -> tuple[tuple[Pose, Any], ...]:
         """Return the drag of the ellipsoids of a body in a medium; without any, of the box of its mass and inertia."""
@@ -611,12 +513,12 @@ class _MujocoModel:
         ellipsoids: list[tuple[Pose, Any]] = []
         for geom, frame in self.contents(body, "geom"):
             if geom.choice("fluidshape", "none", "ellipsoid") == "ellipsoid":
-                if (shape := geom.text("type", "sphere")) not in SHAPES or geom.has("mesh"):
+                if (shape := shape_of(geom)) not in SHAPES or geom.has("mesh"):
                     geom.refuse(f"is a {shape} with fluidshape='ellipsoid', which is read of {', '.join(SHAPES)}")
-                size = self.size(geom, shape)
+                size = size_of(geom, shape)
                 r = size[[0, 0, -1] if len(size) < 3 else [0, 1, 2]] + (shape == "capsule") * size[0] * AXES["z"]
                 coefficients = geom.vector("fluidcoef", (0.5, 0.25, 1.5, 1, 1), (5,))
-                ellipsoids.append((frame @ self.pose(geom), partial(ellipsoid, r, coefficients, *self.medium)))
+                ellipsoids.append((frame @ pose_of(geom), partial(ellipsoid, r, coefficients, *self.medium)))
         if ellipsoids:
             return tuple(ellipsoids)
         heavy = [turn for part, turn in self.inertias(body) if part.mass > LIGHT]
@@ -625,53 +527,6 @@ class _MujocoModel:
         moments = np.diag(turn.T @ inertia.matrix @ turn)
         b = np.sqrt(6 * np.maximum(moments.sum() - 2 * moments, NO_MASS) / inertia.mass)
         return ((Pose(inertia.center, turn), partial(box, b, *self.medium)),)
-
-    @staticmethod
-    def pose(element: Element) -> Pose:
-        """Return the pose of an element in its parent, by position and orientation or by ``fromto``."""
-        if not element.has("fromto"):
-            return Pose(element.vector("pos", (0, 0, 0)), _MujocoModel.orientation(element))
-        if element.vector("pos", (0, 0, 0)).any():
-            element.refuse("has pos and fromto: one is needed")
-        ends = element.vector("fromto", sizes=(6,))
-        line = ends[:3] - ends[3:]
-        length = float(np.linalg.norm(line))
-        if length == 0:
-            element.refuse("has fromto, which needs two different points")
-        return Pose((ends[:3] + ends[3:]) / 2, _shortest_turn(line / length))
-
-    @staticmethod
-    def orientation(element: Element) -> Vector:
-        """Return the rotation matrix of the one attribute of orientation that an element has."""
-        present = [attribute for attribute in ORIENTATIONS if attribute in element.node.attrib]
-        if len(present) > 1:
-            element.refuse(f"has {' and '.join(present)}: one orientation is needed")
-        kind = present[0] if present else ""
-        if kind == "quat":
-            return _of_quaternion(element, element.vector("quat", sizes=(4,)))
-        if kind == "axisangle":
-            *axis, angle = element.vector("axisangle", sizes=(4,))
-            length = float(np.linalg.norm(axis))
-            if length == 0:
-                element.refuse("has an axis of length 0")
-            return about(np.array(axis) / length, angle * _unit(element))
-        if kind == "euler":
-            rotation = np.eye(3)
-            sequence = element.settings.text("eulerseq", "xyz")
-            if not re.fullmatch("[xyzXYZ]{3}", sequence):
-                element.refuse(f"has euler, and eulerseq='{sequence}' is not three of the letters xyzXYZ")
-            for letter, angle in zip(sequence, element.vector("euler"), strict=True):
-                turned = about(AXES[letter.lower()], angle * _unit(element))
-                rotation = rotation @ turned if letter.islower() else turned @ rotation
-            return rotation
-        if kind == "xyaxes":
-            axes = element.vector("xyaxes", sizes=(6,))
-            z = np.cross(axes[:3], axes[3:])
-            if not z.any():
-                element.refuse(f"has xyaxes='{element.text('xyaxes')}', which must be two different directions")
-            x, z = axes[:3] / np.linalg.norm(axes[:3]), z / np.linalg.norm(z)
-            return np.column_stack([x, np.cross(z, x), z])
-        return _shortest_turn(element.unit("zaxis")) if kind else np.eye(3)
 
     def completed(self) -> list[Link]:
         """Return the links, with inertias scaled to ``settotalmass``, and with the springs of ``springdamper``.
@@ -686,10 +541,8 @@ class _MujocoModel:
         on = [flag not in self.disabled for flag in ("spring", "damper")]
         for k, m in mean_inverses(links, self.responses):
             joint, (t, z) = links[k].joint, self.responses[links[k].joint.label]
-            stiffness, damping = (
-                (on[0] / (m * t**2 * z**2), *joint.stiffness[1:]),
-                _added(joint.damping, [2 * on[1] / (m * t)]),
-            )
+            stiffness = on[0] / (m * t**2 * z**2), *joint.stiffness[1:]
+            damping = _added(joint.damping, [2 * on[1] / (m * t)])
             links[k] = replace(links[k], joint=replace(joint, stiffness=stiffness, damping=damping))
         return links
 
@@ -697,122 +550,3 @@ class _MujocoModel:
 def _added(first: Sequence[float], second: Sequence[float]) -> tuple[float, ...]:
     """Return the sum of coefficients by power."""
     return tuple(a + b for a, b in zip_longest(first, second, fillvalue=0.0))
-
-
-def _unit(element: Element) -> float:
-    """Return the radians of a unit of angles."""
-    return np.pi / 180 if element.settings.choice("angle", "degree", "radian") == "degree" else 1.0
-
-
-def _merged(root: Element, tag: str, parts: list[Element]) -> Element:
-    """Return one element with the attributes of several, of which the later ones win."""
-    attributes = {key: value for part in parts for key, value in part.node.attrib.items()}
-    merged = ElementTree.Element(tag, attributes)
-    return Element(merged, {merged: root.places[(parts[0] if parts else root).node]})
-
-
-def _include(root: Element) -> None:
-    """Replace ``<include>`` by the contents of the file.
-
-    Its path is relative to the folder of the main document or, where it does not exist there, of the including one.
-    """
-    read, pending = {Path(root.file).resolve()}, [root]
-    while pending:
-        outer = pending.pop()
-        nodes, children = [], deque(outer.children())
-        while children:
-            child = children.popleft()
-            if child.tag != "include":
-                nodes.append(child)
-                continue
-            name = Path(child.text("file"))
-            if set(child.node.attrib) != {"file"} or len(child.node):
-                child.refuse("must have the attribute file, and nothing else")
-            folders = [Path(file).parent for file in (root.file, child.file)]
-            path = next((folder / name for folder in folders if (folder / name).exists()), folders[0] / name)
-            child.path(str(path.resolve()))
-            if path.resolve() in read:
-                child.refuse(f"names '{name}', which is included already")
-            read.add(path.resolve())
-            included = root_of(path, "mujocoinclude", "mujoco")
-            root.places.update({node: (*place[:3], root) for node, place in included.places.items()})
-            children.extendleft(Element(node, root.places) for node in reversed(included.node))
-        if len(nodes) != len(outer.node) or any(a.node is not b for a, b in zip(nodes, outer.node, strict=True)):
-            outer.node[:] = [element.node for element in nodes]
-        pending += nodes
-
-
-def _apply_defaults(root: Element) -> None:
-    """Give elements the attributes of their class, or of the class of the bodies around them, and check them all."""
-    elements, classes = [*root.walk(MJCF)], _classes(root)
-    of_classes = {node for section in root.children("default") for node in section.node.iter()}
-    for element, kind in elements:
-        if element.node in of_classes:
-            continue
-        inherited = element.node.get("childclass", "")
-        for child in element.node if inherited else ():
-            if child.tag in ("body", "frame", "replicate") or (child.tag in MJCF and MJCF[child.tag].defaults):
-                child.attrib.setdefault("class" if MJCF[child.tag].defaults else "childclass", inherited)
-        name = inherited or element.text("class", "main")
-        if name not in classes:
-            element.refuse(f"is of the class '{name}', which does not exist{closest(name, classes)}")
-        if kind.defaults:
-            _inherit(element, classes[name], kind.defaults)
-        element.check_neutral(kind)
-
-
-def _classes(root: Element) -> dict[str, Defaults]:
-    """Return the default attributes of each class, which inherits those of the class around it."""
-    classes: dict[str, Defaults] = {"main": {}}
-    for section in root.children("default"):
-        if section.text("class", "main") != "main":
-            section.refuse("is an outermost one, whose class is 'main'")
-        pending = [(section, "main")]
-        while pending:
-            element, name = pending.pop()
-            for child in element.children():
-                kind = MJCF.get(MJCF["default"].children[child.tag])
-                if kind is not None and kind.defaults:
-                    if wrong := {"class", "name"} & {*child.node.attrib}:
-                        child.refuse(f"has {min(wrong)}, which defaults do not have")
-                    _inherit(child, classes[name], kind.defaults)
-                    classes[name] |= {kind.defaults: child.node.attrib}
-            for child in element.children("default"):
-                if child.text("class") in classes:
-                    child.refuse(f"is the second of the class '{child.text('class')}': one is allowed")
-                classes[child.text("class")] = dict(classes[name])
-                pending.append((child, child.text("class")))
-    return classes
-
-
-def _inherit(element: Element, defaults: Defaults, kind: str) -> None:
-    """Give an element the attributes of a class that it has not."""
-    own, inherited = element.node.attrib, defaults.get(kind, {})
-    own.update(_over(inherited_by(element.tag, inherited) if kind == "actuator" else inherited, own))
-    if kind == "actuator":
-        as_general(element)
-
-
-def _over(defaults: dict[str, str], attributes: dict[str, str]) -> dict[str, str]:
-    """Return attributes over their defaults: one orientation replaces another, and numbers of a size the first ones."""
-    turned = any(key in attributes for key in ORIENTATIONS)
-    merged = {key: value for key, value in defaults.items() if not (turned and key in ORIENTATIONS)} | attributes
-    for key in {"size", "gear", "gainprm", "biasprm"} & {*defaults} & {*attributes}:
-        sizes = attributes[key].split()
-        merged[key] = " ".join(sizes + defaults[key].split()[len(sizes) :])
-    return merged
-
-
-def _of_quaternion(element: Element, q: Vector) -> Vector:
-    if not q.any():
-        element.refuse("has a quaternion of length 0")
-    return np.array(matrix_of([*map(float, q / np.linalg.norm(q))]), dtype=float)
-
-
-def _shortest_turn(axis: Vector) -> Vector:
-    """Return the shortest rotation that turns the z axis into a unit vector."""
-    across = np.cross([0.0, 0.0, 1.0], axis)
-    length = float(np.linalg.norm(across))
-    if length < 1e-12:
-        return np.diag([1.0, np.sign(axis[2]), np.sign(axis[2])])
-    return about(across / length, float(np.arctan2(length, axis[2])))

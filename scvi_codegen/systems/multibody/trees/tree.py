@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.systems.formulas.expressions import FUNCTIONS
+from scvi_codegen.systems.formulas.rotations import matrix_of
 from scvi_codegen.systems.formulas.symbols import C_KEYWORDS, DOT, TIME
 from scvi_codegen.systems.formulas.symbols import identifier as spelled
 
@@ -246,6 +247,11 @@ def about(axis: Vector, angle: float) -> Vector:
     across = hat(axis)
     rotation: Vector = np.eye(3) + np.sin(angle) * across + (1 - np.cos(angle)) * across @ across
     return rotation
+
+
+def rotation_by(q: Vector) -> Vector:
+    """Return the rotation matrix of a quaternion of any length but 0."""
+    return np.array(matrix_of([*map(float, q / np.linalg.norm(q))]), dtype=float)
 
 
 def hat(v: Vector) -> Vector:
