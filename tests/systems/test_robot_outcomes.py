@@ -26,7 +26,6 @@ PATH = '<tendon><spatial name="t" stiffness="3"><site site="w"/>{}<site site="e"
 SUM = """<tendon><fixed springlength=".1 .2" stiffness="3 2 1" damping="1 2 3"><joint joint="x" coef=".5"/>
 <joint joint="y" coef="-2"/></fixed></tendon>"""
 BALLS = '<joint name="x" type="ball" stiffness="3 2 1" damping="1 2 3"/>', '<joint name="y" type="ball"/>'
-SERVO = '<actuator><position name="u" joint="x" kv="1"/></actuator>'
 RATIOS = '<actuator><position joint="{}" kp="3" dampratio=".7" gear="2" inheritrange=".8"/></actuator>'
 CLASSES = """<default><default class="p"><position kp="4" kv="1" inheritrange="1"/></default><default class="g">
 <general gainprm="2 3" biasprm="1 -2" gaintype="affine"/><intvelocity kp="3" dampratio=".7"/></default>
@@ -37,13 +36,10 @@ ELLIPSOIDS = (
 )
 FLUID = {"option": 'density="9" viscosity="1"'}
 ROWS: dict[str, tuple[dict[str, str], str | None]] = {
-    "degrees": ({"a": A.format('ref="20" springref="30" stiffness="1"')}, EQUAL),
-    "radians": ({"compiler": 'angle="radian"', "a": A.format('ref=".3" springref=".5" stiffness="1"')}, EQUAL),
     "names with other characters": (
         {"a": A.format("").replace('"x"', '"1-hip/π"'), "b": B.replace('"y"', '"exp"')},
         EQUAL,
     ),
-    "polynomials": ({"a": A.format('stiffness="1 2 3" damping="1 2 3"')}, EQUAL),
     "free base": ({"a": '<freejoint name="f" align="false"/>'}, EQUAL),
     "slack tendon": (
         {
@@ -70,8 +66,6 @@ ROWS: dict[str, tuple[dict[str, str], str | None]] = {
     "medium": (FLUID, EQUAL),
     "medium, equal moments": (FLUID | {"a": A + '<geom size=".05" euler="1 0 0" mass="0"/>'}, EQUAL),
     "tendon through sites": ({"rest": PATH.format('<site site="s"/>')}, EQUAL),
-    "gears": ({"rest": '<actuator><motor joint="x" gear="-20" armature=".01" damping=".1"/></actuator>'}, EQUAL),
-    "servo": ({"rest": SERVO}, EQUAL),
     "servos by damping ratios and ranges of joints": (
         {
             "a": A.format('range="-1 .5" ref=".3" armature=".2"'),
@@ -144,6 +138,17 @@ ROWS: dict[str, tuple[dict[str, str], str | None]] = {
         {
             "rest": WRENCHES.format('<damper joint="x" kv="2" ctrlrange="0 1" forcerange="-.1 .2"', "2")
             + WRENCHES.format('<general joint="y" gaintype="affine" gainprm="1 2 3" forcerange="-.3 .3"', "2")
+        },
+        EQUAL,
+    ),
+    "ranges of the forces of several actuators on joints": (
+        {
+            "a": A.format('actuatorfrcrange="-.2 .1"'),
+            "b": B.format('type="slide" actuatorfrcrange="-.1 .3"'),
+            "rest": WRENCHES.format('<motor joint="x"', "2")
+            + WRENCHES.format('<position joint="x" kp="2" kv="1"', "-3")
+            + WRENCHES.format('<velocity jointinparent="y" kv="3" forcerange="-.2 .2"', "-3")
+            + WRENCHES.format('<motor site="e"', "-1 2 3 .5 .7 -.3"),
         },
         EQUAL,
     ),

@@ -64,7 +64,6 @@ class Mjcf:
         self.draw = draw = Draw(seed)
         self.joints: dict[str, str] = {}
         self.bodies, self.depth = 0, draw.one(1, 1, 1, 2)
-        self.clamped = draw.maybe(0.3)  # torques, and then no actuators of tendons
         self.fromto = draw.maybe(0.3)  # geoms then have no pos
         self.classes = ["main", "a", "b", "c"]
         compiler = draw.some(0.4, angle=draw.one("radian", "degree"), settotalmass="7")
@@ -127,7 +126,7 @@ class Mjcf:
         damping = {"damping": draw.numbers(draw.one(1, 2, 3), 0)} if draw.maybe(0.3) else {}
         stiffness = draw.numbers(draw.one(1, 2, 3), -(kind != "ball"), 3) if draw.maybe() else "0"
         limits = draw.some(0.3, range="0 0.2" if kind == "ball" else "0.1 0.2")
-        return {"stiffness": stiffness, **damping, **limits, **draw.some(0.5 * self.clamped, actuatorfrcrange="-1 2")}
+        return {"stiffness": stiffness, **damping, **limits, **draw.some(0.2, actuatorfrcrange="-.1 .2")}
 
     def site(self) -> dict[str, str]:
         return self.draw.turn(0.4) | self.draw.some(0.5, pos=self.draw.numbers(3))
@@ -240,7 +239,7 @@ class Mjcf:
         ends = {"site": self.ends[0]} | draw.some(0.5, refsite="s") | {"gear": draw.numbers(draw.one(3, 6))}
         made = [element(servo[0], {"name": "servo", "tendon": "path", **plain})]
         made += [element("general", {"name": "force", "joint": name, **affine}) for name in self.singles()[:1]]
-        return [] if self.clamped else [*made, element(servo[0], {"name": "wrench", **plain, **ends})]
+        return [*made, element(servo[0], {"name": "wrench", **plain, **ends})]
 
     def write(self, folder: Path) -> Path:
         for name, text in (("included", self.included), ("part", self.part), ("model", self.document)):

@@ -15,12 +15,12 @@ import numpy as np
 from sympy import Expr, Matrix, S
 
 from scvi_codegen.systems.formulas.intermediates import intermediate
-from scvi_codegen.systems.formulas.kinks import positive_part
 from scvi_codegen.systems.formulas.symbols import DOT, input_parameters, symbol
 from scvi_codegen.systems.multibody.trees.closures import frames_in_common
 from scvi_codegen.systems.multibody.trees.document import Element
 from scvi_codegen.systems.multibody.trees.energies import (
     as_quantities,
+    between,
     exact_number,
     exact_vector,
     position_of,
@@ -122,11 +122,7 @@ def actuator_of(
     name = next(x for x in names if taken.isdisjoint({x, *input_parameters([x])}))
     at, along, against = (exact_number(g) * symbol(name) + exact_number(b) for g, b in zip(gain, bias, strict=True))
     length, rate = motion[0], intermediate(motion[1])
-    force = at + along * length + against * rate
-    if forces is not None:
-        low, high = map(exact_number, forces)
-        force += positive_part(low - force) - positive_part(force - high)
-    return label, name, controls, (force, rate)
+    return label, name, controls, (between(at + along * length + against * rate, forces), rate)
 
 
 def clamped(inner: Range, outer: Range, factor: float) -> Range:

@@ -47,6 +47,7 @@ from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWa
 from scvi_codegen.systems.contact import MOST_ROWS, ContactLike, contact, friction, rows_of
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
 from scvi_codegen.systems.formulas.intermediates import intermediate, product, total
+from scvi_codegen.systems.formulas.kinks import positive_part
 from scvi_codegen.systems.formulas.rotations import Rotation, RotationNames
 from scvi_codegen.systems.formulas.symbols import DOT, default_momenta, symbol
 from scvi_codegen.systems.multibody.trees.tree import (
@@ -292,7 +293,9 @@ class Tree:
         names_of_q = [*chain.from_iterable(map(position_of, free)), *singles]
         spins = (rate for rotation in turning for rate in rotation.rates)
         rates = [*(symbol(name + DOT) for name in names_of_q), *spins]
-        loads = forces_on(rates, [*self.loads_of_medium(), *actuating])
+        pulls = {symbol(joint.name + DOT): joint.pull for joint in self.joints.values()}
+        acting = (between(f, pulls.get(rate)) for rate, f in zip(rates, forces_on(rates, actuating), strict=True))
+        loads = map(Add, forces_on(rates, self.loads_of_medium()), acting)
         forces = {name: next(loads) + (symbol(f"tau_{name}") if name in driven else 0) for name in names_of_q}
         return {
             "coordinates": [*map(symbol, names_of_q)],
@@ -311,6 +314,14 @@ def forces_on(rates: Sequence[Symbol], loads: Iterable[tuple[Expr, Expr]]) -> It
     power = Add(*(load * along for load, (_, along) in held.items()))
     values = {load: intermediate(value) for load, (value, _) in held.items()}
     yield from (part.xreplace(values) for part in gradient_tuple(power, rates))
+
+
+def between(force: Expr, bounds: tuple[float, float] | None) -> Expr:
+    """Return a force that is clamped to a range."""
+    if bounds is None or force == 0:
+        return force
+    force, (low, high) = intermediate(force), map(exact_number, bounds)
+    return force + positive_part(low - force) - positive_part(force - high)
 
 
 def rotation_of(joint: Joint) -> Rotation:

@@ -288,15 +288,12 @@ class _MujocoModel:
         return (low, high) if limited == "true" or (limited == "auto" and automatic) else None
 
     def actuators(self, tendons: Sequence[Tendon]) -> Iterator[Actuator]:
-        """Yield the actuators, if they are read; ``actuatorfrcrange`` is that of the only one of a joint or tendon."""
+        """Yield the actuators, if they are read."""
         elements = [*self.entries("actuator")] if "actuators" in self.parts and "actuation" not in self.disabled else []
         names = {name: "" for element in elements if (name := element.node.get("name"))}
         targets = [next(((x, element.text(x)) for x in ACTED if element.has(x)), ("", "")) for element in elements]
         paths = {tendon.name: tendon for tendon in tendons}
         joints = {link.joint.label: link.joint for link in self.links if link.joint.kind != "fixed"}
-        pulls = {("tendon", tendon.name): tendon.pull for tendon in tendons}
-        for key, label in ((key, label) for key in JOINTED for label in self.singles if elements):
-            pulls[key, label] = self.bounds(self.joints[label], "actuatorfrc")
         rated = (is_servo(element) and coefficients_of(element)[1][2] > 0 for element in elements)
         damped = self.singles.keys() & {label for (_, label), damps in zip(targets, rated, strict=True) if damps}
         inverses = {self.links[k].joint.label: m for k, m in mean_inverses(self.completed() if damped else (), damped)}
@@ -313,8 +310,9 @@ class _MujocoModel:
                 things: Mapping[str, Joint | Tendon] = paths if target[0] == "tendon" else joints
                 part = element.among(target[0], target[0].removesuffix("inparent"), things)
                 motion = motion_of(self.links, part, gear, target[0] == "jointinparent")
-            if any(pulls.values()) and (target[0] not in JOINTED or targets.count(target) > 1):
-                element.refuse("is one of several on a part with actuatorfrcrange, which is read of single ones only")
+            pull = paths[target[1]].pull if target[0] == "tendon" else None
+            if pull and targets.count(target) > 1:
+                element.refuse("is one of several on a tendon with actuatorfrcrange, which is read of single ones only")
             law, inherited = activation_of(element), self.inherited(element, target)
             controls = self.bounds(element, "ctrl", inherited)
             activations = self.bounds(element, "act", inherited if law == "integrator" else (0, 0))
@@ -322,7 +320,7 @@ class _MujocoModel:
                 element.refuse("has actrange, the range of an activation, which its dyntype does not have")
             unclamped = law == "integrator" or "clampctrl" in self.disabled
             controls = clamped(None if unclamped else controls, activations, 1.0)
-            ranges = controls, clamped(self.bounds(element, "force"), pulls.get(target), gear[0])
+            ranges = controls, clamped(self.bounds(element, "force"), pull, gear[0])
             inverse = inverses.get(target[1]) if target[0] in JOINTED else None
             actuator = actuator_of(self.links, element, motion, gear[0], names, *ranges, inverse)
             names[actuator[0]] = actuator[1]
@@ -459,6 +457,7 @@ class _MujocoModel:
             zero=zero * turn if kind in SINGLE else 0.0,
             limits=limits and checked_limits(joint, limits[0] * turn, limits[1] * turn),
             dry_friction=friction,
+            pull=self.bounds(joint, "actuatorfrc") if kind in SINGLE else None,
         )
 
     def coefficients(self, element: Element, key: str) -> tuple[float, ...]:

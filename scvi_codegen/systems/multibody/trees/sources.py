@@ -1,8 +1,8 @@
 """Documents of MJCF: included files, attributes of classes, and macros, which are written out.
 
-Macros are ``<replicate>``, and ``<attach>`` of bodies, frames and whole models. A copy has names with a prefix
-or suffix. So have copies of the elements outside of the tree that refer only to its inside; tendons may refer to other parts of
-the same model as well. Elements that refer to the inside of a ``<replicate>`` exist as such copies only.
+Macros are ``<replicate>``, and ``<attach>`` of bodies, frames and whole models. A copy has names with a prefix or
+suffix, and so have copies of the elements outside of the tree that refer only to its inside; tendons may refer to
+other parts of the same model as well. Elements that refer to the inside of a ``<replicate>`` exist as such copies only.
 https://mujoco.readthedocs.io/en/stable/XMLreference.html#replicate
 """
 

@@ -103,6 +103,7 @@ class Joint:
         zero: value of the coordinate at ``pose``.
         limits: smallest and largest value of the coordinate, or none; of the angle of a ball joint only the second.
         dry_friction: torque or force of dry friction of each rate.
+        pull: smallest and largest force of all actuators together, or none.
         follows: name of another joint, factor and offset: q = factor q_other + offset, without a coordinate of its own.
     """
 
@@ -117,6 +118,7 @@ class Joint:
     zero: float = 0.0
     limits: tuple[float, float] | None = None
     dry_friction: float = 0.0
+    pull: tuple[float, float] | None = None
     follows: tuple[str, float, float] | None = None
     label: str = ""
 
