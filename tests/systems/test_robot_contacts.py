@@ -17,9 +17,13 @@ FLOOR = '<geom name="floor" type="plane" size="1 1 1" pos=".1 .2 .3" euler="10 2
 ALL = {"limits": "contact", "friction": "contact", "contacts": "planes"}
 
 
-def robot(folder, bodies, rest="", **arguments):
-    (folder / "robot.xml").write_text(f"<mujoco><worldbody>{bodies}</worldbody>{rest}</mujoco>")
+def read(folder, text, **arguments):
+    (folder / "robot.xml").write_text(text)
     return sc.LagrangianSystem.from_mjcf(folder / "robot.xml", **(arguments or ALL))
+
+
+def robot(folder, bodies, rest="", **arguments):
+    return read(folder, f"<mujoco><worldbody>{bodies}</worldbody>{rest}</mujoco>", **arguments)
 
 
 @pytest.mark.second
@@ -198,8 +202,7 @@ name="hip" damping="1" stiffness="20"/><geom fromto="0 0 0 .1 0 -.4" mass="1"/><
 
 @pytest.mark.rotated
 def test_a_robot_falls_on_its_capsules_and_rests(tmp_path):
-    (tmp_path / "sitter.xml").write_text(SITTER)
-    stepper = sc.compile_stepper(sc.LagrangianSystem.from_mjcf(tmp_path / "sitter.xml", contacts="planes"), "svi:2")
+    stepper = sc.compile_stepper(read(tmp_path, SITTER, contacts="planes"), "svi:2")
     start = dict.fromkeys(["x", "z", "pitch", "hip"], 0.0)
     run = stepper.integrate(start, velocity=start | {"x": 0.5, "pitch": 0.3}, h=0.0025, t_end=6.0)
     assert run.contact_modes[-1][1] == ("open", "stick", "stick", "open")
@@ -221,8 +224,7 @@ STOOL = f"""<mujoco><worldbody><geom type="plane" size="5 5 .1" friction=".8"/>
     [({"h": 0.005}, (0, 1, 2, 3, 11)), ({"h": 0.002}, (20, 22)), ({"tolerance": 1e-8}, (1, 2, 4, 12, 16))],
 )  # slips of feet that end together: 11, 20, 12, 16
 def test_a_free_body_falls_on_four_feet_and_rests(steps, seeds, tmp_path):
-    (tmp_path / "stool.xml").write_text(STOOL)
-    stepper = sc.compile_stepper(sc.LagrangianSystem.from_mjcf(tmp_path / "stool.xml", contacts="planes"), "svi:2")
+    stepper = sc.compile_stepper(read(tmp_path, STOOL, contacts="planes"), "svi:2")
     for seed in seeds:
         spin = np.random.default_rng(seed).normal(size=3) / 2
         velocity = {"x_seat": 0.3, "y_seat": 0.1 * seed, "z_seat": 0.0, "omega_seat": spin}
@@ -240,9 +242,7 @@ def test_a_free_body_falls_on_four_feet_and_rests(steps, seeds, tmp_path):
 
 def fallen(floor, feet, folder, start, velocity, *, e=0.0, **steps):
     """Return the run of a file to its end, which ends with energies that never grew."""
-    (folder / "fallen.xml").write_text(f"<mujoco><worldbody>{floor}{feet}</worldbody></mujoco>")
-    system = sc.LagrangianSystem.from_mjcf(folder / "fallen.xml", contacts="planes", restitution=e)
-    stepper = sc.compile_stepper(system, "svi:2")
+    stepper = sc.compile_stepper(robot(folder, floor + feet, contacts="planes", restitution=e), "svi:2")
     for k in steps["steps"]:
         run = stepper.integrate(start, velocity=velocity, t_end=2.0, **k)
         assert np.diff(run.energy()).max() < 1e-9
@@ -326,8 +326,7 @@ def test_a_robot_lands_on_a_bent_leg(tmp_path):
 @pytest.mark.rotated
 def test_modes_with_forces_outside_of_their_cones_are_refused(tmp_path):
     """With a bound of normal forces that none satisfies after the last choice of modes."""
-    (tmp_path / "stool.xml").write_text(STOOL)
-    own = sc.compile_stepper(sc.LagrangianSystem.from_mjcf(tmp_path / "stool.xml", contacts="planes"), "svi:2")
+    own = sc.compile_stepper(read(tmp_path, STOOL, contacts="planes"), "svi:2")
     stepper = planted(own, "force[normal] >= -small;", "force[normal] >= 1e9;")
     velocity = {"x_seat": 0.3, "y_seat": 0.1, "z_seat": 0.0, "omega_seat": np.random.default_rng(1).normal(size=3) / 2}
     start = {"x_seat": 0, "y_seat": 0, "z_seat": 0.3, "R_seat": [1, 0, 0, 0]}
@@ -350,8 +349,7 @@ LEGGED = """<mujoco><compiler angle="degree"/>
 
 @pytest.mark.second
 def test_a_body_on_a_leg_passes_painleves_paradox_bounces_and_rests(tmp_path):
-    (tmp_path / "leg.xml").write_text(LEGGED)
-    leg = sc.LagrangianSystem.from_mjcf(tmp_path / "leg.xml", limits="contact", contacts="planes", restitution=0.3)
+    leg = read(tmp_path, LEGGED, **ALL, restitution=0.3)
     stepper, jump = sc.compile_stepper(leg, "svi:2"), "impact without collision .*geom 'toe'"
     with pytest.warns(sc.EventWarning, match=jump):
         run = stepper.integrate(
@@ -366,8 +364,7 @@ def test_a_body_on_a_leg_passes_painleves_paradox_bounces_and_rests(tmp_path):
 @pytest.mark.filterwarnings("ignore:impact without collision")
 def test_rebounds_of_a_joint_above_feet_that_rest_end(tmp_path):
     """In free fall a knee has no acceleration that would end them: the forces of the feet count."""
-    (tmp_path / "leg.xml").write_text(LEGGED)
-    leg = sc.LagrangianSystem.from_mjcf(tmp_path / "leg.xml", limits="contact", contacts="planes", restitution=0.3)
+    leg = read(tmp_path, LEGGED, **ALL, restitution=0.3)
     run = sc.compile_stepper(leg, "svi:2").integrate(
         [0, 0.147, 0.109, -0.101, -0.407], velocity=[1.081, 0, 1.935, -0.27, 0], h=0.005, t_end=1.5
     )
@@ -392,9 +389,7 @@ QUADRUPED = f"""<mujoco><default><geom contype="0" conaffinity="0"/><joint dampi
 @pytest.mark.rotated
 def test_a_quadruped_in_space_bounces_on_its_feet_and_comes_to_rest(tmp_path):
     """Nothing supplies energy, and no foot is below the floor."""
-    (tmp_path / "quadruped.xml").write_text(QUADRUPED)
-    arguments = {"limits": "contact", "contacts": "planes", "restitution": 0.3}
-    system = sc.LagrangianSystem.from_mjcf(tmp_path / "quadruped.xml", **arguments)
+    system = read(tmp_path, QUADRUPED, **ALL, restitution=0.3)
     stepper = sc.compile_stepper(system, "svi:2")
     start = {x.name: 0.0 for x in system.coordinates[:-4]} | {"z_f": 0.75, "R_f": [0.98, 0.06, 0.08, np.sqrt(0.0296)]}
     velocity = {x.name: 0.0 for x in system.coordinates[:-4]} | {"x_f": 0.3, "y_f": 0.1, "omega_f": [0.2, -0.3, 0.1]}

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from random_robots import errors_of_motion
+from random_robots import FACES, errors_of_motion
 
 import scvi_codegen as sc
 from scvi_codegen.common.errors import SystemDefinitionError
@@ -53,7 +53,6 @@ WRONG = {
     "inside": ('<joint name="o"/>', '<attach body="own" prefix="y"/>', "is attached before it is written out"),
 }
 BOX = "-1 -.5 -.25 0 -.5 -.25 -1 .5 -.25 0 .5 -.25 -1 -.5 .25 0 -.5 .25 -1 .5 .25 0 .5 .25"
-FACES = "0 2 1 1 2 3 4 5 6 5 7 6 0 1 4 1 5 4 2 6 3 3 6 7 0 4 2 2 4 6 1 3 5 3 7 5"
 BOXES = f'vertex="{BOX} {BOX.replace("-1", "2").replace(" 0 ", " 3 ")}"'
 BOXES += f' face="{FACES} {" ".join(str(int(k) + 8) for k in FACES.split())}"'
 MESH = """<mujoco><option><flag contact="disable"/></option><asset><mesh name="m" {}/></asset><worldbody><body>

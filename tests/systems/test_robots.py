@@ -124,13 +124,7 @@ MJCF = {
     "include of a device": ("<option", '<include file="/dev/zero"/><option', "names '/dev/zero' outside the folder"),
     "include of a folder": ("<option", '<include file="."/><option', "it is no regular file"),
     "include of itself": ("<option", '<include file="figure.xml"/><option', "is included already"),
-    "unknown attribute": ('damping="0.1"', 'dampnig="0.1"', "'dampnig'; did you mean 'damping'?"),
-    "unknown element": ("<freejoint", "<freejiont", "<freejiont>; did you mean 'freejoint'?"),
     "keyword": ('angle="degree"', 'angle="degrees"', "which must be degree or radian; did you mean 'degree'?"),
-    "number of Python": ('damping="0.1"', 'damping="1_0"', "must be numbers"),
-    "no number": ('damping="0.1"', 'damping="nan"', "must be numbers"),
-    "large": ('size="0.05"', 'size="1e200"', "magnitude must be less than 1e+40"),
-    "negative": ('damping="0.1"', 'damping="-0.1"', "damping -0.1, which must not be < 0"),
     "impossible inertia": ('fullinertia="0.1 0.2 0.15', 'fullinertia="0.1 0.2 1.5', "which no body has"),
     "medium": ("<option", '<option wind="1 0 0"', "wind='1 0 0', which changes the motion"),
     "tendon of a class": (
@@ -178,7 +172,7 @@ def test_moments_of_inertia_are_checked_with_fixed_links(tmp_path):
     with pytest.warns(SystemDefinitionWarning, match="which no body has"):
         sc.LagrangianSystem.from_urdf(file, check_inertias=False)
     file.write_text(text.replace('"revolute"', '"floating"'))
-    with pytest.raises(SystemDefinitionError, match=r"urdf:\d+: <joint> 'shoulder' is free, and so is its parent"):
+    with pytest.raises(SystemDefinitionError, match=r"urdf:\d+: <joint> 'shoulder' is free, but its parent moves"):
         sc.LagrangianSystem.from_urdf(file, floating=True)
     file.write_text(rounded)
     assert rounded != negative != text
@@ -226,17 +220,6 @@ def test_nested_includes_flags_and_groups_of_geoms_are_read(tmp_path):
         sc.LagrangianSystem.from_mjcf(file)
 
 
-def test_limits_and_dry_friction_are_named_in_one_warning(tmp_path):
-    file = tmp_path / "arm.urdf"
-    text = (ROBOTS / "arm.urdf").read_text().replace("<dynamics", '<dynamics friction="0.1"')
-    file.write_text(text.replace('<limit lower="-1"', '<dynamics friction="0.2"/><limit lower="-1"'))
-    unread = "limits of joints shoulder, rail-1; dry friction of joints shoulder, rail-1$"
-    with pytest.warns(SystemDefinitionWarning, match=unread) as caught:
-        sc.LagrangianSystem.from_urdf(file)
-    assert len(caught) == 1
-    assert Path(caught[0].filename).name == "test_robots.py"
-
-
 LIFT = {
     "mjcf": """<mujoco><worldbody>
 <body><joint name="lift" type="slide" axis="0 0 1" range="-.5 1"/><geom size=".1" mass="1"/></body>
@@ -280,7 +263,7 @@ def test_parts_of_models_that_are_not_read_are_named_in_one_warning(tmp_path):
     unread = "limits of joints flex; dry friction of joints flex; actuators servo; contacts$"
     with pytest.warns(SystemDefinitionWarning, match=unread) as caught:
         sc.LagrangianSystem.from_mjcf(file)
-    assert len(caught) == 1
+    assert [Path(warning.filename).name for warning in caught] == ["test_robots.py"]
     disabled = '<flag contact="disable" limit="disable" frictionloss="disable"/></option>'
     file.write_text(text.replace('<option gravity="0 1 -9"/>', f"<option>{disabled}"))
     with pytest.warns(SystemDefinitionWarning, match="without actuators servo$"):
@@ -288,31 +271,6 @@ def test_parts_of_models_that_are_not_read_are_named_in_one_warning(tmp_path):
 
 
 DEFAULTS = {
-    "orientation of geoms": (
-        '<default><geom type="box" size=".1 .2 .5" quat="1 .2 .3 .4"/></default>{hinge}<geom pos="0 .3 .1"/>{end}',
-        '{hinge}<geom type="box" size=".1 .2 .5" quat="1 .2 .3 .4" pos="0 .3 .1"/>{end}',
-    ),
-    "another orientation": (
-        '<default><geom type="box" size=".1 .2 .5" quat="1 .2 .3 .4"/></default>{hinge}<geom euler="9 8 7"/>{end}',
-        '{hinge}<geom type="box" size=".1 .2 .5" euler="9 8 7"/>{end}',
-    ),
-    "first number of a size": (
-        '<default><geom type="box" size=".1 .2 .5"/></default>{hinge}<geom size=".3"/>{end}',
-        '{hinge}<geom type="box" size=".3 .2 .5"/>{end}',
-    ),
-    "second outermost default": (
-        '<default><geom type="box"/></default><default><geom size=".1 .2 .5"/></default>{hinge}<geom/>{end}',
-        '{hinge}<geom type="box" size=".1 .2 .5"/>{end}',
-    ),
-    "class of a frame": (
-        '<default><default class="a"><geom type="box" size=".1 .2 .5"/></default></default>'
-        '{hinge}<frame childclass="a"><geom/></frame>{end}',
-        '{hinge}<geom type="box" size=".1 .2 .5"/>{end}',
-    ),
-    "inertial in a frame": (
-        '{hinge}<frame pos="1 0 0"><inertial pos="0 1 0" mass="2" diaginertia="1 1 1"/></frame>{end}',
-        '{hinge}<inertial pos="1 1 0" mass="2" diaginertia="1 1 1"/>{end}',
-    ),
     "equality": (
         '<default><equality active="false"/></default>{hinge}<geom size="1"/>{end}'
         '<equality><joint joint1="q"/></equality>',

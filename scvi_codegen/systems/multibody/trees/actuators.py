@@ -106,10 +106,10 @@ def actuator_of(
     a ratio z.
     """
     gain, bias = _gain_and_bias(element)
-    if bias[2] > 0 and is_servo(element):
+    if ratio := damping_ratio(element):
         if inverse is None or gain[0] < 0 or gear == 0:
             element.refuse("has a dampratio, which hinges and slides with gear and kp >= 0 may have: give kv")
-        bias[2] *= -2 * (gain[0] / inverse) ** 0.5 / abs(gear)
+        bias[2] = -2 * ratio * (gain[0] / inverse) ** 0.5 / abs(gear)
     if not (any(gain[1:]) or any(bias)):
         controls, forces = clamped(controls, forces, gain[0]), None
     if others.get(label := element.node.get("name", "")):
@@ -140,9 +140,14 @@ def coefficients_of(element: Element) -> list[Vector]:
 
 
 def is_servo(element: Element) -> bool:
-    """Return whether the force is g0 (u - l) and damping, whose ratio is the third number of the bias if it is > 0."""
+    """Return whether the force is g0 (u - l) and damping."""
     gain, bias = coefficients_of(element)
     return bool(gain[0] == -bias[1]) and element.text("biastype", "none") == "affine"
+
+
+def damping_ratio(element: Element) -> float:
+    """Return the damping ratio of a servo, the third number of its bias if it is > 0."""
+    return max(0.0, float(coefficients_of(element)[1][2])) if is_servo(element) else 0.0
 
 
 def inherited_by(tag: str, defaults: Mapping[str, str]) -> dict[str, str]:

@@ -26,7 +26,7 @@ from scvi_codegen.systems.multibody.trees.actuators import (
     activation_of,
     actuator_of,
     clamped,
-    coefficients_of,
+    damping_ratio,
     is_servo,
     motion_of,
     motion_of_sites,
@@ -294,8 +294,8 @@ class _MujocoModel:
         targets = [next(((x, element.text(x)) for x in ACTED if element.has(x)), ("", "")) for element in elements]
         paths = {tendon.name: tendon for tendon in tendons}
         joints = {link.joint.label: link.joint for link in self.links if link.joint.kind != "fixed"}
-        rated = (is_servo(element) and coefficients_of(element)[1][2] > 0 for element in elements)
-        damped = self.singles.keys() & {label for (_, label), damps in zip(targets, rated, strict=True) if damps}
+        rated = {label for x, (_, label) in zip(elements, targets, strict=True) if damping_ratio(x)}
+        damped = self.singles.keys() & rated
         inverses = {self.links[k].joint.label: m for k, m in mean_inverses(self.completed() if damped else (), damped)}
         for element, target in zip(elements, targets, strict=True):
             gear = np.append(element.vector("gear", (1,), range(1, 7)), np.zeros(5))[:6]

@@ -41,15 +41,9 @@ def links_of_urdf(path: str | PathLike[str], *, floating: bool, parts: Collectio
             links are no tree, or a joint is of a kind that is not read.
     """
     robot = root_of(Path(path), "robot")
-    unread = Unread()
-    for node in robot.node.iter("drake:joint"):
-        node.tag = "joint"
-    for element, kind in robot.walk(URDF):
-        element.check_neutral(kind)
-        if others := [f"<{child.tag}>" for child in element.node if ":" in child.tag or child.tag == "frame"]:
-            unread.add("elements", *others)
+    unread = _checked(robot, parts)
     links = _links(robot)
-    joints = _by_child(robot, links, floating=floating)
+    joints = _by_child(robot, links)
     roots = [name for name in links if name not in joints]
     if len(roots) != 1:
         robot.refuse(f"must have links that form one tree, but without parents are {roots or 'none'}")
@@ -58,10 +52,13 @@ def links_of_urdf(path: str | PathLike[str], *, floating: bool, parts: Collectio
         outgoing[_linked(joint, "parent")].append(child)
     base = Joint(name=roots[0], kind="free" if floating else "fixed", pose=Pose())
     tree = [Link(roots[0], -1, base, _inertia(links[roots[0]]))]
-    places, rotors = {roots[0]: 0}, _rotors(robot)
+    places, rotors, resting = {roots[0]: 0}, _rotors(robot), set() if floating else {roots[0]}
     for parent in (order := [roots[0]]):
         for child in outgoing[parent]:
-            place = places[parent]
+            place, kind = places[parent], joints[child].text("type")
+            if kind == "floating" and parent not in resting:
+                joints[child].refuse("is free, but its parent moves: remove the joint, or omit floating=True")
+            resting |= {child} if kind == "fixed" and parent in resting else set()
             for moved in _joints(joints[child], parts, rotors.get(joints[child].name, 0.0)):
                 tree.append(Link(child, place, moved, Inertia()))
                 place = len(tree) - 1
@@ -71,14 +68,12 @@ def links_of_urdf(path: str | PathLike[str], *, floating: bool, parts: Collectio
     if len(order) < len(links):
         circle = sorted(set(links) - set(order))
         joints[circle[0]].refuse(f"closes a loop: the links {circle} form a circle")
-    _check_free(joints)
     _check_followed(robot)
-    _list_unread(robot, parts, unread)
     unread.warn(str(path))
     return robot.node.get("name") or Path(path).stem, named(tree)
 
 
-def _by_child(robot: Element, links: Mapping[str, Element], *, floating: bool) -> dict[str, Element]:
+def _by_child(robot: Element, links: Mapping[str, Element]) -> dict[str, Element]:
     """Return the joints by the names of the links that they move, after checks of these."""
     joints: dict[str, Element] = {}
     for joint in _by_name(robot, "joint").values():
@@ -88,20 +83,7 @@ def _by_child(robot: Element, links: Mapping[str, Element], *, floating: bool) -
         if child in joints:
             joint.refuse(f"moves the link '{child}', which joint '{joints[child].name}' moves as well")
         joints[child] = joint
-    for joint in joints.values() if floating else ():
-        if joint.text("type") == "floating" and _linked(joint, "parent") not in joints:
-            joint.refuse("is free, and so is its parent by floating=True: omit floating")
     return joints
-
-
-def _check_free(joints: Mapping[str, Element]) -> None:
-    """Raise an error for a free joint whose parent moves, of joints by the links that they move."""
-    for joint in (joint for joint in joints.values() if joint.text("type") == "floating"):
-        parent = _linked(joint, "parent")
-        while parent in joints:
-            if joints[parent].text("type") != "fixed":
-                joint.refuse("is free, but its parent moves: remove the joint")
-            parent = _linked(joints[parent], "parent")
 
 
 def _check_followed(robot: Element) -> None:
@@ -133,8 +115,15 @@ def _rotors(robot: Element) -> dict[str, float]:
     return rotors
 
 
-def _list_unread(robot: Element, parts: Collection[str], unread: Unread) -> None:
-    """Add the parts of a document that matter and are not read."""
+def _checked(robot: Element, parts: Collection[str]) -> Unread:
+    """Check elements and attributes of a document; return its parts that matter and are not read."""
+    unread = Unread()
+    for node in robot.node.iter("drake:joint"):
+        node.tag = "joint"
+    for element, kind in robot.walk(URDF):
+        element.check_neutral(kind)
+        if others := [f"<{child.tag}>" for child in element.node if ":" in child.tag or child.tag == "frame"]:
+            unread.add("elements", *others)
     for joint in robot.children("joint"):
         bounds, friction = _limits(joint)
         if bounds and "limits" not in parts:
@@ -145,6 +134,7 @@ def _list_unread(robot: Element, parts: Collection[str], unread: Unread) -> None
         unread.add("contacts")
     for actuator in robot.children("transmission", "ros2_control"):
         unread.add("actuators", actuator.name)
+    return unread
 
 
 def _limits(joint: Element) -> tuple[tuple[float, float] | None, float]:
