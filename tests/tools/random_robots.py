@@ -434,30 +434,6 @@ def equations_of(system: Any, labels: Sequence[str], kinds: Sequence[int]) -> An
     return equations
 
 
-def motion_by_mujoco(path: Path, place: Any, rates: Any, span: float) -> Any:
-    """Return qpos after a time span, by DOP853 of M a = f + J^T l, J a = -dJ/dt v, with dependent equations."""
-    import mujoco
-    from scipy.integrate import solve_ivp
-
-    model = mujoco.MjModel.from_xml_path(str(path))
-    data, mass, step = mujoco.MjData(model), np.zeros((model.nv, model.nv)), 1e-5
-
-    def field(_: float, state: Any) -> Any:
-        sides = []
-        for h in (step, -step, 0):
-            data.qpos[:], data.qvel[:] = np.split(state, [model.nq])
-            mujoco.mj_integratePos(model, data.qpos, data.qvel, h)
-            mujoco.mj_forward(model, data)
-            sides.append(np.array(data.efc_J).reshape(-1, model.nv)[: data.ne])
-        mujoco.mj_fullM(model, data, mass)
-        free, rows = np.array(data.qacc_smooth), sides[2]
-        bias, lifted = (sides[0] - sides[1]) @ data.qvel / (2 * step), np.linalg.solve(mass, rows.T)
-        forces = np.linalg.lstsq(rows @ lifted, rows @ free + bias, rcond=1e-7)[0]
-        return np.concatenate([flow(model.jnt_type, data.qpos, data.qvel), free - lifted @ forces])
-
-    return solve_ivp(field, (0, span), [*place, *rates], method="DOP853", rtol=1e-11, atol=1e-12).y[: model.nq, -1]
-
-
 if __name__ == "__main__":
     import tempfile
 

@@ -68,7 +68,7 @@ ACTUATED = (
 )
 OTHERS = "orientation pid muscle adhesion dcmotor plugin"
 """Actuators that are not read."""
-ACTING = f"{'{0} '.join(ACTUATORS)}{{0}} {'=other_actuator{0} '.join(OTHERS.split())}=other_actuator{{0}}"
+ACTING = [*ACTUATORS, *(f"{tag}=other_actuator" for tag in OTHERS.split())]
 
 MJCF = {
     "mujoco": Kind(
@@ -101,7 +101,7 @@ MJCF = {
     "default": Kind(
         "class",
         children="default* joint geom site equality=any_equality tendon=spatial mesh texture~ material~ "
-        f"camera~ light~ pair {ACTING.format('')}",
+        f"camera~ light~ pair {' '.join(ACTING)}",
     ),
     "asset": Kind(children="model=asset_model* mesh* hfield~ skin~ texture~ material~"),
     "mesh": Kind(
@@ -148,7 +148,7 @@ MJCF = {
     "tendon": Kind(children="spatial* fixed*"),
     "spatial": TENDON,
     "fixed": TENDON,
-    "actuator": Kind(children=ACTING.format("*")),
+    "actuator": Kind(children="* ".join([*ACTING, ""])),
     **{tag: Kind(f"{ACTUATED[0]} {own}", ACTUATED[1], defaults="actuator") for tag, own in ACTUATORS.items()},
     "other_actuator": Kind(
         ACTUATED[0],
