@@ -242,6 +242,15 @@ def test_free_flight_is_examined_for_narrow_forces():
     assert missed <= 3
 
 
+@pytest.mark.second
+def test_runs_for_comparison_do_not_pass_over_the_tail_of_a_force():
+    """One of them flies to its flank in one step, and loses 1e-8 of the impulse."""
+    flash = stepper_of("flash", "svi:4")
+    run = flash.integrate([0.1], [0.2], t_end=10.0, error=1e-12, parameters={"w": 0.01})
+    assert run.global_error <= 1e-12
+    assert run.p[-1, 0] - 0.2 == pytest.approx(0.01 * math.sqrt(math.pi), rel=1e-12)
+
+
 @pytest.mark.full
 @pytest.mark.parametrize(("family", "count", "least"), [("smooth", 2000, 0.95), ("narrow", 1000, 0.9)])
 def test_no_false_confirmation_in_three_thousand_cases(family, count, least):

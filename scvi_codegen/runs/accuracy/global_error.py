@@ -300,7 +300,7 @@ class Runs:
         self.least, self.rounded = LEAST, ROUNDED
         self.last: tuple[float | None, ...] = LAST
         self.failure: StepFailedError | None = None
-        self.compared: tuple[Any, _Samples] | None = None
+        self.compared: _Samples | None = None
         if self.words > 1:
             self.least, self.rounded, self.last = LEAST_OF_TWO_WORDS, ROUNDED_OF_TWO_WORDS, LAST_OF_TWO_WORDS
         if not motion.smooth:  # errors are as random as those of rounding
@@ -353,7 +353,6 @@ class Runs:
                 raise
             run = failure.trajectory
         self.taken += run.steps
-        self.compared = run, compared
         return run
 
     def _check_count(self, steps: int) -> None:
@@ -367,7 +366,7 @@ class Runs:
         Args:
             passing: the run before that passes over forces; it is lost if none of smaller steps can be made.
         """
-        attempts: list[tuple[Attempt, Any]] = []
+        attempts: list[tuple[Attempt, _Samples | None]] = []
         for attempt in chain(self._limited() if self.parts else self._by_tolerance(), self._at_round_off()):
             if attempt[1].confirmed:
                 return self._judged(attempt) if self._passes_over_forces(self.compared) else attempt
@@ -380,11 +379,11 @@ class Runs:
         further = [best[0]] if len(best[0].t) == best[0].steps + 1 else []
         return self._judged(best) if self._passes_over_forces(compared, *further) else best
 
-    def _passes_over_forces(self, compared: tuple[Any, "_Samples"] | None, *further: Any) -> bool:
-        """Return whether a run for comparison, or a further one, passes over forces; runs have smaller steps then."""
-        if not self.is_examined or self.examinations == MOST_EXAMINATIONS or compared is None:
+    def _passes_over_forces(self, samples: "_Samples | None", *further: Any) -> bool:
+        """Return whether the farthest run, or a further one, passes over forces; runs have smaller steps then."""
+        run = None if samples is None else samples.farthest
+        if not self.is_examined or self.examinations == MOST_EXAMINATIONS or samples is None or run is None:
             return False
-        run, samples = compared
         size = longest_piece(run, self.motion.end - self.start) * FINER_PIECES**self.examinations
         self.examinations += 1
         apart = np.array([differences_in_pieces(compared, size) for compared in (run, *further)]).max(axis=0)
@@ -460,7 +459,7 @@ class Runs:
         last: bool = False,
     ) -> GlobalError:
         """Return the estimate of the error of a run by others; the last runs are compared with all of them."""
-        compared = _Samples(trajectory, self.start, self.interface)
+        self.compared = compared = _Samples(trajectory, self.start, self.interface)
         safety = SAFETY if len(others) == 1 else SAFETIES_OF_ROUNDING[-1]
         floor = max(smallest_estimate(self.words), 0.0 if tolerance is None else tolerance)
         for number, other in enumerate(others if compared.end != self.start else ()):
@@ -535,6 +534,7 @@ class _Samples:
             coordinates that constraints determine, where their positions differ by rounding.
         steps_of_run: (n,) initial time, and times of all saved states.
         end: last time.
+        farthest: run with the largest difference.
     """
 
     def __init__(self, trajectory: Any, start: float, interface: Interface) -> None:
@@ -569,6 +569,7 @@ class _Samples:
             row[determined_coordinates(trajectory.stepper, np.asarray(q), float(t_row), trajectory.parameters)] = False
         self.errors = self.epsilon * self.independent * np.abs(np.array([np.asarray(x) for x in self.states]))
         self.motion: Motion | None = None
+        self.farthest: Any = None
         q, p = self.states
         self.kinetic = momenta_of_velocities(trajectory.stepper, self.t, q, p, trajectory.parameters)
         plan = trajectory.plan
@@ -586,8 +587,11 @@ class _Samples:
                 states = other._states_at(self.t[some])
                 differences[:, some] = [abs(x - y[some]) for x, y in zip(states, self.states, strict=True)]
         differences[:, ~self.independent & self.is_rounding(differences[0])] = 0.0
+        before = self.largest()
         np.maximum(self.errors, differences, out=self.errors)
         self.motion = Motion(np.asarray(other.t), other.q, other.p, self.firsts, self.epsilon, self.absolute)
+        if self.farthest is None or self.largest() > before:
+            self.farthest = other
         return bool(np.isfinite(differences).all())
 
     def is_rounding(self, apart: Array) -> NDArray[np.bool_]:
