@@ -48,11 +48,13 @@ def test_the_only_array_needs_no_name():
         ),
         ({"constraints": ["q_dot[i] = q[i]*q_dot[i+1] for i in 0..0"]}, sc.SVI(1, "gauss-lobatto:2"), "holonomic"),
         ({}, "scvi:2", "not supported for array systems"),
+        ({"hamiltonian": "sum(i in N, p_q[i]**4/4 + p_q[i]**2/2 + q[i]**2/2)"}, "composition:8", "not supported"),
     ],
 )
 def test_steps_that_require_known_sizes_are_compiled_with_those_of_the_call(extra, method, message):
-    given = {"lagrangian": "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)", **extra}
-    system = sc.LagrangianSystem.from_text(name="chain", coordinates=["q[N]"], **given)
+    kind = sc.HamiltonianSystem if "hamiltonian" in extra else sc.LagrangianSystem
+    given = {} if "hamiltonian" in extra else {"lagrangian": "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)"}
+    system = kind.from_text(name="chain", coordinates=["q[N]"], **{**given, **extra})
     run_time_sizes, start = sc.compile_stepper(system, method, flags=QUICK_FLAGS), {"q": np.array([0.1, 0.2])}
     run = run_time_sizes.integrate(start, velocity={"q": [0.02, 0.2]}, h=0.1, steps=3)
     known = sc.compile_stepper(system, method, sizes={"N": 2}, flags=QUICK_FLAGS)

@@ -62,8 +62,13 @@ def check_solver_of_arrays(
         )
     is_available = is_iterated or isinstance(resolved, Splitting | ConstrainedSteps)
     if not is_available:
-        explicit = "" if system.momenta else ", Stoermer-Verlet or a composition"
-        raise SizesRequiredError(
-            f"{method.name} is not supported for array systems: use an SVI, a Runge-Kutta method of at "
-            f"most 32 points{explicit}"
-        )
+        raise unsupported(system, method)
+
+
+def unsupported(system: ArraySystem, method: Method) -> SizesRequiredError:
+    """Return the error of a method without steps for run-time sizes."""
+    explicit = "" if system.momenta else ", Stoermer-Verlet or a composition"
+    return SizesRequiredError(
+        f"{method.name} is not supported for array systems: use an SVI, a Runge-Kutta method of at "
+        f"most 32 points{explicit}"
+    )

@@ -25,7 +25,7 @@ from scvi_codegen.codegen.ir.program import (
     StageCurve,
     StageEquations,
 )
-from scvi_codegen.codegen.lowering.arrays import check_solver_of_arrays, one_coordinate
+from scvi_codegen.codegen.lowering.arrays import check_solver_of_arrays, one_coordinate, unsupported
 from scvi_codegen.codegen.lowering.constraints import constrained_steps, lowered_constraints, rattle_of
 from scvi_codegen.codegen.lowering.loops import rolled_terms
 from scvi_codegen.codegen.lowering.solvers.curves import curve_iteration
@@ -225,6 +225,8 @@ def lower_arrays(
     Their masses are constant, so that the tables of a method are the same for every coordinate: those of a system of
     one coordinate serve all. Arguments and errors are those of :func:`lower`.
     """
+    if system.momenta and (method.drifts_first or not method.implicit):  # H = T(p) + V(q, t) is split for known sizes
+        raise unsupported(system, method)
     of_tables = one_coordinate(system)
     stages, velocities = discretise(of_tables, method), bool(system.velocities)
     constrained = constrained_steps(system, stages, method)
