@@ -17,6 +17,7 @@ from typing import cast
 
 import numpy as np
 
+from scvi_codegen.codegen.rendering.text import OF_SMALL_STEPS
 from scvi_codegen.common.errors import AccuracyWarning, StateError, StepFailedError, warn
 from scvi_codegen.common.representation import counted
 from scvi_codegen.runs.accuracy.size import (
@@ -70,8 +71,8 @@ Bodies that are ejected move regularly from then on, which brings the mean close
 RIGHT, LOOSER, MOST_REPEATED, PARTS, DIGITS = 1e-10, 1e4, 2**16, 16, 15
 """Difference that leaves ten digits, and its ratio to the tolerance if that is larger; most steps of a repetition that
 confirms a growth, and number of its comparisons; digits of a double."""
-SECOND, EIGHTH, LOOSE_TOLERANCE = 2, 8, 1e-5
-"""Every second step measures the growth above this tolerance, where an orbit has few steps; every eighth below."""
+SECOND, LOOSE_TOLERANCE = 2, 1e-5
+"""Every second step measures the growth above this tolerance, where an orbit has few steps; below fewer do."""
 
 
 def warn_of_error_growth(
@@ -127,7 +128,7 @@ def measured_growth(stepper: Integrator, plan: StepPlan, requested: bool | None)
         or not warnings_wanted()
     ):
         return 0
-    return EIGHTH if plan.tolerance is None or plan.tolerance <= LOOSE_TOLERANCE else SECOND
+    return OF_SMALL_STEPS if plan.tolerance is None or plan.tolerance <= LOOSE_TOLERANCE else SECOND
 
 
 def _by_factor(growth: float) -> str:

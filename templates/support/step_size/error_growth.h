@@ -11,13 +11,13 @@
  * end of the step before; with four knots in two halves of a large step. In one of `measures_growth`
  * steps the vector is projected on the energy surface (in the metric of the sizes of the motion): its part along the
  * gradient of the energy, which is conserved, grows by the error of the iterations only. Requires: the iteration, the
- * tables, the kernels point_derivatives and derivative_product; with VARIABLE_ACCELERATIONS energy_gradient. */
+ * tables, OF_SMALL_STEPS, the kernels point_derivatives and derivative_product; with VARIABLE_ACCELERATIONS
+ * energy_gradient. */
 
 #define LEAST_GROWTH 9.9 /* logarithm: of less, the difference to the mean is not measured */
 #define LARGEST_GROWTH 100.0 /* logarithm: beyond it the growth is known; below the reciprocal numbers underflow */
 #define LARGEST_SQUARE 1e140 /* of sizes: the products of two are numbers */
 #define MOST_ITERATIONS 30
-#define OF_SMALL_STEPS 8 /* one in so many is measured (growth.py), more of large ones */
 #define LOG_2 0.6931471805599453
 
 #ifdef ENERGY_CONSERVED
