@@ -48,6 +48,7 @@ from scvi_codegen.runs.states.words import TwoWords, Words, check_keeps_words, l
 from scvi_codegen.runs.stepping.features import refusal, require
 from scvi_codegen.runs.stepping.noise import NO_BATH, BathReport
 from scvi_codegen.runs.stepping.projection import constraint_values, multipliers
+from scvi_codegen.runs.stepping.state_functions import undefined_energy
 from scvi_codegen.runs.stepping.step_plan import FixedSteps
 from scvi_codegen.systems.event import Crossings, Event, EventLike, Kink, Switches, as_events
 
@@ -231,6 +232,8 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
                 "unknown, so that the change is no error: use energy(). Work requires a method with a curve, L or H "
                 "without time, and at impacts all states (save_every=1)"
             )
+        if not np.isfinite(account.change).all():  # of arrays of run-time sizes
+            raise undefined_energy(self.q, self.p)
         parts, energies = self.energies[:, :2], self.energies[:, 2:]
         if not np.isfinite(parts[0, 0]):
             kinetic = 0.5 * np.sum(self.p * self.velocity, axis=-1)

@@ -20,6 +20,16 @@ PROBES = 8
 """Number of random momenta that estimate the size of the direction of a symmetry."""
 REPORTED = 1e-3
 """Largest relative difference between a velocity and the velocity recomputed from its momentum."""
+OVERFLOWS = 1e100
+"""Numbers whose third powers exceed the range of binary64."""
+
+
+def undefined_energy(q: Array, p: Array) -> StateError:
+    """Return the error of states whose energy is no number."""
+    reason, largest = "a value is infinite or NaN", max(float(abs(np.asarray(x)).max(initial=0.0)) for x in (q, p))
+    if OVERFLOWS < largest < np.inf:
+        reason = f"it overflows at coordinates or momenta of {largest:.0e}: choose larger units"
+    return StateError(f"the energy of a state cannot be computed: {reason}")
 
 
 def neither_or_both(p: States | None) -> StateError:
@@ -126,7 +136,7 @@ class StateFunctions(CompiledMethod):
         values, workspace = binding.pointer(states.block(parameters)), binding.workspace()
         status = binding.function("energies")(len(t), at, positions, momenta, values, energies, workspace)
         if status:
-            raise StateError(f"the energy of a state cannot be computed: {REASONS[status]}")
+            raise undefined_energy(q, p)
         result = states.times(result)
         if self.in_tau:
             energy = parameters[self.interface.energy_index]
