@@ -4,7 +4,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 import scvi_codegen as sc
 from scvi_codegen.runs.ensembles.result import EnsembleRuns
@@ -12,6 +11,8 @@ from scvi_codegen.runs.ensembles.result import EnsembleRuns
 
 def autoregressive(factor: float, shape: tuple[int, ...], seed: int) -> np.ndarray:
     """Return stationary x_n = a x_(n-1) + sqrt(1 - a^2) xi: variance 1, tau = (1 + a) / (2 (1 - a)) steps."""
+    from scipy.signal import lfilter  # a second of import
+
     noise = np.random.default_rng(seed).normal(size=shape)
     noise[1:] *= np.sqrt(1 - factor**2)
     return lfilter([1.0], [1.0, -factor], noise, axis=0)

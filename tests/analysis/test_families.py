@@ -46,7 +46,7 @@ def test_equilibria_have_the_frequencies_of_the_linear_motion(moon, pendulum):
     assert slow.frequencies == pytest.approx([1e-9], rel=1e-12)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_periods_of_a_pendulum_are_elliptic_integrals(pendulum):
     family = sc.family(
         pendulum, sc.equilibrium(pendulum, [0.0]), amplitude=0.01, step=0.3, error=1e-11, until="energy > 0.9"
@@ -102,7 +102,7 @@ def test_isola_is_followed_once():
     assert 0.9 < abs(angles[-1] - angles[0]) / (2 * np.pi) < 1.05
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_units_of_a_parameter_without_effect_on_the_orbit():
     """A stiffness k across the plane, from 0, in units of 1 and 1e10, and one that changes nothing."""
     system = sc.LagrangianSystem.from_text(

@@ -51,7 +51,7 @@ def recorded(seed=None):
     return values if seed is None else values + NOISE * np.random.default_rng(seed).normal(size=values.shape)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_noise_free_data_give_the_true_values():
     found = sc.fit(oscillator(), TIMES, recorded()[0], unknown=SOME, **GUESS)
     assert found.names == (*SOME, "x", "p_x")

@@ -133,7 +133,7 @@ def test_pendulum_period_is_the_elliptic_integral():
     assert over.period == pytest.approx(2 * 2 / 2.5 * ellipk((2 / 2.5) ** 2), rel=1e-11)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_adaptive_steps_reach_the_bound(galaxy, restricted):
     """Periods by K(k), a published halo orbit, and an orbit of Henon-Heiles by equal steps."""
     pendulum = sc.compile_stepper(sc.problem("planar-pendulum").system, sc.SVI(8))

@@ -63,7 +63,7 @@ def test_detected_reversors_and_rotations(pendulum):
         assert closing(turn, 2 * np.pi) < 1e-9
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_exchange_of_bodies_as_reversor():
     """The figure eight of three bodies, from the collinear state: Chenciner & Montgomery (2000)."""
     names = [f"{axis}{k}" for k in (1, 2, 3) for axis in "xy"]

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 from programs import needs
-from scipy import stats
 
 SUPPORT = Path(__file__).parents[2] / "templates/support/run"
 CALLS = """
@@ -90,6 +89,8 @@ def test_bits_depend_on_step_trajectory_and_index_alone(functions):
 
 def test_moments_and_distribution(functions):
     """Means of powers within 4 standard errors of 0, 1, 0, 3; Kolmogorov; no correlation of neighbours."""
+    from scipy import stats  # a second of import
+
     z = drawn(functions, 0, 50, 0, 100, 0, 8)
     for power, mean, variance in ((1, 0, 1), (2, 1, 2), (3, 0, 15), (4, 3, 96)):
         assert abs(np.mean(z**power) - mean) < 4 * np.sqrt(variance / z.size)

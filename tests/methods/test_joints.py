@@ -57,7 +57,7 @@ def test_a_point_slides_on_its_line():
     assert_allclose(run.q[:, 2:], line + 0.5 * np.column_stack([np.sin(f), -np.cos(f)]), rtol=0, atol=1e-8)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_welded_bodies_tumble_as_one():
     run = ran(JOINTS.welded_plates())
     (x1, y1, a1, x2, y2, a2), t = run.q.T, run.t

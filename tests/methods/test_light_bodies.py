@@ -53,7 +53,7 @@ def test_the_default_solver_has_the_digits_of_newtons_method(pendulum, angle, m)
         assert run.steps <= 1.1 * other.steps + 2
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_rods_in_line_throw_a_light_body():
     """A double pendulum in x, y: constraints of light bodies round by more than their own lengths."""
     text = "(m*(x_dot**2 + y_dot**2) + X_dot**2 + Y_dot**2)/2 - 9.81*(m*y + Y)"

@@ -144,7 +144,7 @@ def test_the_theta_method_is_a_stable_from_one_half_on(theta: Fraction) -> None:
     assert tableau_of(((theta,),), (1,)).is_a_stable == (theta >= HALF)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @settings(max_examples=60, deadline=None)
 @example(roots=[(-2, 2), (-1, 1), (2, 2)], sign=1)  # quotients with rounding where a coefficient is 0
 @given(

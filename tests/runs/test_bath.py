@@ -293,7 +293,7 @@ def test_noise_is_a_continuous_function_of_the_state(arguments):
         assert 0 < np.abs(first.p - second.p).max() < 1e-7
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_steps_to_spurious_roots_are_repeated_in_halves():
     """Energies in thermal bounds where single steps jump, with and without friction."""
     pendulum = compiled(

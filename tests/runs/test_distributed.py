@@ -61,7 +61,7 @@ class TestCluster:
             with pytest.raises(sc.StateError):
                 integrate_ensemble(kepler, q, p, **({"h": 0.1, "steps": 1} | faults))  # type: ignore[arg-type]
 
-    @pytest.mark.second
+    @pytest.mark.rotated
     def test_failures_of_trajectories_are_returned(self, distributed: Any, cluster: Any, kepler: sc.Stepper):
         q, p = states()
         mu = np.where(np.arange(COUNT) == 5, 1e9, 1.0)  # the sixth falls into the centre

@@ -86,7 +86,7 @@ def test_few_roots_of_polynomials_of_degree_eight_are_missed(polynomials):
     assert found > 0.98 * 500 * 8
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @settings(max_examples=200, deadline=None)
 @given(st.floats(0.15, 0.85), st.integers(1, 7), st.sampled_from([1.0, -1.0]))
 def test_pairs_of_close_roots_are_found(polynomials, middle, exponent, sign):

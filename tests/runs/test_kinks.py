@@ -134,7 +134,7 @@ def test_derivatives_across_kinks_are_those_of_the_motion(family):
         assert np.abs(change * step - (after - before) / 2).max() < 1e-11 * max(1.0, case.growth) * case.ranges.max()
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_functions_of_nested_kinks_follow_their_sides():
     """Outer functions are smooth in a step only with the sides of the inner ones."""
     nested = sc.compile_stepper(lagrange("nested", "x", "x_dot**2/2 - abs(max(x, -x/3) - 1)"), "svi:4")
@@ -192,7 +192,7 @@ def test_members_of_ensembles_have_dense_output_across_kinks():
     assert member.at(times)[1] == pytest.approx(stepper.integrate([1.0], [0.0], **settings).at(times)[1], abs=1e-12)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_sliding_is_an_error_that_names_it():
     """By points that are not those of constraints, and where the force is not along the slip."""
     rough = lagrange("rough", "x", "x_dot**2/2 - x**2/2", forces={"x": "-0.15*sign(x_dot)"})
@@ -266,7 +266,7 @@ def test_adaptive_steps_keep_the_tolerance_at_powers_that_are_not_whole(method, 
     assert abs(start.q[-1, 0] - 0.25) < bound
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_a_ball_that_returns_to_a_kink_in_its_first_step_does_not_rest_there():
     """It falls with x'' = -3/2 from x = 0, v to -v at t = 4v/3, and then moves by x'' = 1/2 - x."""
     ball = lagrange("ball", "x", "x_dot**2/2 - abs(x) - x/2 - x**2*unit_step(-x)/2")

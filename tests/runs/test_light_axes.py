@@ -48,7 +48,7 @@ def motion(of, moments, **more):
     return of.integrate({"R": np.eye(3)}, velocity={"omega": OMEGA}, parameters=parameters, t_end=T_END, **more)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize(
     ("method", "axis"),
     [

@@ -32,7 +32,7 @@ POINT = ["0.2", "-0.1", "0.5"]
 IN_SPACE = ["sin(t)", "c*x_dot", "-y"]
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_force_in_space_acts_on_position_and_attitude():
     force = {"body": "R", "origin": ["x", "y", "z"], "point": POINT, "force": IN_SPACE}
     turned = [f"unrotate_{k}(R, {', '.join(IN_SPACE)})" for k in (1, 2, 3)]

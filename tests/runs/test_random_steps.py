@@ -143,7 +143,7 @@ def test_spurious_solution_is_rejected_or_its_error_reported(name, flags):
         assert error < 1e-2 or any(issubclass(each.category, sc.AccuracyWarning) for each in heard)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_run_with_controller_starts_with_a_correct_step():
     """With a tolerance of 1e-2, the error estimate of a step of many periods is too small."""
     stepper = sc.compile_stepper(sc.problem("planar-pendulum").system, "scvi:3")

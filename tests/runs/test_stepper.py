@@ -218,7 +218,7 @@ def test_the_discrete_lagrangian_of_an_explicit_step_is_the_trapezoidal_sum(syst
     assert "newton_solver" not in stepper.source.code
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_methods_without_a_discrete_lagrangian_are_reported(compiled):
     for method in (sc.SpectralCollocation(2), sc.RadauIIA(2), sc.ExplicitEuler(), sc.SCVI(3, variational=False)):
         stepper = compiled("kepler", method)

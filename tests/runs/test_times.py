@@ -26,7 +26,7 @@ def in_last_places(time: float, t: float, h: float, n: int) -> float:
     return float(abs(Fraction(time) - (Fraction(t) + n * Fraction(h))) / Fraction(math.ulp(time)))
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_time_is_the_rounded_sum_after_a_million_steps(free):
     run = free.start([0.0], [0.0], h=0.1, t=0.7)
     run.advance(1_000_000)

@@ -415,7 +415,7 @@ def test_slip_in_space_begins_without_a_jump_of_friction(steps: dict[str, float]
     assert np.abs(run.q[:, 2]).max() < 1e-14
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_a_slow_slip_in_space_brakes_to_its_stop() -> None:
     """Friction that nearly balances a turning force: w = r/3 sin(3 t) along it, within w' m/F, which ends at pi/3."""
     force = "(1000 + cos(3*t))"

@@ -47,7 +47,7 @@ def test_zeros_and_unknown_symbols_are_omitted() -> None:
     assert gradient(Y, [X, Y]) == {1: 1}
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_long_lattice_is_fast_and_sparse() -> None:
     q = [Symbol(f"q{index}", real=True) for index in range(257)]
     energy = sympy.Add(*((b - a) ** 2 / 2 + (b - a) ** 4 / 4 for a, b in pairwise(q)))

@@ -238,7 +238,7 @@ def parallelograms(count):
     return f'<body name="base"><freejoint/>{body["base"]}{bodies}</body>', loops, f'<robot name="r">{links}</robot>'
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize(("count", "solver"), [(3, "newton"), pytest.param(9, "auto", marks=pytest.mark.rotated)])
 def test_many_loops_on_a_free_base_move_as_the_tree_of_their_cranks(count, solver, tmp_path):
     bodies, loops, robot = parallelograms(count)

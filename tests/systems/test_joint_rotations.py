@@ -77,7 +77,7 @@ def test_a_spherical_joint_moves_as_in_angles():
     np.testing.assert_allclose(run.q[-1, 0], end[3], rtol=0, atol=1e-10)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_reading_does_not_change_the_system():
     model, _, ball = arm_on_a_ball_joint()
     before = ball.child.masscenter.vel(model.frame), ball.child.frame.dcm(model.frame), model.q, model.kdes

@@ -337,7 +337,7 @@ def swing(bend: float, **run: Any) -> tuple[Any, float]:
     return done, min(eval(height, q).min() for height in heights)
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.filterwarnings("ignore:a transition has several motions")
 @pytest.mark.parametrize("h", [0.005, 0.0025, 0.001])
 def test_bent_legs_with_friction_swing_on_their_feet(h: float) -> None:
@@ -351,7 +351,7 @@ def test_bent_legs_with_friction_swing_on_their_feet(h: float) -> None:
     assert (t, modes) == (pytest.approx(true, abs=1e-6), others)
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.filterwarnings("ignore:a transition has several motions")
 @pytest.mark.parametrize("h", [0.005, 0.001])
 def test_nearly_straight_legs_pass_through_straight(h: float) -> None:

@@ -119,7 +119,7 @@ def pair(power: int) -> sc.LagrangianSystem:
     )
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_order_is_preserved_up_to_the_smoothness_at_the_cut_off() -> None:
     """positive_part()**k has k - 1 continuous derivatives: order 4 with k = 6, by formulas at most 2 with k = 1."""
 

@@ -77,6 +77,7 @@ BALL = '<body name="b"><freejoint/><geom name="ball" size=".1" {}/></body>'
 PAIR = '<contact><pair geom1="ball" geom2="floor" {}/></contact>'
 
 
+@pytest.mark.rotated
 def test_transitions_behind_many_hinges_have_intermediate_quantities(tmp_path):
     """Their formulas in joint coordinates would be too long to write."""
     arm = '<geom name="hand" size=".1" pos="0 0 -.3"/>'
@@ -347,7 +348,7 @@ LEGGED = """<mujoco><compiler angle="degree"/>
 </worldbody></mujoco>"""
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_a_body_on_a_leg_passes_painleves_paradox_bounces_and_rests(tmp_path):
     leg = read(tmp_path, LEGGED, **ALL, restitution=0.3)
     stepper, jump = sc.compile_stepper(leg, "svi:2"), "impact without collision .*geom 'toe'"

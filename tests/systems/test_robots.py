@@ -359,7 +359,7 @@ armature="0" damping="0"/><joint name="z" type="slide" axis="0 0 1" armature="0"
 </worldbody></mujoco>"""
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_joints_of_a_robot_that_is_dropped_stay_at_rest(tmp_path):
     (tmp_path / "robot.xml").write_text(DROPPED)
     robot = sc.LagrangianSystem.from_mjcf(tmp_path / "robot.xml")

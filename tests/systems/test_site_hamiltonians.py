@@ -42,7 +42,7 @@ def test_masses_that_depend_on_position_against_scipy():
     assert len(crossed.t) == (np.diff(np.sign(run.velocity[:, 0])) != 0).sum()
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_charges_in_a_magnetic_field_keep_their_angular_momentum():
     system = sc.LagrangianSystem.from_text("charges", ["r[N, 2]"], CHARGES, parameters={"B": 0.5})
     stepper = sc.compile_stepper(system, "svi:2", flags=QUICK_FLAGS)

@@ -82,7 +82,7 @@ function = "F(x) - 0.3"
 """
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_model_files():
     model = parse_model(TABLED.replace("[[0, 1, 0], [1, 1, 1]]", "[[0, 1, 0], [1, 1, 1], [2, 0, 2]]"))
     assert parse_model(dump_model(model)) == model

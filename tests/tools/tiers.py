@@ -31,7 +31,7 @@ QUICK, SECOND = "not full and (quick or not second)", "second and not quick and 
 """Expressions of the quick tier, as in pyproject.toml, and of the second, for which ``-m second`` stands."""
 UNOPTIMISED_TIERS = (QUICK, SECOND, "not full")
 TIERS = ("quick", "second", "full", "rotated", "tiers")
-PARTS = 48
+PARTS = 64
 """Number of parts of the rotated cases, of which a run with SCVI_CODEGEN_TESTS_PART takes one."""
 
 Combination = tuple[tuple[str, int], ...]
@@ -81,9 +81,8 @@ def mark_later_tiers(items: Iterable[pytest.Item]) -> None:
     """Mark the cases of tests marked ``tiers`` or ``rotated`` as quick, of the second tier, or full."""
     part, seen = os.environ.get("SCVI_CODEGEN_TESTS_PART", ""), Counter[str]()
     for item in items:
-        if len([marker for marker in item.own_markers if marker.name in TIERS]) > 1:
-            continue  # a case with a tier of its own
-        marker = next((marker for marker in item.iter_markers() if marker.name in TIERS), None)
+        own = [marker for marker in item.own_markers if marker.name in TIERS]  # that of a case is the last
+        marker = own[-1] if own else next((marker for marker in item.iter_markers() if marker.name in TIERS), None)
         if marker is None or marker.name not in ("rotated", "tiers"):
             continue
         quick, both = (*marker.args, math.inf)[:2] if marker.name == "tiers" else (0, 0)
