@@ -188,7 +188,7 @@ class TestHonesty:
         advice = advise(chosen.system, SVI(8), chosen.q, p, 200.0, 1e-6)
         iterated.integrate(chosen.q, p, h=advice.h, steps=advice.steps, save_every=advice.steps)
 
-    @pytest.mark.tiers(0, 1)
+    @pytest.mark.rotated
     @pytest.mark.parametrize("span", [100.0, 2000.0, 50_000.0])
     def test_tolerance_below_rounding_is_reported(self, span: float):
         system, (q, p) = problem("kepler").system, kepler_start(0.2)

@@ -30,7 +30,7 @@ def exact(t, q, p):
     return forced * np.cos(t) + b * np.cos(w * (t - T)) + c * np.sin(w * (t - T))
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize("turns", [0, 1])
 def test_motion_at_rest_has_no_advice(turns):
     """Neither at the origin nor elsewhere; an ensemble has advice if a trajectory moves."""

@@ -54,7 +54,7 @@ def test_runs_with_transitions_are_certified(name: str) -> None:
     assert ALWAYS | SYSTEMS[name][-1] <= satisfied
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize(
     ("name", "before", "q", "p", "violated"),
     [

@@ -39,7 +39,7 @@ def printed(model, *words):
     return output_of("run", "model.toml", *words)
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "changed",

@@ -86,10 +86,7 @@ WITHOUT_NEWTON = {
     "driven": (4, {"kinetic": BARS, "terms": " + c*cos(3*t)*x1_dot + sin(t)*y2_dot", "c": 1.5}),
 }
 """Degree and system: constant masses, forces of velocities, uniform bars by their ends, terms linear in velocities."""
-TIERS = {
-    **dict.fromkeys(("moving 1", "constant masses 3", "moving 4"), pytest.mark.full),
-    **dict.fromkeys(("gyroscopic force", "drag", "bars", "driven"), pytest.mark.second),
-}
+TIERS = {**dict.fromkeys(("moving 1", "constant masses 3", "moving 4"), pytest.mark.full), "driven": pytest.mark.second}
 
 
 @pytest.mark.rotated
@@ -140,7 +137,7 @@ VARYING = {
 }
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize(("kind", "s"), [("angles", 4), ("damped", 8), ("all", 2), ("all", 1)])
 def test_masses_of_positions_and_damping_need_no_newton_iteration(kind, s):
     """Compare with the states of Newton's iteration, for weak and for strong damping, also with adaptive steps."""

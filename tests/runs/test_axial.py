@@ -91,7 +91,7 @@ def test_a_top_at_rest_begins_to_fall(top):
     np.testing.assert_allclose(runs[0].rotation(), runs[1].rotation(), rtol=0, atol=1e-11)
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize("method", ["svi:3", "svi:1", "gauss:2"])
 def test_steps_in_the_moving_frame_are_symplectic_and_those_of_newtons_method(method):
     ours, newton = (sc.compile_stepper(body(f"{KINETIC} - w*R_33"), method, solver=s) for s in ("auto", "newton"))

@@ -37,7 +37,7 @@ def by_parameter(run: Any, name: str) -> NDArray[Any]:
     return np.asarray(run.sensitivity().parameters[-1, :, run.stepper.parameters.index(name)])
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize("gap", [False, True])
 def test_an_oscillator_stops_at_x0_less_8_d(gap: bool) -> None:
     dry: Any = sc.contact("y", slip="x_dot", friction="d") if gap else sc.friction("x_dot", limit="d")

@@ -291,7 +291,7 @@ def test_the_last_output_time_may_be_that_of_a_crossing():
         assert stepper.integrate([1.0], [0.1], t_end=end, t_eval=[1.0, end]).t.tolist() == [1.0, end]
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize("constraint", ["y = x**2/4", "y = positive_part(x)**2 + x**2/4"])
 def test_derivatives_of_rest_on_a_constraint(constraint):
     """At rest momenta are rounding of constraint forces; at a kink the derivatives are undefined, by name."""

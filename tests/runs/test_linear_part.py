@@ -47,7 +47,7 @@ def exact_step(system: sc.LagrangianSystem, stepper: sc.Stepper, h: float, stage
     return np.array((mp.inverse(down) * up).tolist(), dtype=float)
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize(("degree", "h"), [(8, 9.0), (3, 4.0)])
 def test_linear_chain(degree, h):
     system = ring()

@@ -25,7 +25,7 @@ def thermal_state(rng):
     return q, factor @ rng.normal(size=2) * np.sqrt(rng.uniform(0.5, 4.0))
 
 
-@pytest.mark.tiers(0, 1)
+@pytest.mark.rotated
 @pytest.mark.parametrize("count", [400, pytest.param(20_000, marks=pytest.mark.full)])
 @pytest.mark.parametrize("solver", ["auto", "newton"])
 @pytest.mark.parametrize("method", ["svi:1", "gauss:1", "svi:2", "radau-iia:2"])
