@@ -420,13 +420,8 @@ def _breaks(axis: str, start: float, end: float, elements: Any, places: Sequence
         parts = [np.linspace(a, b, n + 1) for a, b, n in zip(ends[:-1], ends[1:], numbers, strict=True)]
         return np.unique(np.concatenate(parts))
     breaks = np.asarray(elements, float)
-    if (
-        breaks.ndim != 1
-        or len(breaks) < 2
-        or not (np.diff(breaks) > 0).all()
-        or breaks[0] != start
-        or breaks[-1] != end
-    ):
+    ascend = breaks.ndim == 1 and len(breaks) > 1 and (np.diff(breaks) > 0).all()
+    if not ascend or (breaks[0], breaks[-1]) != (start, end):
         raise SystemDefinitionError(f"the ends of the elements of '{axis}' must ascend from {start:g} to {end:g}")
     return np.union1d(breaks, places)
 

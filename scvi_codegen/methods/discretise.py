@@ -50,10 +50,8 @@ def discretised_form(system: MechanicalSystem, method: Method) -> MechanicalSyst
     """
     if not isinstance(system, LagrangianSystem) or not system.rotations or not method.symplectic:
         return system
-    if (
-        method.needs_regular
-        or (form := hamiltonian_of_rotations(system.clock.plain if system.clock else system)) is None
-    ):
+    plain = system.clock.plain if system.clock else system
+    if method.needs_regular or (form := hamiltonian_of_rotations(plain)) is None:
         return system
     form = replace(form, arrays=system.arrays) if system.arrays else form
     return reparametrise(form, system.clock.rate) if system.clock else form

@@ -11,6 +11,10 @@ from scvi_codegen.systems.system import MechanicalSystem
 
 SOLVERS = ("fixed-point", "newton")
 """Solvers of the equations of a step of an array system."""
+UNSUPPORTED = (
+    " is not supported for array systems: use an SVI, a Runge-Kutta method of at most 32 points, or with a Lagrangian "
+    "Stoermer-Verlet or a composition"
+)
 
 
 def check_solver(solver: object, error: type[ScviCodegenError] = MethodError) -> None:
@@ -62,13 +66,4 @@ def check_solver_of_arrays(
         )
     is_available = is_iterated or isinstance(resolved, Splitting | ConstrainedSteps)
     if not is_available:
-        raise unsupported(system, method)
-
-
-def unsupported(system: ArraySystem, method: Method) -> SizesRequiredError:
-    """Return the error of a method without steps for run-time sizes."""
-    explicit = "" if system.momenta else ", Stoermer-Verlet or a composition"
-    return SizesRequiredError(
-        f"{method.name} is not supported for array systems: use an SVI, a Runge-Kutta method of at "
-        f"most 32 points{explicit}"
-    )
+        raise SizesRequiredError(method.name + UNSUPPORTED)

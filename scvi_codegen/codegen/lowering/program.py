@@ -25,7 +25,7 @@ from scvi_codegen.codegen.ir.program import (
     StageCurve,
     StageEquations,
 )
-from scvi_codegen.codegen.lowering.arrays import check_solver_of_arrays, one_coordinate, unsupported
+from scvi_codegen.codegen.lowering.arrays import UNSUPPORTED, check_solver_of_arrays, one_coordinate
 from scvi_codegen.codegen.lowering.constraints import constrained_steps, lowered_constraints, rattle_of
 from scvi_codegen.codegen.lowering.loops import rolled_terms
 from scvi_codegen.codegen.lowering.solvers.curves import curve_iteration
@@ -50,7 +50,7 @@ from scvi_codegen.codegen.lowering.stage_groups import (
 )
 from scvi_codegen.codegen.statements.steps import bath_texts, rattle_texts, splitting_texts
 from scvi_codegen.codegen.variants import Sums
-from scvi_codegen.common.errors import MethodError
+from scvi_codegen.common.errors import MethodError, SizesRequiredError
 from scvi_codegen.common.precision import Matrix, Vector, mp
 from scvi_codegen.methods.constraints import END_VELOCITY
 from scvi_codegen.methods.discretise import discretise, is_conformally_symplectic, is_symplectic
@@ -226,7 +226,7 @@ def lower_arrays(
     one coordinate serve all. Arguments and errors are those of :func:`lower`.
     """
     if system.momenta and (method.drifts_first or not method.implicit):  # H = T(p) + V(q, t) is split for known sizes
-        raise unsupported(system, method)
+        raise SizesRequiredError(method.name + UNSUPPORTED)
     of_tables = one_coordinate(system)
     stages, velocities = discretise(of_tables, method), bool(system.velocities)
     constrained = constrained_steps(system, stages, method)

@@ -42,7 +42,6 @@ from scvi_codegen.codegen.rendering.text import (
     INPUT_PRECISION,
     LARGEST_VIOLATION,
     MAX_ITERATIONS,
-    OF_SMALL_STEPS,
     ROUNDING_UNITS,
     HeaderRecord,
     wrapped_functions,
@@ -537,8 +536,7 @@ def _control_context(program: Program, control: Control | None) -> dict[str, obj
     if not (control and control.predictor and program.fixed_point):
         return {"control": control, "own_headers": {}}
     end = lane_table("AT_END", control.growth.end) if control.growth else ""
-    growth = {"growth_end": end, "of_small_steps": OF_SMALL_STEPS}
-    return {"control": control, "own_headers": {name: predictor_text(control.predictor)}, **growth}
+    return {"control": control, "own_headers": {name: predictor_text(control.predictor)}, "growth_end": end}
 
 
 def render_ensemble(

@@ -18,8 +18,6 @@ ROUNDING_UNITS, INPUT_PRECISION, LARGEST_VIOLATION = 64.0, 1e-6, 1e-2
 Rounding, in units of it; precision of typed numbers, corrected silently; largest violation that is accepted.
 """
 
-OF_SMALL_STEPS = 8
-"""One in so many small steps measures the growth of errors, a power of 2."""
 
 WIDTH = 120
 CONTINUATION = 4

@@ -152,15 +152,9 @@ def _geometry(model: Model, run: Run) -> str:
 def known_at_end(model: Model, outcome: RunOutcome) -> Known | None:
     """Return the digits of the final state that a second run confirms; ``None`` if the run is incomplete."""
     run, trajectory = outcome.run, outcome.trajectory
-    if (
-        model.array_system is not None
-        or model.in_double_double
-        or model.events
-        or not run.steps
-        or outcome.failure is not None
-        or outcome.interrupted
-        or trajectory.t[-1] != outcome.end[0]
-    ):
+    is_repeated = model.array_system is None and not (model.in_double_double or model.events)
+    is_complete = run.steps and outcome.failure is None and not outcome.interrupted
+    if not (is_repeated and is_complete and trajectory.t[-1] == outcome.end[0]):
         return None
     return known_digits(second_stepper(model.system), trajectory, most=SECOND_RUN + 4 * run.steps, inputs=model.inputs)
 

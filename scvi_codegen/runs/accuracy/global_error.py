@@ -300,7 +300,7 @@ class Runs:
         self.least, self.rounded = LEAST, ROUNDED
         self.last: tuple[float | None, ...] = LAST
         self.failure: StepFailedError | None = None
-        self.compared: _Samples | None = None
+        self.compared: Any = None
         if self.words > 1:
             self.least, self.rounded, self.last = LEAST_OF_TWO_WORDS, ROUNDED_OF_TWO_WORDS, LAST_OF_TWO_WORDS
         if not motion.smooth:  # errors are as random as those of rounding
@@ -366,7 +366,7 @@ class Runs:
         Args:
             passing: the run before that passes over forces; it is lost if none of smaller steps can be made.
         """
-        attempts: list[tuple[Attempt, _Samples | None]] = []
+        attempts: list[tuple[Attempt, _Samples]] = []
         for attempt in chain(self._limited() if self.parts else self._by_tolerance(), self._at_round_off()):
             if attempt[1].confirmed:
                 return self._judged(attempt) if self._passes_over_forces(self.compared) else attempt
@@ -379,10 +379,10 @@ class Runs:
         further = [best[0]] if len(best[0].t) == best[0].steps + 1 else []
         return self._judged(best) if self._passes_over_forces(compared, *further) else best
 
-    def _passes_over_forces(self, samples: "_Samples | None", *further: Any) -> bool:
+    def _passes_over_forces(self, samples: "_Samples", *further: Any) -> bool:
         """Return whether the farthest run, or a further one, passes over forces; runs have smaller steps then."""
-        run = None if samples is None else samples.farthest
-        if not self.is_examined or self.examinations == MOST_EXAMINATIONS or samples is None or run is None:
+        run = samples.farthest
+        if not self.is_examined or self.examinations == MOST_EXAMINATIONS or run is None:
             return False
         size = longest_piece(run, self.motion.end - self.start) * FINER_PIECES**self.examinations
         self.examinations += 1

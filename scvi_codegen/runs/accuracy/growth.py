@@ -17,9 +17,9 @@ from typing import cast
 
 import numpy as np
 
-from scvi_codegen.codegen.rendering.text import OF_SMALL_STEPS
 from scvi_codegen.common.errors import AccuracyWarning, StateError, StepFailedError, warn
 from scvi_codegen.common.representation import counted
+from scvi_codegen.methods.method import OF_SMALL_STEPS
 from scvi_codegen.runs.accuracy.size import (
     Motion,
     first_of_groups,
@@ -121,12 +121,8 @@ def measured_growth(stepper: Integrator, plan: StepPlan, requested: bool | None)
                 "check_growth=True requires adaptive steps, but the step size is fixed: give t_end without h, or omit "
                 "check_growth"
             )
-    if (
-        requested is not None
-        or not isinstance(plan, Adaptive)
-        or not _continuous_in_double(stepper)
-        or not warnings_wanted()
-    ):
+    is_measured = requested is None and _continuous_in_double(stepper) and warnings_wanted()
+    if not (is_measured and isinstance(plan, Adaptive)):
         return 0
     return OF_SMALL_STEPS if plan.tolerance is None or plan.tolerance <= LOOSE_TOLERANCE else SECOND
 

@@ -384,9 +384,7 @@ class Observation:
         self.arrived = True
         whole = int(np.count_nonzero((self.end - part.t) * self.run._step_size >= 0.0)) - 1
         part = record(self.run, whole)
-        while (
-            self.run.left_to(self.end) * self.run._step_size < 0.0
-        ):  # rounded times tie: the previous step is the last one
+        while self.run.left_to(self.end) * self.run._step_size < 0.0:  # rounded times tie: the step before is the last
             self.run.rollback(before)
             whole -= 1
             part = record(self.run, whole)

@@ -20,15 +20,13 @@ PROBES = 8
 """Number of random momenta that estimate the size of the direction of a symmetry."""
 REPORTED = 1e-3
 """Largest relative difference between a velocity and the velocity recomputed from its momentum."""
-OVERFLOWS = 1e100
-"""Numbers whose third powers exceed the range of binary64."""
 
 
 def undefined_energy(q: Array, p: Array) -> StateError:
     """Return the error of states whose energy is no number."""
-    reason, largest = "a value is infinite or NaN", max(float(abs(np.asarray(x)).max(initial=0.0)) for x in (q, p))
-    if OVERFLOWS < largest < np.inf:
-        reason = f"it overflows at coordinates or momenta of {largest:.0e}: choose larger units"
+    largest = max(float(abs(np.asarray(x)).max(initial=0.0)) for x in (q, p))
+    overflow = f"it overflows at coordinates or momenta of {largest:.0e}: choose larger units"
+    reason = overflow if 1e100 < largest < np.inf else "a value is infinite or NaN"
     return StateError(f"the energy of a state cannot be computed: {reason}")
 
 

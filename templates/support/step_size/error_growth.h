@@ -8,10 +8,11 @@
  * vectors of eight lanes, or half as many; derivatives there are evaluated in SIMD lanes. The collocation equations
  *   dq_n = dq + c_n h dv + h^2 sum_j P_nj dq''_j,      dv_n = dv + h sum_j Q_nj dq''_j
  * are solved by Picard iterations (Hairer, Norsett & Wanner, Solving ODEs I, sec. I.8) from Taylor's polynomial at the
- * end of the step before; with four knots in two halves of a large step. In one of `measures_growth`
- * steps the vector is projected on the energy surface (in the metric of the sizes of the motion): its part along the
- * gradient of the energy, which is conserved, grows by the error of the iterations only. Requires: the iteration, the
- * tables, OF_SMALL_STEPS, the kernels point_derivatives and derivative_product; with VARIABLE_ACCELERATIONS
+ * end of the step before; with four knots in two halves of a large step. In one of `measures_growth` steps, which
+ * are OF_SMALL_STEPS unless steps are large, the vector is projected on the energy surface (in the metric of the
+ * sizes of the motion): its part along the gradient of the energy, which is conserved, grows by the error of the
+ * iterations only. Requires: the iteration, tables, the number GROWTH_DERIVATIVES of distinct derivatives at a
+ * point, OF_SMALL_STEPS, the kernels point_derivatives and derivative_product; with VARIABLE_ACCELERATIONS
  * energy_gradient. */
 
 #define LEAST_GROWTH 9.9 /* logarithm: of less, the difference to the mean is not measured */
