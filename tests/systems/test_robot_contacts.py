@@ -134,8 +134,11 @@ def test_ends_and_corners_have_their_own_names(shape, parts, tmp_path):
 
 def test_what_is_not_read_of_geoms_is_named_in_one_warning(tmp_path):
     more = BALL.format('condim="6" adhesion="1"')
-    more += '<body pos="1 0 0"><freejoint/><geom type="cylinder" size=".1 .1"/></body>'
-    with pytest.warns(SystemDefinitionWarning, match="friction of geom 'ball' on geom 'floor'; contacts of 2 pairs"):
+    inertial = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/><geom type="sphere" mesh="m"/>'
+    more += (
+        f'<body pos="1 0 0"><freejoint/><geom type="cylinder" size=".1 .1"/></body><body><freejoint/>{inertial}</body>'
+    )
+    with pytest.warns(SystemDefinitionWarning, match="friction of geom 'ball' on geom 'floor'; contacts of 5 pairs"):
         assert len(robot(tmp_path, FLOOR + more).contacts) == 1
     with pytest.warns(SystemDefinitionWarning, match="without adhesion of geoms ball; contacts$"):
         robot(tmp_path, FLOOR + more, contacts="ignore")

@@ -77,7 +77,7 @@ class Geom(NamedTuple):
 
     def spheres(self) -> list[tuple[Vector, float]]:
         """Return the spheres, corners with radius 0, of which the geom is the convex hull; none of other shapes."""
-        if self.shape not in ("sphere", *PARTS):
+        if self.shape not in ("sphere", *PARTS) or self.element.has("mesh"):  # of a fitted size
             return []
         size = size_of(self.element, self.shape)
         if self.shape == "box":

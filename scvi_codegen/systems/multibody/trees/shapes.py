@@ -114,7 +114,7 @@ SHAPES: dict[str, tuple[int, Callable[[Vector], tuple[float, Vector]]]] = {
     "capsule": (2, _capsule),
 }
 """By shape: the number of its sizes, and a function of these that returns the volume and the three principal moments of
-inertia by mass, about the center and the axes x, y, z. Vector are the radius; half axes; half lengths; radius and half
+inertia by mass, about the center and the axes x, y, z. Sizes are the radius; half axes; half lengths; radius and half
 length along z, of a capsule without its caps."""
 WEIGHTLESS = ("plane", "hfield")
 
