@@ -39,7 +39,7 @@ ACTIVATED = """<actuator><intvelocity joint="x" kp="3" kv="2" actrange="-.1 .2" 
 LIMITED = """<actuator><damper joint="x" kv="2" ctrlrange="0 1" forcerange="-.1 .2" gear="2"/>
 <general joint="y" gaintype="affine" gainprm="1 2 3" forcerange="-.3 .3" gear="2"/></actuator>"""
 SEVERAL = """<actuator><motor joint="x" gear="2"/><position joint="x" kp="2" kv="1" gear="-3"/>
-<velocity jointinparent="y" kv="3" forcerange="-.2 .2" gear="-3"/><motor site="e" gear="1 2 3 .5 .7 .3"/></actuator>"""
+<velocity jointinparent="y" kv="3" forcerange="-.2 .2" gear="-3"/><motor site="e" gear="0 0 3"/></actuator>"""
 ON_SITES = '<actuator>{} gear="-1 2 3 .5 .7 -.3"/></actuator>'
 ON_BALLS = """<actuator><position joint="x" kp="2" kv="1" gear="1 2 3"/>
 <position jointinparent="x" kp="2" kv="1" gear="-1 2 1"/></actuator>"""
@@ -232,6 +232,15 @@ def test_outcome_of_states_outside_limits(kind, tmp_path):
         system = sc.LagrangianSystem.from_mjcf(file, limits="contact")
     with pytest.raises(ContactError, match=f"{limit} of the range .* at {gap:.6g}"):
         sc.compile_stepper(system, "svi:2").integrate(**system.keyframes[state], h=0.01, steps=2)
+
+
+def test_outcome_of_a_quaternion_of_length_0(tmp_path):
+    """It is no rotation, as for MuJoCo."""
+    file, (parts, *_) = tmp_path / "robot.xml", OUTSIDE["ball"]
+    key = '<keyframe><key name="k" qpos="0 0 0 0"/></keyframe>'
+    written(file, **parts | {"compiler": "", "rest": parts.get("rest", "") + key})
+    (turn,) = sc.LagrangianSystem.from_mjcf(file, limits="contact").keyframes["k"]["q"].values()
+    assert turn == [1, 0, 0, 0]
 
 
 @pytest.mark.second

@@ -1,6 +1,6 @@
 """States of robots by name: the reference configuration at rest, and the keyframes of MJCF files."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Any
 
@@ -18,6 +18,10 @@ SMALL = 1e-9
 """Size of negative gaps with which runs begin."""
 
 
+IDENTITY = [1.0, 0.0, 0.0, 0.0]
+"""Quaternion of no rotation, and that by which MuJoCo replaces 0."""
+
+
 def keyframe(links: Iterable[Any], inputs: Sequence[str], numbers: Mapping[str, Any]) -> dict[str, Any]:
     """Return arguments of ``integrate`` for the ``qpos``, ``qvel`` and controls of a file; by default those of rest."""
     places, rates = (iter(numbers.get(key, ())) for key in ("qpos", "qvel"))
@@ -29,12 +33,18 @@ def keyframe(links: Iterable[Any], inputs: Sequence[str], numbers: Mapping[str, 
         }
         velocity |= {name: next(rates, 0.0) for name in names}
         if len(names) != 1:
-            q[f"R_{link.name}"] = [*islice(places, 4)] or (
-                [*map(list, link.rotation)] if names else [1.0, 0.0, 0.0, 0.0]
-            )
+            q[f"R_{link.name}"] = rotation_in(places, link)
             velocity[f"omega_{link.name}"] = [*islice(rates, 3)] or [0.0, 0.0, 0.0]
     controls = {"inputs": {name: numbers.get(name, 0.0) for name in inputs}} if inputs else {}
     return {"q": q, "velocity": velocity, **controls}
+
+
+def rotation_in(places: Iterator[float], link: Any) -> list[Any]:
+    """Return the quaternion among further numbers, of which 0 is no rotation, or the reference without any."""
+    turn = [*islice(places, 4)]
+    if turn:
+        return turn if any(turn) else IDENTITY
+    return [*map(list, link.rotation)] if link.kind == "free" else IDENTITY
 
 
 def outside_limits(contacts: Iterable[Any], states: Mapping[str, Mapping[str, Any]]) -> str:
