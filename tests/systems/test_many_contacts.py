@@ -462,3 +462,60 @@ def test_feet_that_come_to_rest_after_checkpoints_have_the_bits_of_the_uncut_run
         run, cuts = dining_table(0.0).from_checkpoint(run.checkpoint(), **plan), cuts + 1
     assert cuts > 10
     assert np.array_equal([run.q, run.p], [whole.q[-1], whole.p[-1]])
+
+
+TRIPOD = [(0.25, 0.12), (0.0, -0.12), (-0.25, 0.12)]
+
+
+@cache
+def tripod() -> Any:
+    """Return the stepper of a body on three sprung legs, l along them, u ahead, which roll by the angle a.
+
+    On the floor lateral slips are y_dot + X c_dot + z a_dot + l_dot sin(a): dependent without roll.
+    """
+    feet = [
+        sc.contact(
+            f"z + {y}*sin(a) - l{i}*cos(a)",
+            slip=[
+                f"x_dot + u{i}_dot - {y}*c_dot",
+                f"y_dot + {x}*c_dot + (l{i}*cos(a) - {y}*sin(a))*a_dot + l{i}_dot*sin(a)",
+            ],
+            friction=0.8,
+            restitution=0.3,
+        )
+        for i, (x, y) in enumerate(TRIPOD)
+    ]
+    energy = "5*(x_dot**2 + y_dot**2 + z_dot**2) + 0.05*a_dot**2 + 0.1*c_dot**2 - 98.1*z"
+    energy += "".join(f" + 0.2*(l{i}_dot**2 + u{i}_dot**2) - 400*((l{i} - 0.4)**2 + u{i}**2)" for i in range(3))
+    names = ["x", "y", "z", "a", "c", "l0", "l1", "l2", "u0", "u1", "u2"]
+    forces = {name: f"-20*{name}_dot" for name in names[5:]}
+    system = sc.LagrangianSystem.from_text("tripod", names, energy, contacts=feet, forces=forces)
+    return sc.compile_stepper(system, "svi:2", flags=("-O1",))
+
+
+@pytest.mark.filterwarnings("ignore:a transition has several motions")
+@pytest.mark.second
+@pytest.mark.parametrize(
+    "seed", [1, pytest.param(2, marks=pytest.mark.rotated), 3, pytest.param(4, marks=pytest.mark.rotated)]
+)
+def test_slips_that_depend_without_roll_relax_in_few_parts(seed: int) -> None:
+    """Forces obey Coulomb's law at all states; energy decreases; a fifth of the step ends at the same place."""
+    random, mu = np.random.default_rng(seed), 0.8
+    v = random.normal(size=11) * [0.3, 0.3, 0, 0.2, 0.3, *6 * [0.2]]
+    q = [0, 0, 0.45, 10.0 ** -random.integers(2, 7), 0, 0.4, 0.4, 0.4, 0, 0, 0]
+    run, fine = (tripod().integrate(q, velocity=v, h=h, t_end=1.0) for h in (0.005, 0.001))
+    a, w, legs, u = run.q[:, 3], run.velocity, run.q[:, 5:8], run.velocity[:, 8:]
+    x, y = np.transpose(TRIPOD)
+    ahead = w[:, :1] + u - y * w[:, 4:5]
+    lever = legs * np.cos(a)[:, None] - y * np.sin(a)[:, None]
+    aside = w[:, 1:2] + x * w[:, 4:5] + lever * w[:, 3:4] + w[:, 5:8] * np.sin(a)[:, None]
+    force = run.contact_forces()
+    size, slip = np.hypot(force[..., 1], force[..., 2]), np.hypot(ahead, aside)
+    power = force[..., 1] * ahead + force[..., 2] * aside
+    slides = (slip > 1e-3) & (force[..., 0] > 1e-6)
+    assert slides.sum() > 100
+    assert (size <= mu * force[..., 0] + 1e-9).all()
+    assert (power[slides] < -(1 - 1e-3) * mu * (force[..., 0] * slip)[slides]).all()
+    assert np.diff(run.energy()).max() < 0
+    assert len(run) < 3500
+    assert np.abs(run.q[-1] - fine.q[-1]).max() < 1e-5

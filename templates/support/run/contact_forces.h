@@ -200,7 +200,7 @@ static void modes_at(const contact_terms *of, const real *modes, contact_mode *m
       continue;
     const real along = start[2] * w[0] + start[3] * w[1], x[2] = {along * w[0] + start[0], along * w[1] + start[1]};
     for (int i = 0; i < 2 && length_of(x, 2) > 0.0; i++)
-      mode[k].direction[i] = x[i] / length_of(x, 2);
+      mode[k].direction[i] = start[-1] * x[i] / length_of(x, 2);
   }
 }
 

@@ -4,13 +4,15 @@
 enum {
   CONTACT_MODES = 4096, /* that are tried where a relaxation finds none */
   CONTACT_OTHERS = 256, /* that are compared with the one that was found */
-  CONTACT_TRIALS = 10, /* of a relaxation, each of twice as many sweeps */
+  CONTACT_TRIALS = 2, /* of a relaxation */
   CONTACT_SWEEPS = 50 /* over the forces of contacts */
 };
 
+#define CONTACT_BEGIN 1e-4 /* first part of a slip in space, relative to a step: longer than that of rounding */
+#define CONTACT_EXACT 0x1p-40 /* residual of refined forces in the friction cones */
+#define CONTACT_REGULAR 1e-9 /* part of the diagonal of their equations, dimensionless, that is added to it */
 #define CONTACT_APART 1e-5 /* part of their size by which the rates of two motions differ */
 #define CONTACT_ASIDE 1e-9 /* largest angle between friction and slip in space */
-#define CONTACT_COMPLIANCE 1e-3 /* of friction at the start of a relaxation */
 
 /* Modes among which those of contacts are chosen, and their conditions on the rates right + W f of the rows: second
  * rates for forces, rates for impulses. is_free: open by its gap; rests: its slip is 0; begins: 1 or -1 if it slips
@@ -24,6 +26,7 @@ typedef struct {
   int is_relaxed; /* contacts at their limit do not stick */
   int is_free[EVENT_CONTACTS], rests[EVENT_CONTACTS], begins[EVENT_CONTACTS], limit[EVENT_CONTACTS];
   contact_mode role[EVENT_CONTACTS]; /* whether it may be closed, and its friction any (sticks) or in its direction */
+  real directed[EVENT_CONTACTS]; /* part of the friction limit of one that sticks that is in its direction */
 } contact_problem;
 
 /* Sets the modes of a contact that its gap and its slip at a state allow; fastest: its slip so far. */
@@ -129,45 +132,170 @@ static int hold_contacts(const contact_problem *in, contact_mode *mode)
   return any;
 }
 
+/* Subtracts a part of the derivatives of force - rate / diagonal in a row. */
+static void subtract_derivative(const contact_terms *of, int row, real diagonal, real part, real *line)
+{
+  line[row] -= part;
+  for (int j = 0; j < CONTACT_ROWS; j++)
+    line[j] += part / diagonal * of->W[row * CONTACT_ROWS + j];
+}
+
+/* Lists the rows of a contact and returns their number. */
+static int rows_of(int k, int *row)
+{
+  const contact_places *const at = CONTACTS + k;
+  int count = 0;
+  if (at->normal >= 0)
+    row[count++] = at->normal;
+  for (int i = 0; i < at->slips; i++)
+    row[count++] = at->tangential + i;
+  return count;
+}
+
+/* Part of the friction of a contact that is given, in the direction of its role. */
+static real given_part(const contact_problem *in, int k)
+{
+  return in->role[k].sticks ? in->directed[k] : 1.0;
+}
+
+/* Free part z = f - rate / trace, of friction without the given one, before the projection onto its part of the cone;
+ * returns the factor by which that shortens it. */
+static real free_friction(const contact_problem *in, int k, const real *force, real bound, real trace, real *z)
+{
+  const int slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
+  const real given = given_part(in, k);
+  for (int i = 0; i < slips; i++)
+    z[i] = given == 1.0 ? 0.0
+                        : force[slip + i] - rate_after(in->of, in->right, force, slip + i) / trace +
+            bound * given * in->role[k].direction[i];
+  return fmin(1.0, (1.0 - given) * bound / fmax(length_of(z, slips), DBL_MIN));
+}
+
+static real trace_of(const contact_terms *of, int k)
+{
+  real trace = 0.0;
+  for (int i = 0; i < CONTACTS[k].slips; i++)
+    trace += of->W[(CONTACTS[k].tangential + i) * (CONTACT_ROWS + 1)];
+  return trace;
+}
+
+/* Equations of forces in the friction cones, force = projection of force - rate / diagonal, and their derivatives, by
+ * rows of closed contacts (P. Alart & A. Curnier, Comput. Methods Appl. Mech. Eng. 92, 1991). Returns the sum of
+ * squares. */
+static real state_projections(const contact_problem *in, const real *force, real (*line)[CONTACT_ROWS + 1])
+{
+  const contact_terms *const of = in->of;
+  real sum = 0.0;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
+    const real bound = fmax(friction_limit(of, k, in->limit[k], force), 0.0), trace = trace_of(of, k);
+    const real given = given_part(in, k);
+    const real *const d = in->role[k].direction;
+    real z[2] = {0.0}, n[2] = {0.0};
+    int row[3], count = in->role[k].closed ? rows_of(k, row) : 0;
+    for (int i = 0; i < count; i++) {
+      memset(line[row[i]], 0, sizeof *line);
+      line[row[i]][row[i]] = 1.0;
+      line[row[i]][CONTACT_ROWS] = -force[row[i]];
+    }
+    if (normal >= 0 && count > 0) {
+      const real diagonal = of->W[normal * (CONTACT_ROWS + 1)];
+      const real push = force[normal] - rate_after(of, in->right, force, normal) / diagonal;
+      if (push > 0.0)
+        subtract_derivative(of, normal, diagonal, 1.0, line[normal]);
+      line[normal][CONTACT_ROWS] += fmax(push, 0.0);
+    }
+    const real across = count > 0 ? free_friction(in, k, force, bound, trace, z) : 0.0;
+    for (int i = 0; i < slips && across < 1.0; i++)
+      n[i] = z[i] / fmax(length_of(z, slips), DBL_MIN);
+    for (int i = 0; i < slips && count > 0; i++) {
+      real by_bound = (1.0 - given) * n[i] - given * d[i];
+      for (int l = 0; l < slips; l++) {
+        const real part = across * ((i == l) - n[i] * n[l]);
+        subtract_derivative(of, slip + l, trace, part, line[slip + i]);
+        by_bound += part * given * d[l];
+      }
+      if (normal >= 0 && bound > 0.0)
+        line[slip + i][normal] -= bound / force[normal] * by_bound;
+      line[slip + i][CONTACT_ROWS] += across * z[i] - bound * given * d[i];
+    }
+    for (int i = 0; i < count; i++)
+      sum += line[row[i]][CONTACT_ROWS] * line[row[i]][CONTACT_ROWS];
+  }
+  return sum;
+}
+
+/* Solves for forces in the friction cones by Newton's method from those given, as far as residuals decrease. Returns
+ * whether they are exact. */
+static int refine(const contact_problem *in, real *force)
+{
+  real line[CONTACT_ROWS][CONTACT_ROWS + 1], step[CONTACT_ROWS], trial[CONTACT_ROWS], size = DBL_MIN, part = 1.0;
+  int row[CONTACT_ROWS], independent[CONTACT_ROWS], count = 0;
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    count += in->role[k].closed ? rows_of(k, row + count) : 0;
+  real sum = state_projections(in, force, line);
+  memcpy(trial, force, sizeof trial);
+  for (int iteration = 0; part > CONTACT_EXACT && iteration < CONTACT_SWEEPS; iteration++) {
+    real matrix[CONTACT_ROWS][CONTACT_ROWS + 1], next = INFINITY;
+    for (int i = 0; i < count; i++) {
+      for (int j = 0; j < count; j++)
+        matrix[i][j] = line[row[i]][row[j]];
+      matrix[i][i] += CONTACT_REGULAR; /* for dependent rows */
+      matrix[i][count] = line[row[i]][CONTACT_ROWS];
+      size = fmax(size, fabs(force[row[i]]));
+    }
+    if (sqrt(sum) <= CONTACT_EXACT * size)
+      return 1;
+    eliminate(matrix, count, independent);
+    for (int i = 0; i < count; i++)
+      step[i] = independent[i] ? matrix[i][count] / matrix[i][i] : 0.0;
+    for (part = 2.0; part > CONTACT_EXACT && !(next < (1.0 - 1e-4 * part) * sum);) {
+      part *= 0.5;
+      for (int i = 0; i < count; i++)
+        trial[row[i]] = force[row[i]] + part * step[i];
+      next = state_projections(in, trial, line);
+    }
+    if (next < sum)
+      memcpy(force, trial, sizeof trial);
+    sum = next;
+  }
+  return 0;
+}
+
 /* Forces by projection onto the friction cones, contact by contact (M. Jean, Comput. Methods Appl. Mech. Eng. 177,
- * 1999), from those given; role: whether a contact is closed, and its friction any (sticks) or in its direction.
- * Compliance distributes friction in proportion to its limits. */
-static void relax(const contact_problem *in, real compliance, int sweeps, real *force)
+ * 1999), from those given, then by Newton's method; role: whether a contact is closed, and its friction any (sticks) or
+ * in its direction. */
+static void relax(const contact_problem *in, real *force)
 {
   const contact_terms *const of = in->of;
   const contact_mode *const role = in->role;
-  real strongest = 0.0;
-  for (int moves = 1; moves && sweeps > 0; sweeps--) {
+  for (int moves = 1, sweeps = 0; moves && sweeps < CONTACT_SWEEPS; sweeps++) {
     real before[CONTACT_ROWS];
     memcpy(before, force, sizeof before);
     moves = 0;
     for (int k = 0; k < EVENT_CONTACTS; k++) {
       const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
-      real diagonal = normal < 0 ? 0.0 : of->W[normal * (CONTACT_ROWS + 1)], oblique = diagonal, trace = 0.0;
-      real bound, size, friction[2] = {0.0, 0.0};
-      for (int i = 0; i < slips; i++) {
-        trace += of->W[(slip + i) * (CONTACT_ROWS + 1)];
-        if (normal >= 0 && !role[k].sticks)
-          oblique -= of->coefficient[3 * k] * role[k].direction[i] * of->W[normal * CONTACT_ROWS + slip + i];
-      }
+      real diagonal = normal < 0 ? 0.0 : of->W[normal * (CONTACT_ROWS + 1)], oblique = diagonal, z[2];
+      int row[3];
+      for (int i = rows_of(k, row) - 1; i >= 0 && !role[k].closed; i--)
+        force[row[i]] = 0.0;
+      if (!role[k].closed)
+        continue;
+      for (int i = 0; i < slips && normal >= 0 && !role[k].sticks; i++)
+        oblique -= of->coefficient[3 * k] * role[k].direction[i] * of->W[normal * CONTACT_ROWS + slip + i];
       if (normal >= 0)
         force[normal] -= rate_after(of, in->right, force, normal) / (oblique > 0.0 ? oblique : diagonal);
-      if (normal >= 0 && !(role[k].closed && force[normal] > 0.0))
-        force[normal] = 0.0;
-      bound = role[k].closed ? friction_limit(of, k, in->limit[k], force) : 0.0;
-      strongest = fmax(strongest, bound);
-      const real kept = 1.0 - fmin(compliance * strongest, bound) / fmax(bound, DBL_MIN);
+      if (normal >= 0)
+        force[normal] = fmax(force[normal], 0.0);
+      const real bound = friction_limit(of, k, in->limit[k], force);
+      const real across = free_friction(in, k, force, bound, trace_of(of, k), z);
       for (int i = 0; i < slips; i++)
-        friction[i] = role[k].sticks
-            ? kept * force[slip + i] - rate_after(of, in->right, force, slip + i) / trace
-            : -bound * role[k].direction[i];
-      size = length_of(friction, slips);
-      for (int i = 0; i < slips; i++)
-        force[slip + i] = friction[i] * (role[k].sticks && size > bound ? bound / size : 1.0);
+        force[slip + i] = across * z[i] - bound * given_part(in, k) * role[k].direction[i];
     }
     for (int r = 0; r < CONTACT_ROWS; r++)
       moves |= fabs(force[r] - before[r]) > DBL_EPSILON * fabs(force[r]);
   }
+  refine(in, force);
 }
 
 /* Opens a contact, if other forces give the same rates of the imposed rows but not of all: the first of those that
@@ -298,14 +426,11 @@ static int relax_modes(contact_problem *in, real *force, contact_mode *best)
   in->is_relaxed = 1;
   memcpy(limit, in->limit, sizeof limit);
   for (int trial = 0; trial < CONTACT_TRIALS; trial++) {
-    const int sweeps = CONTACT_SWEEPS << trial;
     memcpy(in->limit, limit, sizeof limit);
     memcpy(in->role, role, sizeof role);
-    if (trial > 0)
-      relax(in, CONTACT_COMPLIANCE, sweeps, force);
     do { /* all contacts carry loads, else some do not */
       for (int changes = 0, changed = 1; changed && changes <= EVENT_CONTACTS; changes++) {
-        relax(in, 0.0, sweeps, force);
+        relax(in, force);
         changed = modes_of_forces(in, trial, force, mode);
       }
       for (in->is_strict = 1; in->is_strict >= found; in->is_strict--)
@@ -318,8 +443,7 @@ static int relax_modes(contact_problem *in, real *force, contact_mode *best)
           }
         }
     } while (!found && unload(in, mode, force));
-    if (trial == 0)
-      memset(force, 0, BYTES(CONTACT_ROWS));
+    memset(force, 0, BYTES(CONTACT_ROWS));
   }
   memcpy(in->limit, limit, sizeof limit);
   memcpy(in->role, role, sizeof role);
@@ -347,15 +471,29 @@ static int is_impossible(const contact_terms *of, int k, real *number)
   return is_friction || !(e >= 0.0 && e <= 1.0);
 }
 
+/* Whether the direction (ahead.w) w + start of a slip in space is that of its second term. */
+static int keeps_direction(const real *start, const real *w)
+{
+  return length_of(start, 2) > length_of(w, 2) * length_of(w, 2);
+}
+
 /* Sets the consistent modes at a state that stick most, of redundant contacts those near given forces. */
 static int choose_modes(const event_step *step, const contact_terms *of, const contact_change *now, real *force)
 {
   contact_problem in = {.of = of, .right = of->second, .is_strict = 1, .lifts = now->lifts};
   contact_mode best[EVENT_CONTACTS], other[EVENT_CONTACTS];
   real second[CONTACT_ROWS];
-  int imposed[CONTACT_ROWS] = {0};
-  for (int k = 0; k < EVENT_CONTACTS; k++)
+  int imposed[CONTACT_ROWS] = {0}, directed[EVENT_CONTACTS] = {0};
+  contact_mode present[EVENT_CONTACTS];
+  modes_at(of, step->watch->mode, present);
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
     allow_modes(&in, k, now, step->watch->fastest[k]);
+    const real *const start = step->watch->mode + CONTACTS[k].direction + 1, *const d = present[k].direction;
+    directed[k] = CONTACTS[k].slips == 2 && in.role[k].closed && !in.limit[k] && start[-1] != 0.0 && !present[k].held &&
+        keeps_direction(start, of->rate + CONTACTS[k].tangential);
+    for (int i = 0; directed[k] && i < 2; i++)
+      in.role[k].direction[i] = d[i] / length_of(d, 2); /* friction would jump to that of the rate */
+  }
   int found = relax_modes(&in, force, best);
   for (int k = 0; k < EVENT_CONTACTS && !found; k++) { /* where another slip unloads the one at its limit, that stays */
     in.rests[k] |= in.begins[k] != 0;
@@ -381,12 +519,11 @@ static int choose_modes(const event_step *step, const contact_terms *of, const c
     best[k].sticks = sticks;
     for (int j = 0; j < CONTACT_ROWS && slip >= 0; j++)
       speed += fabs(of->W[slip * CONTACT_ROWS + j] * force[j] * step->whole);
-    put_mode(CONTACTS + k, best[k], is_slow || slip < 0 ? AT_REST : of->rate + slip, speed, step->watch->mode);
-    if (is_slow) {
+    const real *const w = is_slow || directed[k] || slip < 0 ? AT_REST : of->rate + slip;
+    put_mode(CONTACTS + k, best[k], w, speed, step->watch->mode);
+    if (is_slow)
       step->watch->fastest[k] = fmax(step->watch->fastest[k], speed);
-      step->watch->began[k] = step->watch->time;
-      step->watch->whole[k] = fabs(step->whole);
-    }
+    step->watch->part[k] = (is_slow ? CONTACT_BEGIN : 1.0) * fabs(step->whole);
   }
   put_modes(step->watch->mode, step->own);
   return OK;

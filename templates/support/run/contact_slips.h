@@ -1,12 +1,20 @@
 #include "contact_modes.h"
 
 /* Directions of slips in space where these stop and begin. */
-#define CONTACT_BEGIN 1e-4 /* first part of a slip in space, relative to a step: longer than that of rounding */
+enum {
+  CONTACT_TURNS = 8 /* iterations for directions at the end of a part */
+};
+
 #define CONTACT_BRAKES 0.25 /* longest parts relative to the time to its stop .. */
 #define CONTACT_GROWS 0.2 /* .. to that from its beginning .. */
-#define CONTACT_RELAXES 2.0 /* .. and to the relaxation of its direction, for which iterations on stages converge .. */
-#define CONTACT_BRAKING 4.0 /* .. and of slips that brake */
-#define CONTACT_SHORT 3e-4 /* .. once that is longer than this part of a step */
+#define CONTACT_RELAXES 2.0 /* .. and to the relaxation of its direction, for which iterations on stages converge */
+#define CONTACT_STIFF 0.25 /* relaxation relative to a part and those times, below which it is not followed */
+#define CONTACT_BRAKED 0.03 /* braking relative to friction, above which slow slips keep their direction to the stop */
+#define CONTACT_TURNED 1e-7 /* change of a direction at which iterations end */
+#define CONTACT_GAMMA 0.2928932188134524 /* 1 - 1/sqrt(2), of the rule for directions of slips */
+#define CONTACT_ACCURACY 4e-10 /* error of slips that turn in a part, relative to the fastest one .. */
+#define CONTACT_DAMPED 25.0 /* .. as many times larger where several turn with each other .. */
+#define CONTACT_PATH 2e-3 /* .. and the weight of that of paths, relative to that of a step */
 /* Least size of an adaptive step for this, relative to the largest so far: the energy of a stool that falls on its feet
  * grows without bound for 0, and by 1e-8, 7e-11, 3e-12, 8e-13, 8e-13 for 2^-12, 2^-9, 2^-6, 2^-3, 1. */
 #define CONTACT_PACE 0x1p-6
@@ -34,12 +42,6 @@ static int add_change(const event_step *step, int event, const event_sample *at)
   return OK;
 }
 
-/* Whether the direction (ahead.w) w + start of a slip in space is that of its second term. */
-static int keeps_direction(const real *start, const real *w)
-{
-  return length_of(start, 2) > length_of(w, 2) * length_of(w, 2);
-}
-
 /* Present modes, the forces and second rates in them, if there are slips in space (*any), and forces. */
 static int slips_at(const event_step *step, const event_sample *at, contact_terms *of, contact_mode *mode, real *force,
     real *second, int *any)
@@ -56,94 +58,264 @@ static int slips_at(const event_step *step, const event_sample *at, contact_term
   return OK;
 }
 
-/* Directions in a part of a step of slips that begin, by the midpoint rule: friction is opposite to w + (part/2) w', w'
- * that of the middle. At the beginning, w = 0, that is w' parallel to -d where friction jumps; where it does not jump,
- * w' = 0, the friction at rest, which w follows as long as the friction that would stop it is stiff. */
-static int turn_slips(const event_step *step, const event_sample *at, const contact_terms *of, const int *begins,
-    contact_mode *mode, real *force, real part)
+/* Sets the direction of a slip in space; `keeps`: that of friction in the next part of a step, whose share of the limit
+ * is its length. A slip stops where that along `ahead` does. */
+static void direct_slip(const event_step *step, int k, const real *direction, const real *ahead, int keeps)
 {
-  event_sample middle = {.t = at->t + 0.5 * part, .q = step->memory, .p = step->memory + M};
-  contact_terms there;
-  contact_problem in = {.of = &there};
-  real right[CONTACT_ROWS];
+  real *const start = step->watch->mode + CONTACTS[k].direction + 1;
+  const real share = length_of(direction, 2), fast = CONTACT_FAST * step->watch->fastest[k];
+  start[-1] = share < 1.0 - CONTACT_ROUNDING ? fmax(share, DBL_EPSILON) : 1.0;
+  for (int i = 0; i < 2; i++) {
+    start[i] = keeps ? fast * fast * direction[i] / fmax(share, DBL_MIN) : 0.0;
+    start[2 + i] = ahead[i];
+  }
+}
+
+/* Directions of slips that turn in a part of a step: d at the end of one of its stages, where slips are w, and friction
+ * brakes them by so much; a part of the friction, `given`, is along -base, the rest along -d. */
+typedef struct {
+  real part, given, base[EVENT_CONTACTS][2], d[EVENT_CONTACTS][2], w[EVENT_CONTACTS][2], brake[EVENT_CONTACTS];
+  int stops[EVENT_CONTACTS];
+} slip_stage;
+
+/* Solves for forces at the end of a stage, with rates there as functions of the forces near those in the present
+ * directions: the part of friction that is not given is in its cone, and opposite to slips. */
+static int forces_at_end(const event_step *step, const event_sample *at, const slip_stage *stage, const int *turns,
+    contact_terms *end, contact_mode *mode, real *right, real *force)
+{
+  event_sample next = {.t = at->t + stage->part, .q = step->memory, .p = step->memory + M};
+  contact_problem in = {.of = end, .right = right};
+  real after[CONTACT_ROWS];
   solver_report own;
-  TRY(NAME(step)(at->t, 0.5 * part, at->q, at->p, step->own, step->options, middle.q, middle.p, &own,
-      step->workspace));
-  TRY(terms_at(step, &middle, &there));
-  memcpy(right, there.second, sizeof right);
-  in.right = right;
+  put_modes(step->watch->mode, step->own);
+  TRY(NAME(step)(at->t, stage->part, at->q, at->p, step->own, step->options, next.q, next.p, &own, step->workspace));
+  TRY(terms_at(step, &next, end));
+  modes_at(end, step->watch->mode, mode);
+  solve_contacts(end, mode, end->second, force, after, NULL);
+  memcpy(right, end->second, BYTES(CONTACT_ROWS));
+  memcpy(in.role, mode, sizeof in.role);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int slip = CONTACTS[k].tangential;
     in.limit[k] = mode[k].sticks != 0;
-    if (!begins[k])
+    if (!turns[k])
       continue;
-    mode[k] = CONTACT_STICKS;
+    in.role[k] = CONTACT_STICKS;
+    in.directed[k] = stage->given;
+    memcpy(in.role[k].direction, stage->base[k], sizeof stage->base[k]);
     for (int i = 0; i < 2; i++)
-      right[slip + i] += 2.0 / part * of->rate[slip + i];
+      right[slip + i] += end->rate[slip + i] / stage->part - after[slip + i];
   }
-  memcpy(in.role, mode, sizeof in.role);
-  relax(&in, 0.0, CONTACT_SWEEPS, force);
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const real *const tau = force + CONTACTS[k].tangential, size = length_of(tau, 2);
-    for (int i = 0; begins[k] && size > 0.0 && i < 2; i++) /* without a force any direction is right */
-      mode[k].direction[i] = -tau[i] / size;
-  }
+  if (!refine(&in, force))
+    relax(&in, force);
   return OK;
+}
+
+/* Directions at the end of a stage by forces there, and their largest change. Others that stick may begin: *begin. */
+static real redirect_slips(const event_step *step, const contact_terms *end, const contact_mode *mode,
+    const real *right, const real *force, int *turns, slip_stage *stage, int *begin)
+{
+  real change = 0.0;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int slip = CONTACTS[k].tangential;
+    const int begins = CONTACTS[k].slips == 2 && mode[k].sticks == 3 && step->watch->mode[CONTACTS[k].held] == 0.0;
+    const real least = CONTACT_ROUNDING * step->watch->fastest[k];
+    const int rests = turns[k] && length_of(end->rate + slip, 2) <= least; /* by friction of the present direction */
+    const real limit = (turns[k] && !rests) || begins ? friction_limit(end, k, begins, force) : 0.0;
+    for (int i = 0; turns[k] && rests && i < 2; i++)
+      stage->w[k][i] = 0.0;
+    for (int i = 0; limit > 0.0 && i < 2; i++)
+      stage->w[k][i] = stage->part * rate_after(end, right, force, slip + i);
+    if (limit <= 0.0 || (begins && length_of(stage->w[k], 2) <= least))
+      continue;
+    for (int i = 0; i < 2; i++) {
+      const real d = (-force[slip + i] / limit - stage->given * stage->base[k][i]) / (1.0 - stage->given);
+      change = fmax(change, fabs(d - stage->d[k][i]));
+      stage->d[k][i] = d;
+    }
+    if (begins)
+      put_mode(CONTACTS + k, (contact_mode){.closed = 1}, AT_REST, 0.0, step->watch->mode);
+    stage->brake[k] = limit * end->W[slip * (CONTACT_ROWS + 1)];
+    *begin |= begins;
+    turns[k] = 1;
+  }
+  return change;
+}
+
+/* Solves for the directions at the end of a stage, until others begin. */
+static int solve_stage(const event_step *step, const event_sample *at, int *turns, slip_stage *stage, int *begin)
+{
+  contact_terms end;
+  contact_mode mode[EVENT_CONTACTS];
+  real right[CONTACT_ROWS], force[CONTACT_ROWS], mean[2];
+  for (int pass = 0; pass < CONTACT_TURNS; pass++) {
+    for (int k = 0; k < EVENT_CONTACTS; k++) {
+      for (int i = 0; i < 2; i++)
+        mean[i] = stage->given * stage->base[k][i] + (1.0 - stage->given) * stage->d[k][i];
+      if (turns[k])
+        direct_slip(step, k, mean, AT_REST, 1);
+    }
+    TRY(forces_at_end(step, at, stage, turns, &end, mode, right, force));
+    if (redirect_slips(step, &end, mode, right, force, turns, stage, begin) <= CONTACT_TURNED || *begin)
+      return OK;
+  }
+  return NOT_CONVERGED;
+}
+
+/* How many times larger errors of a slip may be, as others that turn with it damp them. */
+static real damping_of(const contact_terms *of, int k, const int *turns)
+{
+  const int slip = CONTACTS[k].tangential;
+  real coupling = 0.0;
+  for (int j = 0; j < EVENT_CONTACTS; j++)
+    for (int i = 0; turns[j] && j != k && i < 4; i++)
+      coupling += fabs(of->W[(slip + i / 2) * CONTACT_ROWS + CONTACTS[j].tangential + i % 2]);
+  return coupling > 0.0 ? CONTACT_DAMPED : 1.0;
+}
+
+/* Error of a slip by a part: along it of second order in its turn, or less where it is slow; that of its path; what
+ * friction gains; and the slip from its stop on, until which *stops of the part lasts. */
+static real error_of_turn(const event_step *step, const contact_terms *of, int k, slip_stage *last, real *stops)
+{
+  const real *const w = of->rate + CONTACTS[k].tangential, *const d = last->d[k], *const end = last->w[k];
+  const real speed = length_of(w, 2), brake = last->brake[k] * fabs(last->part);
+  const real spare = CONTACT_GAMMA * brake * (1.0 - length_of(d, 2)), kept = speed / fmax(speed + spare, DBL_MIN);
+  const real path = CONTACT_PATH * brake * fabs(last->part / step->whole);
+  const int is_slow = speed <= CONTACT_SLOW * step->watch->fastest[k]; /* by rounding, without a direction */
+  real turn = 0.0, work = 0.0;
+  for (int i = 0; i < 2; i++) {
+    turn = hypot(turn, d[i] - (is_slow ? last->base[k][i] : w[i] / speed));
+    work += is_slow ? 0.0 : (last->given * last->base[k][i] + CONTACT_GAMMA * d[i]) * (w[i] + end[i]);
+  }
+  if (is_slow || spare * kept <= CONTACT_ACCURACY * step->watch->fastest[k])
+    return turn * (fmin(fmax(speed, length_of(end, 2)), brake * turn) + path) - fmin(work, 0.0);
+  last->stops[k] = 1;
+  *stops = fmin(*stops, kept);
+  return INFINITY;
+}
+
+/* Directions of slips that relax in a part of a step, by a rule of second order that damps them (R. Alexander, SIAM J.
+ * Numer. Anal. 14, 1977): friction is opposite to the slip at the end of a stage gamma part, and then, with 1 - gamma
+ * times that, at the end of the part; it is in its cone if the slip there is 0. The part becomes shorter until errors
+ * are small, and slips that stop do so at its end. */
+static int turn_slips(const event_step *step, const event_sample *at, const contact_terms *of, int *turns,
+    const contact_mode *mode, real *part)
+{
+  const real least = CONTACT_UNSOLVED * fabs(step->whole), longest = *part;
+  slip_stage first = {.part = 0.0}, last = {.given = 1.0 - CONTACT_GAMMA};
+  real worst = INFINITY;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    memcpy(first.d[k], mode[k].direction, sizeof first.d[k]);
+    memcpy(last.d[k], mode[k].direction, sizeof last.d[k]);
+  }
+  while (worst > CONTACT_ACCURACY) {
+    int begin = 0;
+    real stops = 1.0;
+    first.part = CONTACT_GAMMA * *part;
+    last.part = *part;
+    int status = solve_stage(step, at, turns, &first, &begin);
+    memcpy(last.base, first.d, sizeof first.d);
+    if (status == OK && !begin)
+      status = solve_stage(step, at, turns, &last, &begin);
+    if (status == OK && begin)
+      continue;
+    worst = status == OK ? 0.0 : INFINITY;
+    for (int k = 0; k < EVENT_CONTACTS && status == OK; k++)
+      if (turns[k])
+        worst = fmax(worst,
+            error_of_turn(step, of, k, &last, &stops) / (step->watch->fastest[k] * damping_of(of, k, turns)));
+    if (worst <= CONTACT_ACCURACY || fabs(*part) <= least) { /* what is shorter is rounding */
+      TRY(status);
+      break;
+    }
+    *part *= fmax(0.125, stops < 1.0 ? stops : 0.75 * cbrt(CONTACT_ACCURACY / worst));
+  }
+  const real next = *part * fmin(2.0, 0.9 * cbrt(CONTACT_ACCURACY / fmax(worst, DBL_MIN)));
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    if (turns[k]) {
+      const int slows = last.stops[k] && length_of(last.w[k], 2) <= CONTACT_SLOW * step->watch->fastest[k];
+      step->watch->stops[k] = slows || length_of(last.d[k], 2) < 1.0 - CONTACT_ROUNDING;
+      step->watch->part[k] = fmax(next, *part < longest ? 0.0 : step->watch->part[k]);
+    }
+  return OK;
+}
+
+/* Times of a slip in space, and what is done with its direction at the beginning of a part of a step: it is kept, new,
+ * or turned in the part. by_rate: to its stop or from its beginning; relaxes: of its direction. */
+typedef struct {
+  int moves, keeps, renews, is_stiff;
+  real by_rate, relaxes;
+} slip_pace;
+
+static slip_pace pace_of(const event_step *step, const contact_terms *of, int k, const contact_mode *mode,
+    const real *force, const real *second)
+{
+  const int slip = CONTACTS[k].tangential;
+  const real *const start = step->watch->mode + CONTACTS[k].direction + 1, *const w = of->rate + slip;
+  const real *const d = mode->direction, size = length_of(w, 2);
+  slip_pace pace = {.moves = CONTACTS[k].slips == 2 && start[-1] != 0.0 && !mode->held};
+  if (!pace.moves)
+    return pace;
+  real *const fastest = step->watch->fastest + k;
+  const real rate = d[0] * second[slip] + d[1] * second[slip + 1];
+  const real by_friction = length_of(force + slip, 2) * of->W[slip * (CONTACT_ROWS + 1)];
+  const int stops = rate < -CONTACT_ROUNDING * by_friction, kept = keeps_direction(start, w);
+  *fastest = fmax(*fastest, fmax(size, of->speed[slip]));
+  pace.by_rate = (stops ? CONTACT_BRAKES : CONTACT_GROWS) * fmax(size, CONTACT_SLOW * *fastest) / fabs(rate);
+  pace.relaxes = CONTACT_RELAXES * size / by_friction;
+  pace.is_stiff = CONTACT_RELAXES * rate <= CONTACT_STIFF * CONTACT_GROWS * by_friction;
+  pace.keeps = size <= CONTACT_SLOW * *fastest && (rate < -CONTACT_BRAKED * by_friction || !pace.is_stiff);
+  pace.renews = pace.keeps != kept || (!kept && start[2] * w[0] + start[3] * w[1] < CONTACT_TURN * size);
+  return pace;
 }
 
 /* Slips in space at the beginning of a part of a step, of at most *longest. Where they stop and where they begin
  * solutions are not smooth: parts are in proportion to |w|/|w'|, and to the time |w|/(W tau) in which the direction
- * relaxes to that of other forces. Slow ones that stop keep their direction, and those that begin that of the middle of
- * each part, until parts of relaxation are no longer short. The direction `ahead` of others is renewed after a turn. */
+ * relaxes to that of other forces. Slow ones that stop or begin by a jump of friction keep their direction, and those
+ * that relax faster than all else turn by the rule above. The direction `ahead` of others is renewed after a turn. */
 static int follow_slips(const event_step *step, const event_sample *at, real *longest)
 {
   contact_terms of;
   contact_mode mode[EVENT_CONTACTS];
-  real force[CONTACT_ROWS], second[CONTACT_ROWS], direction[EVENT_CONTACTS][2], most = *longest;
-  int keeps[EVENT_CONTACTS], begins[EVENT_CONTACTS], changes = 0, turns = 0, any;
+  slip_pace pace[EVENT_CONTACTS];
+  real force[CONTACT_ROWS], second[CONTACT_ROWS], part = *longest, smooth = part;
+  int turns[EVENT_CONTACTS] = {0}, turning = 0, changes = 0, status = OK, any;
   *longest = INFINITY;
   TRY(slips_at(step, at, &of, mode, force, second, &any));
   if (!any)
     return OK;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const int slip = CONTACTS[k].tangential;
-    const real *const start = step->watch->mode + CONTACTS[k].direction + 1, *const ahead = start + 2;
-    const real *const w = of.rate + slip, size = length_of(w, 2), *const d = mode[k].direction;
-    keeps[k] = -1;
-    begins[k] = 0;
-    if (CONTACTS[k].slips < 2 || start[-1] == 0.0 || mode[k].held)
-      continue;
-    const real rate = d[0] * second[slip] + d[1] * second[slip + 1];
-    const real by_friction = length_of(force + slip, 2) * of.W[slip * (CONTACT_ROWS + 1)];
-    const real part = (rate < 0.0 ? CONTACT_BRAKES : CONTACT_GROWS) * size / fabs(rate);
-    const real relaxes = CONTACT_RELAXES * size / by_friction;
-    const real whole = step->watch->whole[k], age = fabs(step->watch->time - step->watch->began[k]);
-    const int kept = keeps_direction(start, w), stops = rate < -CONTACT_ROUNDING * by_friction;
-    const int stiff = CONTACT_GROWS * by_friction > CONTACT_RELAXES * rate && relaxes < CONTACT_SHORT * whole;
-    step->watch->fastest[k] = fmax(step->watch->fastest[k], fmax(size, of.speed[slip]));
-    keeps[k] = stops ? size <= CONTACT_SLOW * step->watch->fastest[k] : kept && (age == 0.0 || stiff);
-    begins[k] = keeps[k] && !stops && age > 0.0;
-    if (keeps[k] && !stops)
-      *longest = fmin(*longest, fmax(CONTACT_BEGIN * whole, CONTACT_GROWS * age));
-    else if (!keeps[k])
-      *longest = fmin(*longest, fmin(part, stops ? CONTACT_BRAKING * relaxes : relaxes));
-    turns |= begins[k];
-    changes |= begins[k] || keeps[k] != kept || (!kept && ahead[0] * w[0] + ahead[1] * w[1] < CONTACT_TURN * size);
-    for (int i = 0; i < 2; i++)
-      direction[k][i] = size > 0.0 && !(keeps[k] && kept) ? w[i] / size : ahead[i];
+    pace[k] = pace_of(step, &of, k, mode + k, force, second);
+    if (pace[k].moves && !pace[k].keeps)
+      smooth = fmin(smooth, pace[k].by_rate);
   }
-  if (turns)
-    TRY(turn_slips(step, at, &of, begins, mode, force, fmin(*longest, most)));
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int keeps = pace[k].keeps, follows = pace[k].moves && !keeps;
+    turns[k] = follows && pace[k].is_stiff && pace[k].relaxes <= CONTACT_STIFF * smooth;
+    turning |= turns[k];
+    changes |= turns[k] || pace[k].renews;
+    if (keeps && !pace[k].is_stiff)
+      *longest = fmin(*longest, fmax(CONTACT_BEGIN * fabs(step->whole), pace[k].by_rate));
+    if (follows)
+      *longest = fmin(*longest, turns[k] ? step->watch->part[k] : fmin(pace[k].by_rate, pace[k].relaxes));
+    step->watch->part[k] = turns[k] ? step->watch->part[k] : INFINITY;
+  }
+  part = fmin(part, *longest);
   if (changes)
     TRY(add_change(step, FIRST_TRANSITION, at));
-  for (int k = 0; changes && k < EVENT_CONTACTS; k++) {
-    real *const start = step->watch->mode + CONTACTS[k].direction + 1;
-    for (int i = 0; keeps[k] >= 0 && i < 2; i++) {
-      start[2 + i] = begins[k] ? mode[k].direction[i] : direction[k][i];
-      start[i] = keeps[k] ? pow(CONTACT_FAST * step->watch->fastest[k], 2.0) * start[2 + i] : 0.0;
-    }
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const real *const w = of.rate + CONTACTS[k].tangential;
+    if (!pace[k].renews || turns[k])
+      continue;
+    for (int i = 0; length_of(w, 2) > 0.0 && i < 2; i++)
+      mode[k].direction[i] = w[i] / length_of(w, 2);
+    direct_slip(step, k, mode[k].direction, mode[k].direction, pace[k].keeps);
   }
+  if (turning)
+    status = turn_slips(step, at, &of, turns, mode, &part);
+  if (status != OK)
+    --*step->filled; /* the part is taken again */
+  *longest = turning ? part : *longest;
   put_modes(step->watch->mode, step->own);
-  return OK;
+  return status;
 }
 #endif

@@ -196,7 +196,17 @@ static int renew_slips(const event_step *step, event_sample *at, real *longest)
   const real most = *longest;
   contact_change now;
   contact_terms of;
-  int outside[EVENT_CONTACTS], first = -1;
+  int outside[EVENT_CONTACTS], first = -1, stops = 0;
+  memset(&now, 0, sizeof now);
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    now.stops[k] = step->watch->stops[k];
+    step->watch->stops[k] = 0;
+    stops |= now.stops[k];
+  }
+  if (stops) {
+    TRY(add_change(step, FIRST_TRANSITION, at));
+    TRY(change_modes(step, at, &now));
+  }
   TRY(follow_slips(step, at, longest));
   if (*step->filled > before) {
     TRY(terms_at(step, at, &of));

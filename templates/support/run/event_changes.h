@@ -661,7 +661,9 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
     event_sample now = {.t = run->t, .q = run->q, .p = run->p};
     longest = fabs(run->h);
 #if EVENTS_CONTROLLED
-    longest = control ? exp2((real)run->grid_level / 4.0) : longest; /* the size that the controller has found */
+    const real unknown_size = watch->pace > 0.0 ? watch->pace : fabs(t_end - run->t);
+    if (control) /* the size that the controller has found */
+      longest = run->error_before > 0 ? exp2((real)run->grid_level / 4.0) : unknown_size;
 #endif
     step.whole = fmax(longest, watch->pace);
 #endif
