@@ -182,7 +182,7 @@ def test_text_with_warnings_is_always_read(made):
         sc.compile_stepper(system, "svi:2")
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(
     "make",
     [
