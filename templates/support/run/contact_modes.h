@@ -27,6 +27,7 @@ typedef struct {
   int is_free[EVENT_CONTACTS], rests[EVENT_CONTACTS], begins[EVENT_CONTACTS], limit[EVENT_CONTACTS];
   contact_mode role[EVENT_CONTACTS]; /* whether it may be closed, and its friction any (sticks) or in its direction */
   real directed[EVENT_CONTACTS]; /* part of the friction limit of one that sticks that is in its direction */
+  real weight, near[CONTACT_ROWS]; /* of the distance from forces nearby in the equations of forces (solve_cones) */
 } contact_problem;
 
 /* Sets the modes of a contact that its gap and its slip at a state allow; fastest: its slip so far. */
@@ -132,12 +133,13 @@ static int hold_contacts(const contact_problem *in, contact_mode *mode)
   return any;
 }
 
-/* Subtracts a part of the derivatives of force - rate / diagonal in a row. */
-static void subtract_derivative(const contact_terms *of, int row, real diagonal, real part, real *line)
+/* Subtracts a part of the derivatives of an unprojected force. */
+static void subtract_derivative(const contact_problem *in, int row, real diagonal, real part, real *line)
 {
+  part /= 1.0 + in->weight;
   line[row] -= part;
   for (int j = 0; j < CONTACT_ROWS; j++)
-    line[j] += part / diagonal * of->W[row * CONTACT_ROWS + j];
+    line[j] += part / diagonal * in->of->W[row * CONTACT_ROWS + j];
 }
 
 /* Lists the rows of a contact and returns their number. */
@@ -158,6 +160,13 @@ static real given_part(const contact_problem *in, int k)
   return in->role[k].sticks ? in->directed[k] : 1.0;
 }
 
+/* Force of a row by its rate, f - rate / diagonal, and by the forces nearby, before a projection. */
+static real unprojected(const contact_problem *in, const real *force, int row, real diagonal)
+{
+  const real free = force[row] - rate_after(in->of, in->right, force, row) / diagonal;
+  return (free + in->weight * in->near[row]) / (1.0 + in->weight);
+}
+
 /* Free part z = f - rate / trace, of friction without the given one, before the projection onto its part of the cone;
  * returns the factor by which that shortens it. */
 static real free_friction(const contact_problem *in, int k, const real *force, real bound, real trace, real *z)
@@ -166,8 +175,7 @@ static real free_friction(const contact_problem *in, int k, const real *force, r
   const real given = given_part(in, k);
   for (int i = 0; i < slips; i++)
     z[i] = given == 1.0 ? 0.0
-                        : force[slip + i] - rate_after(in->of, in->right, force, slip + i) / trace +
-            bound * given * in->role[k].direction[i];
+                        : unprojected(in, force, slip + i, trace) + bound * given * in->role[k].direction[i];
   return fmin(1.0, (1.0 - given) * bound / fmax(length_of(z, slips), DBL_MIN));
 }
 
@@ -200,9 +208,9 @@ static real state_projections(const contact_problem *in, const real *force, real
     }
     if (normal >= 0 && count > 0) {
       const real diagonal = of->W[normal * (CONTACT_ROWS + 1)];
-      const real push = force[normal] - rate_after(of, in->right, force, normal) / diagonal;
+      const real push = unprojected(in, force, normal, diagonal);
       if (push > 0.0)
-        subtract_derivative(of, normal, diagonal, 1.0, line[normal]);
+        subtract_derivative(in, normal, diagonal, 1.0, line[normal]);
       line[normal][CONTACT_ROWS] += fmax(push, 0.0);
     }
     const real across = count > 0 ? free_friction(in, k, force, bound, trace, z) : 0.0;
@@ -212,7 +220,7 @@ static real state_projections(const contact_problem *in, const real *force, real
       real by_bound = (1.0 - given) * n[i] - given * d[i];
       for (int l = 0; l < slips; l++) {
         const real part = across * ((i == l) - n[i] * n[l]);
-        subtract_derivative(of, slip + l, trace, part, line[slip + i]);
+        subtract_derivative(in, slip + l, trace, part, line[slip + i]);
         by_bound += part * given * d[l];
       }
       if (normal >= 0 && bound > 0.0)
@@ -262,40 +270,33 @@ static int refine(const contact_problem *in, real *force)
   return 0;
 }
 
-/* Forces by projection onto the friction cones, contact by contact (M. Jean, Comput. Methods Appl. Mech. Eng. 177,
- * 1999), from those given, then by Newton's method; role: whether a contact is closed, and its friction any (sticks) or
- * in its direction. */
-static void relax(const contact_problem *in, real *force)
+/* Solves for forces in the friction cones from those given: by Newton's method; where that ends, by proximal points
+ * (R. T. Rockafellar, SIAM J. Control Optim. 14, 1976), whose equations are well conditioned: a weight attracts forces
+ * to those before and decreases with each solution. */
+static int solve_cones(contact_problem *in, real *force)
 {
-  const contact_terms *const of = in->of;
-  const contact_mode *const role = in->role;
-  for (int moves = 1, sweeps = 0; moves && sweeps < CONTACT_SWEEPS; sweeps++) {
-    real before[CONTACT_ROWS];
-    memcpy(before, force, sizeof before);
-    moves = 0;
-    for (int k = 0; k < EVENT_CONTACTS; k++) {
-      const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
-      real diagonal = normal < 0 ? 0.0 : of->W[normal * (CONTACT_ROWS + 1)], oblique = diagonal, z[2];
-      int row[3];
-      for (int i = rows_of(k, row) - 1; i >= 0 && !role[k].closed; i--)
-        force[row[i]] = 0.0;
-      if (!role[k].closed)
-        continue;
-      for (int i = 0; i < slips && normal >= 0 && !role[k].sticks; i++)
-        oblique -= of->coefficient[3 * k] * role[k].direction[i] * of->W[normal * CONTACT_ROWS + slip + i];
-      if (normal >= 0)
-        force[normal] -= rate_after(of, in->right, force, normal) / (oblique > 0.0 ? oblique : diagonal);
-      if (normal >= 0)
-        force[normal] = fmax(force[normal], 0.0);
-      const real bound = friction_limit(of, k, in->limit[k], force);
-      const real across = free_friction(in, k, force, bound, trace_of(of, k), z);
-      for (int i = 0; i < slips; i++)
-        force[slip + i] = across * z[i] - bound * given_part(in, k) * role[k].direction[i];
-    }
-    for (int r = 0; r < CONTACT_ROWS; r++)
-      moves |= fabs(force[r] - before[r]) > DBL_EPSILON * fabs(force[r]);
+  real trial[CONTACT_ROWS];
+  int solved;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    int row[3];
+    for (int i = rows_of(k, row) - 1; i >= 0 && !in->role[k].closed; i--)
+      force[row[i]] = 0.0;
   }
-  refine(in, force);
+  memcpy(trial, force, sizeof trial);
+  solved = refine(in, trial);
+  in->weight = 1.0;
+  for (int pass = 0; pass < CONTACT_SWEEPS && !solved && in->weight > CONTACT_REGULAR; pass++) {
+    memcpy(in->near, force, sizeof trial);
+    memcpy(trial, force, sizeof trial);
+    const int is_near = refine(in, trial);
+    if (is_near)
+      memcpy(force, trial, sizeof trial);
+    in->weight *= is_near ? 0.1 : 3.0;
+  }
+  in->weight = 0.0;
+  if (solved)
+    memcpy(force, trial, sizeof trial);
+  return solved || refine(in, force);
 }
 
 /* Opens a contact, if other forces give the same rates of the imposed rows but not of all: the first of those that
@@ -430,7 +431,7 @@ static int relax_modes(contact_problem *in, real *force, contact_mode *best)
     memcpy(in->role, role, sizeof role);
     do { /* all contacts carry loads, else some do not */
       for (int changes = 0, changed = 1; changed && changes <= EVENT_CONTACTS; changes++) {
-        relax(in, force);
+        solve_cones(in, force);
         changed = modes_of_forces(in, trial, force, mode);
       }
       for (in->is_strict = 1; in->is_strict >= found; in->is_strict--)

@@ -105,8 +105,7 @@ static int forces_at_end(const event_step *step, const event_sample *at, const s
     for (int i = 0; i < 2; i++)
       right[slip + i] += end->rate[slip + i] / stage->part - after[slip + i];
   }
-  if (!refine(&in, force))
-    relax(&in, force);
+  solve_cones(&in, force);
   return OK;
 }
 
