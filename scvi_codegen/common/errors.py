@@ -110,7 +110,7 @@ class EventError(ScviCodegenError, ValueError):
     """An invalid event: an unknown symbol, a constant function, an unknown direction or a value that is not finite.
 
     Attributes:
-        trajectory: the :class:`Trajectory` before the failure of an event that changes the state, else ``None``.
+        trajectory: the :class:`Trajectory` before a failure of contacts, or of an event that changes the state.
     """
 
     trajectory: object | None = None
@@ -120,8 +120,8 @@ class EventWarning(UserWarning):
     """A run that ended where its events accumulate, or whose contacts have several modes or created energy."""
 
 
-class ContactError(ScviCodegenError, ValueError):
-    """Contacts without consistent forces or impulses, with a negative gap at the start, or too many."""
+class ContactError(EventError):
+    """Contacts without consistent forces or impulses, with a negative gap at the start or negative friction."""
 
 
 class PlotError(ScviCodegenError):

@@ -1,6 +1,7 @@
 """Contacts: constraints in some modes only, whose forces are oblique where they slide."""
 
 import pickle
+import re
 from dataclasses import replace
 from functools import cache
 from subprocess import check_output
@@ -696,6 +697,42 @@ def test_kinks_of_friction_coefficients_are_located() -> None:
     later = 0.7 - first
     assert run.q[-1, 0] == pytest.approx(0.1 + (1 - 3 * first) * later - later**2 / 4, abs=1e-14)
     assert [round(float(t), 12) for t in run.switches[0].t] == [round(first, 12)]
+
+
+@pytest.mark.parametrize("steps", [{"h": 0.05}, {"h": 0.7}, {}])
+@pytest.mark.parametrize(
+    ("dry", "height", "end"),
+    [
+        (sc.contact("y", slip="x_dot", friction="a - 0.2*t"), 0.0, 1.5),
+        (sc.contact("y", slip="x_dot", friction="a - 0.15*x"), 0.0, np.arctanh(0.15**0.5) / 0.15**0.5),
+        (sc.friction("x_dot", limit="a - 0.2*t"), 0.0, 1.5),
+        (sc.contact("y", slip="x_dot", friction="a - t"), 0.5, 1.0),
+        (sc.contact("y", restitution="a/2 - t/2"), 0.5, 1.0),
+    ],
+)
+def test_coefficients_that_become_negative_end_a_run(
+    dry: Any, height: float, end: float, steps: dict[str, Any]
+) -> None:
+    """Of a block with the velocity 2; one that is never negative, and another trajectory, go on."""
+    stepper = of(f"{PLANE} - y", "x y", [dry], "svi:2", a=0.3)
+    start: Any = {"t_end": 1.8, **steps}
+    with pytest.raises(sc.ContactError, match=r"contact 1 \((gap 'y'|slip 'x_dot')\).* negative.*max\(0") as caught:
+        stepper.integrate([0, height], velocity=[2, 0], **start)
+    (t,) = re.findall(r"t = ([\d.]+)", str(caught.value))
+    assert -1e-12 < float(t) - end < 0.25
+    assert caught.value.trajectory.t[-1] <= float(t)
+    both: Any = stepper.integrate_ensemble(
+        [[0, height]] * 2, velocity=[[2, 0]] * 2, parameters={"a": [0.3, 1.9]}, **start
+    )
+    assert [*both.status] == ["event failed", "ok"]
+
+
+@pytest.mark.parametrize("steps", [{"h": 0.05}, {"h": 0.7}, {}])
+def test_friction_that_vanishes_goes_on(steps: dict[str, Any]) -> None:
+    for friction, loss in (("max(0, 0.3 - 0.2*t)", 0.225), ("0.1*(1 - cos(5*t))", 0.2 - 0.02 * np.sin(10))):
+        block = of(f"{PLANE} - y", "x y", [sc.contact("y", slip="x_dot", friction=friction)], "svi:2")
+        run = block.integrate([0, 0], velocity=[2, 0], t_end=2.0, **steps)
+        assert run.velocity[-1, 0] == pytest.approx(2 - loss, abs=0.02 if steps.get("h") == 0.7 else 1e-4)
 
 
 @pytest.mark.parametrize("steps", [{"h": 0.07}, {"h": 0.2}, {}])

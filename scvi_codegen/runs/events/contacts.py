@@ -18,7 +18,8 @@ REFUSALS = {
     "correct the initial positions, the range of the joint, or the sign of the gap",
     3: "no impulses satisfy the law of impact with friction at t = {t:.17g}, contact {k}: reduce its friction",
     5: "contact {k} has an impossible coefficient at t = {t:.17g}, {value:.6g}: friction must not be negative, nor "
-    "static friction at rest less than that of sliding; restitution must be 0 to 1",
+    "static friction at rest less than that of sliding; restitution must be 0 to 1. Correct the formula or the number, "
+    "as with max(0, ..)",
     2: "neither forces nor impulses of the contacts are consistent at t = {t:.17g}: the contacts contradict each "
     "other, or none were found. Reduce friction, or use fewer contacts",
     6: "contact {k} pulls, or exceeds its friction, at t = {t:.17g} in each mode that was tried: limit the steps by "

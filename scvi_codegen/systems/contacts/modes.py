@@ -304,6 +304,7 @@ class _Binding:
             tangential = rows[0]
             normal_force = self._multiplier(normal) if normal is not None else self.sympy.S.One
             limit = normal_force * static_limit(item)
+            transitions |= self._watched(item.friction if of_gap else item.limit, closed)
             transitions["stops"] = (1 - held) * moving.ahead + held
             tau = [self._multiplier(row) for row in rows]
             if len(slips) == 1:
@@ -323,6 +324,12 @@ class _Binding:
         title = item.name or f"{'gap' if of_gap else 'slip'} '{' and '.join(map(self.system.text_of, shown))}'"
         law = getattr(item, "impacts", Impacts.SEQUENTIAL)
         return ContactRows(normal, tangential, len(slips), *names, title, functions, law, quantities)
+
+    def _watched(self, friction: Expr, closed: Symbol | None) -> dict[str, Expr]:
+        """Return a coefficient or limit that may become negative along a run, 1 while its contact is open."""
+        if friction.is_nonnegative or friction.free_symbols <= {*self.system.parameters}:
+            return {}
+        return {"drives": friction if closed is None else closed * friction + 1 - closed}
 
     def _slipping(self, number: int, slips: Sequence[Expr]) -> Slipping:
         """Return the direction of a slip w: a parameter d in a plane, else that of (ahead.w) w + start."""

@@ -461,15 +461,16 @@ static int refuse(const event_step *step, int reason, int k, real value)
   return NOT_CONVERGED;
 }
 
-/* Whether friction is negative, less static than sliding at rest, or a restitution is not in [0, 1]; that number. */
-static int is_impossible(const contact_terms *of, int k, real *number)
+/* Whether friction is negative, less static than sliding at rest, or the restitution of a contact that meets others is
+ * not in [0, 1]; that number. */
+static int is_impossible(const contact_terms *of, int k, int meets, real *number)
 {
   const real mu = of->coefficient[3 * k], held = of->coefficient[3 * k + 1], e = of->coefficient[3 * k + 2];
   const int slip = CONTACTS[k].tangential;
   const int rests = slip >= 0 && length_of(of->rate + slip, CONTACTS[k].slips) <= CONTACT_ROUNDING * of->speed[slip];
   const int is_friction = !(mu >= 0.0 && held >= 0.0) || (rests && held < (1.0 - CONTACT_ROUNDING) * mu);
   *number = is_friction ? fmin(mu, held) : e;
-  return is_friction || !(e >= 0.0 && e <= 1.0);
+  return is_friction || (meets && !(e >= 0.0 && e <= 1.0));
 }
 
 /* Whether the direction (ahead.w) w + start of a slip in space is that of its second term. */

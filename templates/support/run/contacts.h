@@ -91,8 +91,9 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
   contact_mode present[EVENT_CONTACTS];
   real force[CONTACT_ROWS];
   const real none[CONTACT_ROWS] = {0.0};
-  real before[CONTACT_ROWS];
+  real before[CONTACT_ROWS], impossible = 0.0;
   int closed[EVENT_CONTACTS], outside[EVENT_CONTACTS], approach = 0, first = 0;
+  step->report->t = at->t;
   TRY(terms_at(step, at, &of));
   memcpy(before, of.value, sizeof before);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
@@ -103,7 +104,10 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
     now->touches[k] |= closed[k];
     now->rests[k] = mode.sticks || (mode.closed && mode.held) || (now->stops[k] && stops_at(step, &of, k));
     now->rests[k] &= !now->begins[k];
-    approach |= is_met(&of, now, closed, k) && /* also one that just does not close yet */
+    const int meets = is_met(&of, now, closed, k);
+    if ((meets || (mode.closed && !now->leaves[k])) && is_impossible(&of, k, meets, &impossible))
+      return refuse(step, CONTACT_IMPOSSIBLE, k, impossible);
+    approach |= meets && /* also one that just does not close yet */
         of.rate[CONTACTS[k].normal] < (now->closes[k] ? 0.0 : -CONTACT_ROUNDING * of.speed[CONTACTS[k].normal]);
   }
   forces_at(at->t, at->q, at->p, step->own, present, force, step->workspace);
@@ -278,7 +282,7 @@ static int begin_contacts(const event_step *step, event_sample *at)
     const int row = CONTACTS[k].normal;
     if (row >= 0 && !of.absent[k] && of.value[row] < -CONTACT_PENETRATION * of.size[row])
       return refuse(step, CONTACT_PENETRATES, k, of.value[row]);
-    if (is_impossible(&of, k, &impossible))
+    if (is_impossible(&of, k, 1, &impossible))
       return refuse(step, CONTACT_IMPOSSIBLE, k, impossible);
     now.closes[k] = row >= 0 && !of.absent[k] && fabs(of.value[row]) <= CONTACT_ROUNDING * of.size[row];
   }
@@ -293,7 +297,7 @@ static int is_kept(int transition)
 }
 
 /* Effect of rounding on the gap or the normal force of a transition, by their terms: of forces f = -W^-1 b by those of
- * b, with W of the closed contacts and sticking slips. 0 for others. */
+ * b, with W of the closed contacts and sticking slips. 0 for others, INFINITY for those that are not searched. */
 static int rounding_of_contact(const event_step *step, int event, const event_sample *at, real *rounding)
 {
   const int kind = TRANSITION[event - FIRST_TRANSITION][1];
@@ -301,7 +305,7 @@ static int rounding_of_contact(const event_step *step, int event, const event_sa
   contact_terms of;
   contact_mode mode[EVENT_CONTACTS];
   real right[CONTACT_ROWS] = {0.0}, force[CONTACT_ROWS] = {0.0}, after[CONTACT_ROWS];
-  *rounding = 0.0;
+  *rounding = kind == CONTACT_DRIVES ? INFINITY : 0.0;
   if (kind != CONTACT_CLOSES && kind != CONTACT_LIFTS)
     return OK;
   TRY(terms_at(step, at, &of));
@@ -321,7 +325,7 @@ static int rounding_of_contact(const event_step *step, int event, const event_sa
 static int is_of_forces(int transition)
 {
   const int kind = TRANSITION[transition][1];
-  return kind != CONTACT_CLOSES && kind != CONTACT_LEAVES && kind != CONTACT_STOPS;
+  return kind != CONTACT_CLOSES && kind != CONTACT_LEAVES && kind != CONTACT_STOPS && kind != CONTACT_DRIVES;
 }
 
 /* Whether a gap that the rows of other contacts held at 0 has left it at a state, where they no longer determine it. */
@@ -392,6 +396,23 @@ static real least_gap(const event_step *step, const contact_terms *of, int trans
       (row < 0 ? 0.0 : CONTACT_ROUNDING * of->size[row]);
 }
 
+/* Fails if friction is negative by more than rounding at a node of a part of a step before its first transition. */
+static int check_friction(const event_step *step)
+{
+  for (int i = 0; i < TRANSITIONS; i++) {
+    const int e = EVENT_FIRST[FIRST_TRANSITION + i];
+    real largest = 0.0;
+    for (int j = 0; j <= EVENT_DEGREE && TRANSITION[i][1] == CONTACT_DRIVES; j++) {
+      const real value = values_at(step, j)[e];
+      largest = fmax(largest, fabs(value));
+      step->report->t = step->t + EVENT_NODES[j] * step->h;
+      if (value < -CONTACT_ROUNDING * largest && EVENT_NODES[j] <= step->horizon->fraction)
+        return refuse(step, CONTACT_IMPOSSIBLE, TRANSITION[i][0], value);
+    }
+  }
+  return OK;
+}
+
 /* Ends modes at the start of a step whose forces or gaps are negative there within rounding, and more at its end: their
  * functions have no zero. Of gaps in steps to whose end the present modes last. */
 static int end_modes_at_start(const event_step *step, const event_sample *right)
@@ -399,6 +420,7 @@ static int end_modes_at_start(const event_step *step, const event_sample *right)
   contact_terms of;
   const int lasts = isinf(step->horizon->fraction);
   int outside[EVENT_CONTACTS], has_terms = 0;
+  TRY(check_friction(step));
   for (int i = 0; i < TRANSITIONS; i++) {
     const int e = EVENT_FIRST[FIRST_TRANSITION + i];
     const real before = values_at(step, 0)[e], after = values_at(step, EVENT_DEGREE)[e];
