@@ -41,7 +41,9 @@ def actions_of_steps(
         binding.workspace(),
     )
     if status:
-        raise step_failure(status, report, step=int(report.steps), h=float(starts.h[report.steps]))
+        k = int(report.steps)
+        failures = stepper.failures_from(starts.q[k], starts.p[k], float(starts.t[k]), parameters)
+        raise step_failure(status, report, step=k, h=float(starts.h[k]), failures=failures)
     return actions, np.concatenate([q1, p1], axis=1)
 
 

@@ -75,7 +75,6 @@ STEPS_NEAR_REST = 16
 """Number of steps in which a force moves a state away from rest."""
 EVENT_NUMBERS = ("undefined", "inseparable", "accumulated", "through", "jammed", "sliding", "chatters")
 """Numbers of events, from 1 on, in the state of the search for events; 0 for none, < 0 for an undefined change."""
-FINITE = "Start at a state where L and its forces are finite"
 NO_OUTPUT, NO_PLAN = LARGEST_COUNT, Fixed(math.nan)
 """Output stride that saves no state; plan of a run that was not started."""
 
@@ -539,11 +538,7 @@ class Memory:
             remark = next((f". Cause: {cause}" for t in ends if (cause := negative_strength(stepper, t, *here))), "")
             remark = remark or remark_on_strengths(stepper, self.t, *here)
         remark = remark or singular_position(stepper, self._q, self.t, self._parameters)
-        failures = self.stepper.binding.failures
-        try:
-            stepper.energy(self.q, self.p, self.t, self._parameters)
-        except StateError as error:
-            failures = dict.fromkeys(failures, (f"at its start {error}", FINITE))
+        failures = stepper.failures_from(self.q, self.p, self.t, self._parameters)
         return step_failure(status, self._report, step=self.steps, h=self._step_size, remark=remark, failures=failures)
 
     def _taken(self, steps: int) -> int:

@@ -18,6 +18,9 @@ from scvi_codegen.runs.stepping.compiled_method import CompiledMethod
 
 PROBES = 8
 """Number of random momenta that estimate the size of the direction of a symmetry."""
+HUGE = 1e20
+"""Size of coordinates or momenta whose powers overflow, although the energy or its other terms may not."""
+FINITE = "Start at a state where L and its forces are finite"
 REPORTED = 1e-3
 """Largest relative difference between a velocity and the velocity recomputed from its momentum."""
 
@@ -25,8 +28,8 @@ REPORTED = 1e-3
 def undefined_energy(q: Array, p: Array) -> StateError:
     """Return the error of states whose energy is no number."""
     largest = max(float(abs(np.asarray(x)).max(initial=0.0)) for x in (q, p))
-    overflow = f"it overflows at coordinates or momenta of {largest:.0e}: choose larger units"
-    reason = overflow if 1e100 < largest < np.inf else "a value is infinite or NaN"
+    overflow = f"a term overflows at coordinates or momenta of {largest:.0e}: choose larger units"
+    reason = overflow if HUGE < largest < np.inf else "a value is infinite or NaN"
     return StateError(f"the energy of a state cannot be computed: {reason}")
 
 
@@ -113,6 +116,15 @@ class StateFunctions(CompiledMethod):
         if not self._states.is_one(q):
             return result
         return scalar(result[0])
+
+    def failures_from(self, q: Array, p: Array, t: float, parameters: Parameters) -> Mapping[str, tuple[str, str]]:
+        """Return cause and remedy of the failures of a step from a state; an energy that is undefined there is one."""
+        try:
+            if not np.isfinite(self.energy(q, p, t, parameters)):  # of arrays of run-time sizes
+                raise undefined_energy(q, p)
+        except StateError as error:
+            return dict.fromkeys(self.binding.failures, (f"at its start {error}", FINITE))
+        return self.binding.failures
 
     def _energy_parts(self, q: Array, p: Array, t: Array, parameters: Array) -> Array:
         """Return (n, 3) kinetic, potential and total energies of (n, m) states; parts of run-time sizes, else NaN."""
