@@ -18,7 +18,7 @@ from scvi_codegen.common.errors import MethodError
 from scvi_codegen.systems.checks.continuity import MOST_SURFACES, jump_message, jumps_of
 from scvi_codegen.systems.event import Kink, Refraction
 from scvi_codegen.systems.formulas.expressions import parts_of_type
-from scvi_codegen.systems.formulas.intermediates import parts
+from scvi_codegen.systems.formulas.intermediates import LONGEST_WRITTEN, parts, written_size
 from scvi_codegen.systems.formulas.kinks import Mode, steps_on_sides, switching_function, unit_step
 from scvi_codegen.systems.formulas.tables import without_tables
 
@@ -46,7 +46,7 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
     steps = sorted(parts_of_type(unit_step, *formulas), key=str)
     powers = _vanishing_powers(formulas)
     one_sided = _one_sided(formulas, powers)
-    located = [step for step in steps if _moves(step, system) and step not in one_sided]
+    located = [step for step in steps if _moves(step, system) and step not in one_sided and _is_written(step)]
     arguments = {switching_function(step.args[0])[0] for step in located}
     if not arguments or len(arguments) > MOST_KINKS or system.clock:
         return system, ()
@@ -116,6 +116,11 @@ def _replaced(value: Any, rules: dict[Expr, Expr]) -> Any:
 def _moves(step: Expr, system: MechanicalSystem) -> bool:
     """Return whether the argument of a step varies along motions."""
     return not step.free_symbols.issubset(system.parameters)
+
+
+def _is_written(step: Expr) -> bool:
+    """Return whether runs can store its function as text."""
+    return written_size(switching_function(step.args[0])[0]) <= LONGEST_WRITTEN
 
 
 def _vanishing_powers(formulas: Iterable[Expr]) -> dict[Expr, Expr]:

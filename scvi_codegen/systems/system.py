@@ -27,6 +27,7 @@ all arguments of ``from_text``, its class and the versions of this package and o
 from __future__ import annotations
 
 import json
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -365,9 +366,11 @@ class MechanicalSystem(Deferred, ABC):
     def kinks(self) -> tuple[str, ...]:
         """Functions as text at whose zeros the function, forces or constraints are not smooth, by unit_step or rint."""
         from scvi_codegen.systems.formulas.expressions import kinks_of
+        from scvi_codegen.systems.formulas.intermediates import LONGEST_WRITTEN
 
         kinks = kinks_of((self.lagrangian, *self.forces, *self.constraints))
-        return tuple(sorted(self.text_of(u) for u in kinks if not u.free_symbols <= {*self.parameters}))
+        moving = (u for u in kinks if not u.free_symbols <= {*self.parameters})
+        return tuple(sorted(self._shown(u, "a function", LONGEST_WRITTEN) for u in moving))
 
     @property
     def has_localised_forces(self) -> bool:
@@ -408,21 +411,28 @@ class MechanicalSystem(Deferred, ABC):
 
         return format_expression(inputs_by_name(written_out(formula), self.inputs))
 
+    def _shown(self, formula: Expr, name: str, longest: float) -> str:
+        """Return a formula as text, or its name and size if it has more than so many terms and factors."""
+        from scvi_codegen.systems.formulas.intermediates import written_size
+
+        size = written_size(formula)
+        return self.text_of(formula) if size <= longest else f"{name}, of {size} terms and factors"
+
     @property
     def constraint_texts(self) -> tuple[str, ...]:
         """Constraints g as text, without modes, in the names of the rotations and directions of a Lagrangian.
 
         Of those of contacts that would exceed ``LONGEST_SHOWN`` the text is a number.
         """
-        from scvi_codegen.systems.formulas.intermediates import LONGEST_SHOWN, written_size
+        from scvi_codegen.systems.formulas.intermediates import LONGEST_SHOWN
         from scvi_codegen.systems.formulas.kinks import without_modes
 
         formulas = (self.reduced or self).constraints
         first = len(formulas) - len(self.reactions)
-        sizes = [written_size(g) if k >= first else 0 for k, g in enumerate(formulas)]
+        longest = [LONGEST_SHOWN if k >= first else math.inf for k in range(len(formulas))]
         return tuple(
-            self.text_of(without_modes(g)) if size <= LONGEST_SHOWN else f"g_{k}, of {size} terms and factors"
-            for k, (g, size) in enumerate(zip(formulas, sizes, strict=True), 1)
+            self._shown(without_modes(g), f"g_{k}", most)
+            for k, (g, most) in enumerate(zip(formulas, longest, strict=True), 1)
         )
 
     def with_parameters(self, **values: float) -> Self:

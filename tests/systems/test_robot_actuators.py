@@ -87,10 +87,12 @@ INVALID = {
     '<general joint="x" actrange="0 1"/>': "has actrange, the range of an activation, which its dyntype does not have",
     '<position joint="x" timeconst="-1"/>': "the timeconst -1, which must not be < 0",
     '<position joint="x" dampratio="1" kv="1"/>': "has kv and dampratio: one is needed",
-    '<position joint="x" inheritrange="1"/>': "an inheritrange, which is read of joints with a range",
+    '<position joint="x" inheritrange="1"/>': "an inheritrange, which is read of parts with a range",
     '<velocity joint="x" dampratio="1"/>': "<velocity> 'velocity' has the unknown attribute 'dampratio'",
     '<damper joint="x" kv="-2" ctrlrange="0 1"/>': "the kv -2, which must not be < 0",
     '<damper joint="x" kv="2"/>': "<damper> 'damper' is limited to ctrlrange='0 0': the second number must be larger",
+    '<damper joint="x" kv="2" ctrlrange="0 1" ctrllimited="true"/>': "has the unknown attribute 'ctrllimited'",
+    '</actuator><compiler autolimits="false"/><actuator><motor joint="x" ctrlrange="0 1"/>': "without ctrllimited",
     '<damper joint="x" kv="2" ctrlrange="-1 1"/>': "has ctrlrange='-1 1', which must not be < 0",
 }
 """What MuJoCo refuses, too."""

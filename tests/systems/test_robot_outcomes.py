@@ -49,6 +49,9 @@ ON_FREE = (
 ELLIPSOIDS = (
     '<geom type="{}" size="{}" pos=".1 0 .2" euler=".3 .2 .1" fluidshape="ellipsoid" fluidcoef=".3 .2 1 .7 .6"/>'
 )
+TENDONS = """<tendon><fixed name="s" range="-.4 .7"><joint joint="x" coef=".5"/><joint joint="y" coef="-2"/></fixed>
+<spatial name="t" actuatorfrcrange="-.1 .2"><site site="w"/><site site="e"/></spatial></tendon><actuator>
+<position tendon="s" kp="2" gear="3" inheritrange=".8"/><velocity tendon="t" kv="3" gear="2"/></actuator>"""
 FLUID = {"option": 'density="9" viscosity="1"'}
 BALL, FREE = '<joint name="x" type="ball"/>', '<freejoint name="f"/>'
 READ = {
@@ -78,6 +81,11 @@ READ = {
     },
     "thrusts and torques of sites": {"a": FREE, "rest": ON_SITES.format('<motor site="s"')},
     "servos between sites": {"rest": ON_SITES.format('<position site="e" refsite="s" kp="2" kv="1"')},
+    "ranges of tendons": {"rest": TENDONS},
+    "servos of a site of a free body, whose range has a long formula": {
+        "a": FREE,
+        "rest": ON_SITES.format('<position site="e" kp="2" kv="1" forcerange="-3 2"'),
+    },
     "servos of a site in the world": {
         "a": BALL,
         "rest": ON_SITES.format('<position site="e" refsite="w" kp="2" kv="1" forcerange="-3 2"').replace(
@@ -166,6 +174,7 @@ def written(file: Any, **parts: str) -> Any:
 @pytest.mark.rotated
 @pytest.mark.parametrize("kind", READ)
 @pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.SystemDefinitionWarning")
+@pytest.mark.filterwarnings("ignore:the stepper of .* does not locate .*, of 20715 terms")
 def test_outcome_of_mjcf_that_is_read(kind, tmp_path):
     file = written(tmp_path / "robot.xml", **READ[kind])
     system = sc.LagrangianSystem.from_mjcf(file, actuators=True)

@@ -284,8 +284,9 @@ class _MujocoModel:
         low, high = map(float, element.vector(f"{prefix}range", inherited, (2,)))
         if limited == "true" and not low < high and element.text("type", "") != "ball":
             element.refuse(f"is limited to {prefix}range='{low:g} {high:g}': the second number must be larger")
-        automatic = low < high and element.settings.choice("autolimits", "true", "false") == "true"
-        return (low, high) if limited == "true" or (limited == "auto" and automatic) else None
+        if limited == "auto" and (low or high) and element.settings.choice("autolimits", "true", "false") == "false":
+            element.refuse(f"has {prefix}range without {prefix}limited, which autolimits='false' requires: give it")
+        return (low, high) if limited == "true" or (limited == "auto" and low < high) else None
 
     def actuators(self, tendons: Sequence[Tendon]) -> Iterator[Actuator]:
         """Yield the actuators, if they are read."""
@@ -320,7 +321,7 @@ class _MujocoModel:
                 element.refuse("has actrange, the range of an activation, which its dyntype does not have")
             unclamped = law == "integrator" or "clampctrl" in self.disabled
             controls = clamped(None if unclamped else controls, activations, 1.0)
-            ranges = controls, clamped(self.bounds(element, "force"), pull, gear[0])
+            ranges = controls, clamped(self.bounds(element, "force"), pull, 1.0)
             inverse = inverses.get(target[1]) if target[0] in JOINTED else None
             actuator = actuator_of(self.links, element, motion, gear[0], names, *ranges, inverse)
             names[actuator[0]] = actuator[1]
@@ -332,15 +333,17 @@ class _MujocoModel:
             yield actuator
 
     def inherited(self, element: Element, target: tuple[str, str]) -> Sequence[float]:
-        """Return the range of a control by ``inheritrange``, this multiple of that of the joint; (0, 0) without."""
+        """Return the range of a control by ``inheritrange``, this multiple of that of its part; (0, 0) without."""
         if not (share := element.number("inheritrange", 0, 0)) or not is_servo(element):
             return 0.0, 0.0
-        single = self.singles.get(label := target[1]) if target[0] in JOINTED else None
-        low, high = self.joints[label].vector("range", (0, 0), (2,)) if single else (0.0, 0.0)
+        parts = {(kind, label): self.joints[label] for kind in JOINTED for label in self.singles}
+        parts |= {("tendon", tendon.name): tendon for tendon in self.entries("tendon")}
+        low, high = parts[target].vector("range", (0, 0), (2,)) if target in parts else (0.0, 0.0)
         if low == high or element.has("ctrlrange") or element.has("actrange"):
-            element.refuse("has an inheritrange, which is read of joints with a range, without ctrlrange and actrange")
+            element.refuse("has an inheritrange, which is read of parts with a range, without ctrlrange and actrange")
         middle, radius = (low + high) / 2, (high - low) / 2 * share
-        unit = unit_of_angles(element) if single and single.kind == "hinge" else 1.0
+        turns = target[0] in JOINTED and self.singles[target[1]].kind == "hinge"
+        unit = unit_of_angles(element) if turns else 1.0
         return (middle - radius) * unit, (middle + radius) * unit
 
     def keyframes(self, controls: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -52,17 +52,17 @@ TENDON = Kind(
 )
 EQUALITY = Kind("name class active", f"{SOFTNESS} tendon1 tendon2 polycoef flex cell", defaults="equality")
 ACTUATORS = {
-    "general": "actdim actlimited actrange biasprm biastype dynprm dyntype gainprm gaintype inheritrange",
-    "motor": "",
-    "position": "dampratio inheritrange kp kv timeconst",
-    "velocity": "kv",
-    "intvelocity": "actlimited actrange dampratio inheritrange kp kv",
+    "general": "ctrllimited actdim actlimited actrange biasprm biastype dynprm dyntype gainprm gaintype inheritrange",
+    "motor": "ctrllimited",
+    "position": "ctrllimited dampratio inheritrange kp kv timeconst",
+    "velocity": "ctrllimited kv",
+    "intvelocity": "ctrllimited actlimited actrange dampratio inheritrange kp kv",
     "damper": "kv",
-    "cylinder": "area bias diameter timeconst",
+    "cylinder": "ctrllimited area bias diameter timeconst",
 }
 """Actuators that are read, with the attributes that not all of them have."""
 ACTUATED = (
-    "name class joint jointinparent tendon site refsite gear armature damping ctrllimited ctrlrange forcelimited "
+    "name class joint jointinparent tendon site refsite gear armature damping ctrlrange forcelimited "
     "forcerange delay group",
     "actearly body cranklength cranksite ffrange input interp lengthrange nsample slidersite user velrange",
 )
