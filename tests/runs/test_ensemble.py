@@ -122,6 +122,8 @@ class Case:
         runs, stepper = self.run(), stepper_of(self.system, self.method)
         assert runs.ok.tolist() == [j != self.failing for j in range(self.count)]
         energies, errors = runs.energy(), runs.momentum_errors()
+        conserved = stepper.interface.changes_energy is None
+        drifts = runs.energy_error() if conserved else np.empty(0)
         for j, (t, q, p, _, steps) in enumerate(runs.each()):
             arguments = of_one(self.arguments, j)
             if "t_eval" in arguments:
@@ -140,6 +142,8 @@ class Case:
                 energy = run.energy()
                 assert_allclose(energies[: len(t), j], energy, rtol=0, atol=20 * tolerance * np.abs(energy).max())
                 assert_allclose(errors[: len(t), j], run.momentum_errors(), rtol=0, atol=20 * tolerance)
+                if conserved:
+                    assert_allclose(drifts[j], run.energy_error(), rtol=0, atol=20 * tolerance)
             assert all(np.isnan(x[len(t) :, j]).all() for x in (runs.q, runs.p, energies))
 
 

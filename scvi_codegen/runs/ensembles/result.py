@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -126,7 +126,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
             return self._quantity(j)
         trajectory: type[Trajectory] = cast(Any, self.stepper)._trajectory_type
         j = checked_row(j, len(self))
-        parts = [(good, parameters) for k, good, parameters in self._with_parameters() if k == j]
+        parts = [(good, parameters) for _, good, parameters in self._with_parameters([j])]
         times, tau = self.times[:, j], self.tau
         if tau is not None and tau.ndim == 2:
             tau = tau[:, j]
@@ -221,6 +221,14 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
                 )
         return energies
 
+    def energy_error(self) -> Array:
+        """Return (k,) errors of the energy as of :meth:`Trajectory.energy_error`; NaN for undefined energies."""
+        energies, errors = np.asarray(self.energy(), float), np.full(len(self), np.nan)
+        for j in range(len(self)):
+            if (reached := self._reached(j)).any() and np.isfinite(energies[reached, j]).all():
+                errors[j] = self[j].energy_error()
+        return errors
+
     def action(self, *, cumulative: bool = False) -> Array:
         """Return (k,) actions, or (n, k) up to each state, as of :meth:`Trajectory.action`; NaN after a failure."""
         actions = np.full(self.q.shape[:2], np.nan) if self.actions is None else self.actions.copy()
@@ -258,12 +266,12 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
                 )
         return values, sizes
 
-    def _with_parameters(self) -> Iterator[tuple[int, NDArray[np.intp], Array]]:
-        """Yield trajectories with the rows of their states and the parameters in these rows."""
+    def _with_parameters(self, among: Container[int] | None = None) -> Iterator[tuple[int, NDArray[np.intp], Array]]:
+        """Yield trajectories, all or these, with the rows of their states and the parameters in these rows."""
+        among = range(len(self)) if among is None else among
         for rows, some, parameters in self.spans or ((slice(None), slice(None), self.parameters.__getitem__),):
             for j, values in zip(range(*some.indices(len(self))), parameters(some), strict=True):
-                good = np.flatnonzero(self._reached(j)[rows]) + (rows.start or 0)
-                if good.size:
+                if j in among and (good := np.flatnonzero(self._reached(j)[rows]) + (rows.start or 0)).size:
                     yield j, good, values
 
     def _with_modes(self) -> Iterator[tuple[int, NDArray[np.intp], Array]]:
