@@ -383,7 +383,7 @@ def test_entries() -> None:
         assert x[1].mp() == mp.mpf(1) + mp.mpf(3e-20)
 
 
-@pytest.mark.rotated
+@pytest.mark.second
 def test_explicit_ensembles() -> None:
     """Trajectories in SIMD lanes equal the formulas in 50 digits, whatever their neighbours are."""
     driven = lagrange("driven", "x y", "m*(x_dot**2 + 2*y_dot**2)/2 - k*cos(x - y) - x*y**2*sin(t)", m=1.0, k=1.0)

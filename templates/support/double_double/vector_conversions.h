@@ -5,6 +5,7 @@ static inline ddl ddl_of(dd x)
 }
 
 #define ddl_of_words(high_words, low_words) ((ddl){high_words, low_words})
+#define PARAMETER_OF_LANES(i) ddl_of_words(parameters[i], parameters[PARAMETERS + (i)])
 
 /* Lane j. */
 static inline double lane_of(const lanes *x, int j)

@@ -119,7 +119,8 @@ class _PairPrinter:
             return _Printed(f"w{load.index}", *self.temporaries[load.index])
         kind = self.kind_of(load.source)
         if load.source == "parameters":
-            return _Printed(f"PARAMETER{'_OF_LANES' if kind == 'ddl' else ''}({load.index})", kind)
+            parameter = "PARAMETER_OF_LANES" if kind == "ddl" else "PARAMETER"
+            return _Printed(f"{parameter}({load.index})", kind)
         return _Printed("t" if load.source == "t" else f"u[{load.index}]", kind)
 
 
