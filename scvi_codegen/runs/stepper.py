@@ -509,9 +509,11 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
                 precision.
             BuildError: with ``device`` if there is no GPU, or too little memory on it.
         """
-        schedule = h, steps, t_end, tolerance, absolute_tolerance, max_step, first_step, save_every, t, t_eval
-        others = parameters, options, error, device, observe, seed, metropolis
-        settings = EnsembleSettings(inputs, *schedule, *others, precision=precision)
+        times: Any = {"h": h, "steps": steps, "t_end": t_end, "save_every": save_every, "t": t, "t_eval": t_eval}
+        times |= {"max_step": max_step, "first_step": first_step, "options": options, "device": device}
+        errors: Any = {"tolerance": tolerance, "absolute_tolerance": absolute_tolerance, "error": error}
+        others: Any = {"inputs": inputs, "parameters": parameters, "seed": seed, "metropolis": metropolis}
+        settings = EnsembleSettings(**times, **errors, **others, observe=observe, precision=precision)
         runs = runs_of(self._ensemble(q, p, settings, velocity=velocity, action=action))
         runs.run(progress=progress, threads=threads)
         if isinstance(runs, DeviceRuns):

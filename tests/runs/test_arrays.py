@@ -100,6 +100,14 @@ def test_fixed_point_converges_up_to_the_documented_step_size(form: str, method:
     assert np.isnan(run.step_error) == (method == "svi:1" and form == "hamiltonian")
 
 
+@pytest.mark.second
+def test_energy_error_without_velocities() -> None:
+    """Also where the energy changes so much that its size is in question."""
+    system = sc.HamiltonianSystem.from_text("H", ["q[N]"], "sum(i in N, p_q[i]**2/2 + q[i]**4/4)")
+    run = sc.compile_stepper(system, "stoermer-verlet").integrate([1.0, 2.0], [0.0, 0.0], h=0.1, steps=3)
+    assert run.energy_error() == pytest.approx(np.ptp(run.energy()) / 4.25)
+
+
 def test_error_estimate_of_a_step_from_rest_at_the_origin() -> None:
     """Where nothing but a drive moves anything, it is a part of where that leads; it is held against the coefficient
     below the highest, which is far too much for so short a step."""

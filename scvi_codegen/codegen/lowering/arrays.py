@@ -13,7 +13,7 @@ SOLVERS = ("fixed-point", "newton")
 """Solvers of the equations of a step of an array system."""
 UNSUPPORTED = (
     " is not supported for array systems: use an SVI, a Runge-Kutta method of at most 32 points, or with a Lagrangian "
-    "Stoermer-Verlet or a composition"
+    "'stoermer-verlet' or a composition"
 )
 
 

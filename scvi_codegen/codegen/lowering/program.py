@@ -225,7 +225,7 @@ def lower_arrays(
     Their masses are constant, so that the tables of a method are the same for every coordinate: those of a system of
     one coordinate serve all. Arguments and errors are those of :func:`lower`.
     """
-    if system.momenta and (method.drifts_first or not method.implicit):  # H = T(p) + V(q, t) is split for known sizes
+    if system.momenta and (method.drifts_first or not method.implicit):  # with known sizes H is T(p) + V(q, t)
         raise SizesRequiredError(method.name + UNSUPPORTED)
     of_tables = one_coordinate(system)
     stages, velocities = discretise(of_tables, method), bool(system.velocities)
@@ -234,7 +234,7 @@ def lower_arrays(
     if sums == "plain" and splitting is None:
         raise MethodError(
             f"sums='plain' is not available for {method.name} with '{system.name}': its steps are not explicit. Leave "
-            "out sums=, or use Stoermer-Verlet or a composition without constraints"
+            "out sums=, or use 'stoermer-verlet' or a composition without constraints"
         )
     iterated = constrained is None and splitting is None
     fixed_point = iteration_of(of_tables, stages, velocities=velocities) if iterated else None

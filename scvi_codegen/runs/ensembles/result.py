@@ -266,12 +266,12 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
                 )
         return values, sizes
 
-    def _with_parameters(self, among: Container[int] | None = None) -> Iterator[tuple[int, NDArray[np.intp], Array]]:
+    def _with_parameters(self, these: Container[int] | None = None) -> Iterator[tuple[int, NDArray[np.intp], Array]]:
         """Yield trajectories, all or these, with the rows of their states and the parameters in these rows."""
-        among = range(len(self)) if among is None else among
+        these = range(len(self)) if these is None else these
         for rows, some, parameters in self.spans or ((slice(None), slice(None), self.parameters.__getitem__),):
             for j, values in zip(range(*some.indices(len(self))), parameters(some), strict=True):
-                if j in among and (good := np.flatnonzero(self._reached(j)[rows]) + (rows.start or 0)).size:
+                if j in these and (good := np.flatnonzero(self._reached(j)[rows]) + (rows.start or 0)).size:
                     yield j, good, values
 
     def _with_modes(self) -> Iterator[tuple[int, NDArray[np.intp], Array]]:

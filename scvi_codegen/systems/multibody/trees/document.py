@@ -28,7 +28,7 @@ XACRO = re.compile(r"\$[({]")
 NAMED = 5
 """Number of names that a warning lists of each kind of parts."""
 
-Thing = TypeVar("Thing")
+Part = TypeVar("Part")
 Place = tuple[str, int, str, Any]
 """Path of a document, number of a line, the nearest element around it that has a name, and the outermost element."""
 
@@ -111,11 +111,11 @@ class Element:
             self.refuse(f"has the {key} {value:g}, which must not be < {least:g}")
         return value
 
-    def among(self, key: str, kind: str, things: Mapping[str, Thing], default: str | None = None) -> Thing:
-        """Return the thing of a kind that an attribute names, of those that exist by name."""
-        if (name := self.text(key, default)) not in things:
-            self.refuse(f"names the {kind} '{name}', which does not exist{closest(name, things)}")
-        return things[name]
+    def named_by(self, key: str, kind: str, parts: Mapping[str, Part], default: str | None = None) -> Part:
+        """Return the part that an attribute names, of the parts of this kind by name."""
+        if (name := self.text(key, default)) not in parts:
+            self.refuse(f"names the {kind} '{name}', which does not exist{closest(name, parts)}")
+        return parts[name]
 
     def children(self, *tags: str) -> list[Element]:
         """Return the children with one of the tags, in order; all of them without tags."""

@@ -30,7 +30,7 @@ def inertia_of(geom: Element, computed: dict[Node, Inertia]) -> Inertia:
     """Return the inertia of the ``<mesh>`` of a geom, of density 1, whose name is by default that of its file."""
     meshes = [mesh for assets in geom.document.children("asset") for mesh in assets.children("mesh")]
     names = {mesh.node.get("name", Path(mesh.node.get("file", "")).stem): mesh for mesh in meshes}
-    mesh = geom.among("mesh", "mesh", names)
+    mesh = geom.named_by("mesh", "mesh", names)
     computed[mesh.node] = computed.get(mesh.node) or _inertia(mesh)
     return computed[mesh.node]
 

@@ -308,8 +308,8 @@ class _MujocoModel:
             if target[0] == "site":
                 motion = motion_of_sites(self.links, [self.place(element, key) for key in places], gear)
             else:
-                things: Mapping[str, Joint | Tendon] = paths if target[0] == "tendon" else joints
-                part = element.among(target[0], target[0].removesuffix("inparent"), things)
+                parts: Mapping[str, Joint | Tendon] = paths if target[0] == "tendon" else joints
+                part = element.named_by(target[0], target[0].removesuffix("inparent"), parts)
                 motion = motion_of(self.links, part, gear, target[0] == "jointinparent")
             pull = paths[target[1]].pull if target[0] == "tendon" else None
             if pull and targets.count(target) > 1:
@@ -386,7 +386,7 @@ class _MujocoModel:
     def place(self, element: Element, key: str) -> tuple[int, Pose]:
         """Return the place of the body, site or geom that an attribute names."""
         kind = key.rstrip("12").removeprefix("ref")
-        return element.among(key, kind, self.places[kind], "world" if key == "body2" else None)
+        return element.named_by(key, kind, self.places[kind], "world" if key == "body2" else None)
 
     def closure(self, equality: Element) -> Closure:
         """Return a connection or weld of two sites, or of bodies, by default as in the reference configuration."""
@@ -428,11 +428,11 @@ class _MujocoModel:
         """Return the length of the joint or tendon that an attribute names."""
         if key.startswith("joint"):
             return symbol(self.single(element, key).name)
-        return length_of(self.links, element.among(key, "tendon", paths))
+        return length_of(self.links, element.named_by(key, "tendon", paths))
 
     def single(self, element: Element, key: str) -> Joint:
         """Return the hinge or slide that an attribute names."""
-        return element.among(key, "hinge or slide", self.singles)
+        return element.named_by(key, "hinge or slide", self.singles)
 
     def joint(self, joint: Element, name: str, pose: Pose, frame: Pose, parent: int) -> Joint:
         """Return a joint of a link, whose pose is that in its parent."""

@@ -201,7 +201,7 @@ class Macros:
         parts = [part for world in worlds for part in world.children()]
         for kind in kinds:
             nodes = {node.get("name", ""): node for world in worlds for node in world.node.iter(kind)}
-            parts = [Element(macro.among(kind, kind, nodes), models[key].places)]
+            parts = [Element(macro.named_by(kind, kind, nodes), models[key].places)]
         return self.copies(macro, parts, (macro.text("prefix"), ""), set(), self.referring(models[key]))
 
     def referring(self, source: Element) -> list[tuple[str, bool, Element]]:
