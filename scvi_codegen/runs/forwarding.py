@@ -24,13 +24,6 @@ if TYPE_CHECKING:
     from scvi_codegen.interfaces.pictures.overview import Plots
 
 
-def largest_step(*arguments: Any, **settings: Any) -> float:
-    """Return :func:`scvi_codegen.analysis.advice.largest_step.largest_step`, the step of tau of runs with error=."""
-    from scvi_codegen.analysis.advice.largest_step import largest_step as largest
-
-    return largest(*arguments, **settings)
-
-
 class SteppersAnalysis:
     """Paths and chaos indicators, of steppers."""
 

@@ -24,7 +24,6 @@ and those inside functions, too."""
 ROOT = ("__init__", "__main__", "version")
 FORWARDING = {
     "runs.forwarding": {
-        "analysis.advice.largest_step",
         "analysis.chaos.ensemble",
         "analysis.chaos.indicators",
         "analysis.paths.path",

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import Akima1DInterpolator, BPoly, CubicSpline, PPoly, make_interp_spline
 
 import scvi_codegen as sc
-from scvi_codegen.analysis.advice.largest_step import largest_step
+from scvi_codegen.runs.driver.largest_step import largest_step
 
 KNOTS = np.array([0.0, 0.37, 0.9, 1.41, 2.05, 2.6])
 VALUES = np.array([0.0, 1.2, -0.7, 0.4, 1.9, -1.0])

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from sympy import Expr
 
 from scvi_codegen.analysis.advice.advice import advise
-from scvi_codegen.analysis.advice.largest_step import accuracy_message, largest_step
 from scvi_codegen.analysis.advice.tolerance_check import missed_tolerance
 from scvi_codegen.codegen.native.arguments import checked_number, checked_step, real_array
 from scvi_codegen.codegen.native.options import SolverOptions
@@ -23,6 +22,7 @@ from scvi_codegen.methods import Method, as_method, default_method
 from scvi_codegen.methods.controllers import SYMPLECTIC, with_time_transformation
 from scvi_codegen.runs.accuracy.global_error import checked_error
 from scvi_codegen.runs.compiler import compile_stepper, second_stepper
+from scvi_codegen.runs.driver.largest_step import accuracy_message, largest_step
 from scvi_codegen.runs.results.dense_output import times_of_run
 from scvi_codegen.runs.states.validation import Array, States
 from scvi_codegen.runs.stepper import Stepper

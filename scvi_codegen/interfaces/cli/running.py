@@ -8,7 +8,6 @@ from functools import partial
 
 import numpy as np
 
-from scvi_codegen.analysis.advice.largest_step import accuracy_message
 from scvi_codegen.analysis.advice.tolerance_check import SECOND_RUN, Known, known_digits
 from scvi_codegen.codegen.rendering.source import Interface
 from scvi_codegen.common.errors import AccuracyWarning, StateError, StepFailedError, warn
@@ -20,6 +19,7 @@ from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.runs.accuracy.local_error import TOLERABLE_ERROR
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runs.compiler import second_stepper
+from scvi_codegen.runs.driver.largest_step import accuracy_message
 from scvi_codegen.runs.driver.run import Run
 from scvi_codegen.runs.driver.segments import record_segments
 from scvi_codegen.runs.results.energy import EnergyAccount

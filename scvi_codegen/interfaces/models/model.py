@@ -388,7 +388,7 @@ class Model(TimeSpan):
             if result.precision != "double":
                 stepper = stepper._in_double_double or stepper
         elif h is None and self.has_time_transformation:
-            from scvi_codegen.analysis.advice.largest_step import largest_step  # imported here: not needed for reading
+            from scvi_codegen.runs.driver.largest_step import largest_step  # imported here: not needed for reading
 
             if self.system.inputs:
                 raise ModelFileError(

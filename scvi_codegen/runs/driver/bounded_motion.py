@@ -8,8 +8,8 @@ from typing import Any
 
 from scvi_codegen.common.errors import ScviCodegenError
 from scvi_codegen.runs.accuracy.size import neighbouring
+from scvi_codegen.runs.driver.largest_step import largest_step
 from scvi_codegen.runs.driver.segments import InputSegments
-from scvi_codegen.runs.forwarding import largest_step
 from scvi_codegen.runs.states.layout import InitialData
 from scvi_codegen.runs.states.validation import coordinate_shapes
 from scvi_codegen.runs.stepping.step_plan import ErrorControl
@@ -64,8 +64,8 @@ class BoundedMotion:
         """Return the largest step of tau for a tolerance."""
         *state, t, parameters, options = self.initial
         momenta = self.stepper._initial_momenta(*state, t, parameters)
-        along = {"t": t, "parameters": parameters, "options": options}
-        return largest_step(self.stepper, self.initial.q, momenta, self.end - t, tolerance, **along)
+        motion = self.stepper, self.initial.q, momenta, self.end - t
+        return largest_step(*motion, tolerance, t=t, parameters=parameters, options=options)
 
     def run(self, check: Callable[[int], None] | None, **steps: Any) -> Trajectory:
         """Return a run by these steps; ``check`` is called as ``progress`` is."""

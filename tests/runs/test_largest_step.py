@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.analysis.advice.largest_step import ALLOWED, REFINEMENTS, accuracy_message, largest_step
+from scvi_codegen.runs.driver.largest_step import ALLOWED, REFINEMENTS, accuracy_message, largest_step
 
 KEPLER = sc.problem("kepler").system
 START: Any = [1.9, 0.0], [0.0, (0.1 / 1.9) ** 0.5]
