@@ -42,7 +42,7 @@ def actions_of_steps(
     )
     if status:
         k = int(report.steps)
-        failures = stepper.failures_from(starts.q[k], starts.p[k], float(starts.t[k]), parameters)
+        failures = stepper._failures_from(starts.q[k], starts.p[k], float(starts.t[k]), parameters)
         raise step_failure(status, report, step=k, h=float(starts.h[k]), failures=failures)
     return actions, np.concatenate([q1, p1], axis=1)
 

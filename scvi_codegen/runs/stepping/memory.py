@@ -538,7 +538,7 @@ class Memory:
             remark = next((f". Cause: {cause}" for t in ends if (cause := negative_strength(stepper, t, *here))), "")
             remark = remark or remark_on_strengths(stepper, self.t, *here)
         remark = remark or singular_position(stepper, self._q, self.t, self._parameters)
-        failures = stepper.failures_from(self.q, self.p, self.t, self._parameters)
+        failures = stepper._failures_from(self.q, self.p, self.t, self._parameters)
         return step_failure(status, self._report, step=self.steps, h=self._step_size, remark=remark, failures=failures)
 
     def _taken(self, steps: int) -> int:

@@ -117,7 +117,7 @@ class StateFunctions(CompiledMethod):
             return result
         return scalar(result[0])
 
-    def failures_from(self, q: Array, p: Array, t: float, parameters: Parameters) -> Mapping[str, tuple[str, str]]:
+    def _failures_from(self, q: Array, p: Array, t: float, parameters: Parameters) -> Mapping[str, tuple[str, str]]:
         """Return cause and remedy of the failures of a step from a state; an energy that is undefined there is one."""
         try:
             if not np.isfinite(self.energy(q, p, t, parameters)):  # of arrays of run-time sizes
