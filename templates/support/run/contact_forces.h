@@ -1,30 +1,40 @@
 #include "contact_rows.h"
 
 /* Forces of contacts in their modes: W f = -b for the imposed rows of r'' = b + W f (contacts.h). */
-#define CONTACT_ROUNDING 1e-10 /* part of their size below which gaps, rates and forces count as 0 */
-/* The same for modes that a run keeps, whose slips have turned since: directions of those as slow as CONTACT_SLOW, from
- * which on they are kept, have rounding errors of DBL_EPSILON / CONTACT_SLOW (measured: .6 of that). */
+enum {
+  CONTACT_LEVELS = 3, /* of pivots, from 1 down to CONTACT_DEPENDENT */
+  CONTACT_PASSES = 4 /* over friction of dependent rows, by which it does not exceed its limit */
+};
+
+/* CONTACT_ROUNDING for modes that a run keeps, whose slips have turned since: directions of those as slow as
+ * CONTACT_SLOW, from which on they are kept, have rounding errors of DBL_EPSILON / CONTACT_SLOW (measured: .6). */
 #define CONTACT_OUTSIDE (4.0 * DBL_EPSILON / CONTACT_SLOW)
 #define CONTACT_HEAVIER 1e3 /* weight of friction beyond its limit: what remains of the excess is the square of 1/1e3 */
 #define CONTACT_DEPENDENT 1e-12 /* part of a column below which a pivot counts as 0 */
 
 /* Reduces the rows (A, b) by elimination with the pivots on the diagonal that are independent of those before but for
- * rounding, so that their rows and columns are. Returns the number of others. */
+ * rounding, so that their rows and columns are: of nearly dependent ones the small pivots come last. Returns the number
+ * of others. */
 static int eliminate(real (*line)[CONTACT_ROWS + 1], int count, int *independent)
 {
-  int others = 0;
-  for (int i = 0; i < count; i++) {
-    real size = 0.0;
-    for (int r = 0; r < count; r++)
-      size = fmax(size, fabs(line[r][i]));
-    independent[i] = fabs(line[i][i]) > CONTACT_DEPENDENT * size;
-    others += !independent[i];
-    for (int r = 0; r < count && independent[i]; r++) {
-      const real factor = line[r][i] / line[i][i];
-      for (int j = i; r != i && j <= count; j++)
-        line[r][j] -= factor * line[i][j];
+  int others = count;
+  memset(independent, 0, (size_t)count * sizeof *independent);
+  for (int level = 1; others > 0 && level <= CONTACT_LEVELS; level++)
+    for (int i = 0; i < count; i++) {
+      const real least = pow(CONTACT_DEPENDENT, level / (real)CONTACT_LEVELS);
+      real size = 0.0;
+      for (int r = 0; r < count && !independent[i]; r++)
+        size = fmax(size, fabs(line[r][i]));
+      if (independent[i] || !(fabs(line[i][i]) > least * size))
+        continue;
+      independent[i] = 1;
+      others--;
+      for (int r = 0; r < count; r++) {
+        const real factor = line[r][i] / line[i][i];
+        for (int j = 0; r != i && j <= count; j++)
+          line[r][j] -= j == count || !independent[j] || j == i ? factor * line[i][j] : 0.0;
+      }
     }
-  }
   return others;
 }
 
@@ -119,16 +129,16 @@ static int reduce_equations(const contact_terms *of, const contact_unknowns *in,
   return eliminate(matrix, in->count, independent);
 }
 
-/* Largest of some rates, and of those by moved forces, relative to the terms of right + W f, with the bounds
- * sqrt(W_rr W_jj) of abs(W_rj): entries that cancel, as of slips at rest with normal forces, have the rounding of
+/* Largest of some rates, and of those by moved forces, relative to the terms of right + W f, of given sizes at least,
+ * with the bounds sqrt(W_rr W_jj) of abs(W_rj): entries that cancel, as of slips at rest with normal forces, have the rounding of
  * these. */
 static real discord_of(const contact_terms *of, const real *rates, const real *moved, const real *right,
-    const real *force)
+    const real *sizes, const real *force)
 {
   const real still[CONTACT_ROWS] = {0.0};
   real largest = 0.0;
   for (int r = 0; r < CONTACT_ROWS; r++) {
-    real size = fabs(right[r]);
+    real size = fmax(fabs(right[r]), sizes[r]);
     for (int j = 0; j < CONTACT_ROWS; j++)
       size += sqrt(of->W[r * (CONTACT_ROWS + 1)] * of->W[j * (CONTACT_ROWS + 1)]) * fabs(force[j]);
     largest = fmax(largest, fmax(fabs(rates[r]), fabs(rate_after(of, still, moved, r))) / fmax(size, DBL_MIN));
@@ -137,10 +147,10 @@ static real discord_of(const contact_terms *of, const real *rates, const real *m
 }
 
 /* Solves for the forces of the rows in given modes with after = right + W f = 0 in imposed rows, those of least norm,
- * friction relative to its limit, if these are dependent; after two passes friction beyond its limit weighs more.
- * Returns by how much they contradict each other, or such forces differ in the rates, relative to these. If `imposed`
- * is not NULL, it becomes 1 for rows to impose, which are independent. */
-static real solve_in_passes(const contact_terms *of, const contact_mode *mode, const real *right, int passes,
+ * friction relative to its limit, if these are dependent; what exceeds it weighs more in the later passes. Returns by
+ * how much they contradict each other, or such forces differ in the rates, relative to these, whose terms have given
+ * sizes at least. If `imposed` is not NULL, it becomes 1 for rows to impose, which are independent. */
+static real solve_rows(const contact_terms *of, const contact_mode *mode, const real *right, const real *sizes,
     real *force, real *after, int *imposed)
 {
   contact_unknowns in;
@@ -154,7 +164,7 @@ static real solve_in_passes(const contact_terms *of, const contact_mode *mode, c
     least[i] = x[i] = independent[i] ? matrix[i][count] / matrix[i][i] : 0.0;
     weight[i] = 1.0;
   }
-  for (int pass = 0; pass < passes && dependent; pass++) {
+  for (int pass = 0; pass < CONTACT_PASSES && dependent; pass++) {
     reduce_norm(matrix, count, independent, weight, least);
     for (int i = 0; i < count; i++) {
       moved[in.row[i]] = least[i];
@@ -181,13 +191,14 @@ static real solve_in_passes(const contact_terms *of, const contact_mode *mode, c
     imposed[in.row[i]] = independent[i];
   for (int i = 0; i < count; i++)
     left[in.row[i]] = after[in.row[i]];
-  return dependent ? discord_of(of, left, moved, right, force) : 0.0;
+  return dependent ? discord_of(of, left, moved, right, sizes, force) : 0.0;
 }
 
+/* The same for second rates. */
 static real solve_contacts(const contact_terms *of, const contact_mode *mode, const real *right, real *force,
     real *after, int *imposed)
 {
-  return solve_in_passes(of, mode, right, 2, force, after, imposed);
+  return solve_rows(of, mode, right, of->second_terms, force, after, imposed);
 }
 
 /* Present modes, with the directions of slips at a state, in space of (ahead.w) w + start. */

@@ -155,7 +155,7 @@ static int settle(const event_step *step, event_sample *at, contact_terms *of, c
     if (CONTACTS[k].normal >= 0 && !now->touches[k])
       mode[k] = CONTACT_IS_OPEN;
   }
-  const real discord = solve_contacts(of, mode, of->rate, impulse, after, NULL);
+  const real discord = solve_rows(of, mode, of->rate, of->rate, impulse, after, NULL);
   return discord > CONTACT_ROUNDING ? OK : push(step, at, of, impulse);
 }
 

@@ -68,7 +68,8 @@ static real rounding_at_row(const contact_problem *in, const real *after, int ro
 static int is_consistent(const contact_problem *in, const contact_mode *mode, real *force, real *after)
 {
   const contact_terms *const of = in->of;
-  if (solve_in_passes(of, mode, in->right, in->scale ? 4 : 2, force, after, NULL) > CONTACT_ROUNDING)
+  const real *const sizes = in->scale ? of->speed : of->second_terms;
+  if (solve_rows(of, mode, in->right, sizes, force, after, NULL) > CONTACT_ROUNDING)
     return 0;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
@@ -234,10 +235,12 @@ static real state_projections(const contact_problem *in, const real *force, real
 }
 
 /* Solves for forces in the friction cones by Newton's method from those given, as far as residuals decrease. Returns
- * whether they are exact. */
+ * whether these are 0 within rounding. */
 static int refine(const contact_problem *in, real *force)
 {
+  const real *const sizes = in->scale ? in->scale : in->of->second_terms;
   real line[CONTACT_ROWS][CONTACT_ROWS + 1], step[CONTACT_ROWS], trial[CONTACT_ROWS], size = DBL_MIN, part = 1.0;
+  real rounding = 0.0;
   int row[CONTACT_ROWS], independent[CONTACT_ROWS], count = 0;
   for (int k = 0; k < EVENT_CONTACTS; k++)
     count += in->role[k].closed ? rows_of(k, row + count) : 0;
@@ -251,6 +254,7 @@ static int refine(const contact_problem *in, real *force)
       matrix[i][i] += CONTACT_REGULAR; /* for dependent rows */
       matrix[i][count] = line[row[i]][CONTACT_ROWS];
       size = fmax(size, fabs(force[row[i]]));
+      rounding = fmax(rounding, CONTACT_ROUNDING * sizes[row[i]] / in->of->W[row[i] * (CONTACT_ROWS + 1)]);
     }
     if (sqrt(sum) <= CONTACT_EXACT * size)
       return 1;
@@ -267,7 +271,7 @@ static int refine(const contact_problem *in, real *force)
       memcpy(force, trial, sizeof trial);
     sum = next;
   }
-  return 0;
+  return sqrt(sum) <= rounding;
 }
 
 /* Solves for forces in the friction cones from those given: by Newton's method; where that ends, by proximal points
@@ -316,7 +320,7 @@ static int unload(contact_problem *in, const contact_mode *mode, const real *for
     for (int i = 0; i < unknown.count && !independent[d]; i++)
       for (int r = 0; r < CONTACT_ROWS; r++)
         moved[r] += unknown.column[i][r] * (independent[i] ? -line[i][d] / line[i][i] : i == d);
-    for (int k = 0; k < EVENT_CONTACTS && discord_of(of, still, moved, still, moved) > CONTACT_ROUNDING; k++) {
+    for (int k = 0; k < EVENT_CONTACTS && discord_of(of, still, moved, still, still, moved) > CONTACT_ROUNDING; k++) {
       const int normal = CONTACTS[k].normal;
       if (normal < 0 || !mode[k].closed || !(fabs(force[normal]) < least * fabs(moved[normal])))
         continue;

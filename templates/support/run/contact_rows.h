@@ -33,6 +33,10 @@ enum {
   CONTACT_STUCK = 4 /* sticks by others */
 };
 
+#define CONTACT_ROUNDING 1e-10 /* part of their size below which gaps, rates and forces count as 0 */
+/* Second rate whose change of a slip in a step counts as 0, relative to its fastest, and to CONTACT_ROUNDING of terms. */
+#define CONTACT_AT_REST (DBL_EPSILON / CONTACT_ROUNDING)
+
 static const real AT_REST[2] = {0.0, 0.0};
 static const contact_mode CONTACT_IS_OPEN = {0, 0, 0, {0.0, 0.0}};
 static const contact_mode CONTACT_STICKS = {1, 3, 0, {0.0, 0.0}};
@@ -43,7 +47,8 @@ static const contact_mode CONTACT_SLIPS = {1, 0, 0, {0.0, 0.0}};
  * values, and rates at rest. */
 typedef struct {
   real numbers[CONTACT_NUMBERS];
-  const real *value, *rate, *second, *terms, *second_terms, *W, *G, *coefficient;
+  const real *value, *rate, *second, *terms, *W, *G, *coefficient;
+  real *second_terms;
   real size[CONTACT_ROWS], speed[CONTACT_ROWS], rounding[CONTACT_ROWS], drift[CONTACT_ROWS];
   int absent[EVENT_CONTACTS]; /* whether a condition of the contact fails, or the state is behind it */
 } contact_terms;
@@ -139,7 +144,7 @@ static int rows_at(real t, const real *q, const real *p, const real *parameters,
   of->rate = of->value + CONTACT_ROWS;
   of->second = of->rate + CONTACT_ROWS;
   of->terms = of->second + CONTACT_ROWS;
-  of->second_terms = of->terms + CONTACT_ROWS;
+  of->second_terms = of->numbers + 4 * CONTACT_ROWS;
   of->W = of->second_terms + CONTACT_ROWS;
   of->G = of->W + CONTACT_ROWS * CONTACT_ROWS;
   of->coefficient = of->G + CONTACT_ROWS * M;
@@ -173,6 +178,9 @@ static int terms_at(const event_step *step, const event_sample *at, contact_term
     of->rounding[r] = DBL_EPSILON * (fmax(by_position, of->terms[r]) + fabs(at->t) * of->drift[r]);
     of->size[r] = fmax(by_position, of->terms[r]) + of->speed[r] * duration;
   }
+  for (int k = 0; k < EVENT_CONTACTS && duration > 0.0; k++) /* rounding of bodies at rest without forces */
+    for (int i = 0; i < CONTACTS[k].slips; i++)
+      of->second_terms[CONTACTS[k].tangential + i] += CONTACT_AT_REST * step->watch->fastest[k] / duration;
   memset(of->absent, 0, sizeof of->absent);
   for (int i = 0; i < TRANSITIONS; i++) {
     const int event = FIRST_TRANSITION + i, k = TRANSITION[i][0], row = CONTACTS[k].normal;
