@@ -434,6 +434,22 @@ def test_a_slow_slip_in_space_brakes_to_its_stop() -> None:
 
 
 @pytest.mark.second
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_body_on_points_with_friction_alone_comes_to_rest(count: int) -> None:
+    """It spins until t = I w/(n F r); then accelerations are rounding, and rows depend on each other."""
+    turns = [f"(a + {2 * np.pi * k / count})" for k in range(count)]
+    slips = [[f"x_dot - a_dot*sin{turn}/2", f"y_dot + a_dot*cos{turn}/2"] for turn in turns]
+    body = sc.LagrangianSystem.from_text("body", ["x", "y", "a"], "(x_dot**2 + y_dot**2 + a_dot**2/10)/2")
+    stepper = sc.compile_stepper(body, "svi:2", contacts=[sc.friction(slip, limit=0.6) for slip in slips])
+    for rate in np.random.default_rng(0).uniform(1, 9, 4):
+        run = stepper.integrate([0.0, 0.0, 0.0], velocity=[0.0, 0.0, rate], h=0.01, t_end=3.0)
+        end = 0.1 * rate / (count * 0.6 * 0.5)
+        assert run.contact_modes[-1] == (pytest.approx(end, rel=1e-9), ("stick",) * count)
+        assert run.q[-1] == pytest.approx([0.0, 0.0, end * rate / 2], abs=1e-9)
+        assert np.abs(run.velocity[-1]).max() < 1e-15
+
+
+@pytest.mark.second
 def test_slip_in_space_that_begins_after_a_long_step_has_any_unit_of_time() -> None:
     """The step during which a belt carries a puck is no measure of the slip, nor is the unit."""
     belt = sc.contact("z", slip=["x_dot - u", "y_dot - u/3"], friction=0.13, static_friction=0.2)

@@ -378,7 +378,7 @@ def test_contacts_that_contradict_each_other_are_refused_or_slip() -> None:
     run = own.integrate([0], velocity=[0], h=0.1, t_end=1)
     assert (run.contact_modes, run.q[-1, 0]) == ([(0.0, ("slip", "stick"))], pytest.approx(0.05, abs=1e-14))
     assert run.contact_forces()[-1, :, 1] == pytest.approx([-1, 1.1])
-    solved = "in->scale ? 4 : 2, force, after, NULL)"
+    solved = "in->right, sizes, force, after, NULL)"
     unnoticed = planted(own, f"{solved} > CONTACT_ROUNDING", f"{solved} < 0")
     with pytest.raises(sc.ContactError, match=r"at t = 0: the contacts contradict each other"):
         unnoticed.integrate([0], velocity=[0], h=0.1, t_end=1)

@@ -281,11 +281,6 @@ static int solve_cones(contact_problem *in, real *force)
 {
   real trial[CONTACT_ROWS];
   int solved;
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    int row[3];
-    for (int i = rows_of(k, row) - 1; i >= 0 && !in->role[k].closed; i--)
-      force[row[i]] = 0.0;
-  }
   memcpy(trial, force, sizeof trial);
   solved = refine(in, trial);
   in->weight = 1.0;
@@ -301,6 +296,42 @@ static int solve_cones(contact_problem *in, real *force)
   if (solved)
     memcpy(force, trial, sizeof trial);
   return solved || refine(in, force);
+}
+
+/* Forces by projection onto the friction cones, contact by contact (M. Jean, Comput. Methods Appl. Mech. Eng. 177,
+ * 1999), from those given, which keeps equal directions of friction, then by Newton's method; role: whether a contact is
+ * closed, and its friction any (sticks) or in its direction. */
+static void relax(contact_problem *in, real *force)
+{
+  const contact_terms *const of = in->of;
+  const contact_mode *const role = in->role;
+  for (int moves = 1, sweeps = 0; moves && sweeps < CONTACT_SWEEPS; sweeps++) {
+    real before[CONTACT_ROWS];
+    memcpy(before, force, sizeof before);
+    moves = 0;
+    for (int k = 0; k < EVENT_CONTACTS; k++) {
+      const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
+      real diagonal = normal < 0 ? 0.0 : of->W[normal * (CONTACT_ROWS + 1)], oblique = diagonal, z[2];
+      int row[3];
+      for (int i = rows_of(k, row) - 1; i >= 0 && !role[k].closed; i--)
+        force[row[i]] = 0.0;
+      if (!role[k].closed)
+        continue;
+      for (int i = 0; i < slips && normal >= 0 && !role[k].sticks; i++)
+        oblique -= of->coefficient[3 * k] * role[k].direction[i] * of->W[normal * CONTACT_ROWS + slip + i];
+      if (normal >= 0)
+        force[normal] -= rate_after(of, in->right, force, normal) / (oblique > 0.0 ? oblique : diagonal);
+      if (normal >= 0)
+        force[normal] = fmax(force[normal], 0.0);
+      const real bound = friction_limit(of, k, in->limit[k], force);
+      const real across = free_friction(in, k, force, bound, trace_of(of, k), z);
+      for (int i = 0; i < slips; i++)
+        force[slip + i] = across * z[i] - bound * given_part(in, k) * role[k].direction[i];
+    }
+    for (int r = 0; r < CONTACT_ROWS; r++)
+      moves |= fabs(force[r] - before[r]) > DBL_EPSILON * fabs(force[r]);
+  }
+  solve_cones(in, force);
 }
 
 /* Opens a contact, if other forces give the same rates of the imposed rows but not of all: the first of those that
@@ -435,7 +466,7 @@ static int relax_modes(contact_problem *in, real *force, contact_mode *best)
     memcpy(in->role, role, sizeof role);
     do { /* all contacts carry loads, else some do not */
       for (int changes = 0, changed = 1; changed && changes <= EVENT_CONTACTS; changes++) {
-        solve_cones(in, force);
+        relax(in, force);
         changed = modes_of_forces(in, trial, force, mode);
       }
       for (in->is_strict = 1; in->is_strict >= found; in->is_strict--)
