@@ -414,6 +414,40 @@ def test_a_quadruped_in_space_bounces_on_its_feet_and_comes_to_rest(abducts, t_e
     assert 0.33 < run.q[-1, names.index("z_f")] < 0.37
 
 
+SOLES = "".join(
+    f'<geom class="foot" pos="{x} {y} -.03" size=".025" mass=".05"/>' for x in (-0.06, 0.12) for y in (-0.04, 0.04)
+)
+BIPED = "".join(f"""<body pos="0 {y} 0"><joint name="h{i}" axis="0 1 0" range="-60 60"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.4" size=".04" mass="2"/>
+<body pos="0 0 -.42"><joint name="a{i}" axis="0 1 0" range="-40 40"/>
+<geom type="box" size=".1 .04 .02" mass=".6"/>{SOLES}</body></body>
+""" for i, y in enumerate((-0.15, 0.15)))  # fmt: skip
+BIPED = f"""<mujoco><default><geom contype="0" conaffinity="0"/><joint damping="2" stiffness="30" armature=".005"/>
+<default class="foot"><geom type="sphere" contype="1"/></default></default><worldbody>
+<geom type="plane" size="5 5 1" conaffinity="1" friction="1"/><body><freejoint name="f"/>
+<geom type="box" size=".1 .2 .1" mass="6"/>{BIPED}</body></worldbody></mujoco>"""
+
+
+@pytest.mark.filterwarnings("ignore:a transition has several motions")
+@pytest.mark.rotated
+def test_a_biped_in_space_falls_on_soles_whose_rows_nearly_depend_on_each_other(tmp_path):
+    """Friction along the edge of a sole is any of several forces, but for its angle with the floor."""
+    system = read(tmp_path, BIPED, **ALL, restitution=0.2)
+    stepper, names = sc.compile_stepper(system, "svi:2", flags=("-O1",)), [x.name for x in system.coordinates]
+    gaps = [RotationNames(system.rotations).in_coordinates(contact.gap) for contact in system.contacts[-8:]]
+    feet = Tape(gaps, system.coordinates)
+    for seed in (1, 5):
+        random = np.random.default_rng(seed)
+        start = dict.fromkeys(names[:-4], 0.0) | {"z_f": 0.7, "R_f": [1.0, *random.normal(scale=0.15, size=3)]}
+        velocity = {name: 0.3 * random.normal() for name in names[:-4]} | {"omega_f": 0.7 * random.normal(size=3)}
+        start["R_f"] /= np.linalg.norm(start["R_f"])
+        run = stepper.integrate(start, velocity=velocity, h=0.005, t_end=0.78)
+        energy = run.energy()
+        assert np.diff(energy).max() < 1e-10 * np.ptp(energy)
+        assert min(min(map(float, feet(q.tolist()))) for q in run.q[::5]) > -1e-9
+        assert len(run.contact_modes) > 20
+
+
 LEGS = """<body><joint name="z" type="slide" axis="0 0 1"/><joint name="x" type="slide" axis="1 0 0"/>
 <joint name="p" axis="0 1 0"/>{}<body pos="0 0 {}"><joint name="hip" axis="0 1 0" range="-150 0"/>{}
 <body pos="0 0 {}"><joint name="knee" axis="0 1 0" range="-150 0"/>{}</body></body></body>"""

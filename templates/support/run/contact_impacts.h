@@ -15,7 +15,6 @@ enum {
 };
 
 #define CONTACT_SLIGHT 1e-4 /* part of the rates of bodies of which those of an impact are at least */
-#define CONTACT_LOWEST 16.0 /* roundings of a gap below which a rebound ends */
 #define CONTACT_RESIDUALS 16.0 /* residuals of its located zero below which a rebound ends */
 #define CONTACT_AHEAD 1e-5 /* time step of an impact without collision, relative to that in which a slip would stop */
 #define CONTACT_GAIN 1e-9 /* part of the work of an impact by which energy may grow */

@@ -5,6 +5,7 @@
  * parts/contacts.c.jinja. */
 #define CONTACT_SLOW 1e-6 /* part of its size below which the direction of a slip in space is kept */
 #define CONTACT_PENETRATION 1e-9 /* part of its size by which a gap may be negative at a start */
+#define CONTACT_LOWEST 16.0 /* roundings of a gap below which a rebound ends */
 #define CONTACT_FAST 1e3 /* speed relative to that of a slip whose direction is kept */
 
 /* What the modes of contacts do not allow, in watch->refusal. */
@@ -193,4 +194,17 @@ static int terms_at(const event_step *step, const event_sample *at, contact_term
     of->absent[k] = !exists || of->value[row] < -CONTACT_PENETRATION * of->size[row];
   }
   return OK;
+}
+
+/* Time in which accelerations displace gaps by as much as rounding does, sqrt(2 u r / |r''|), by the terms of both and
+ * with the roundings of CONTACT_LOWEST: those of shorter parts of a step change momenta by more than forces. */
+static real time_of_rounding(const contact_terms *of)
+{
+  real least = 0.0;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int row = CONTACTS[k].normal;
+    if (row >= 0 && of->second_terms[row] > 0.0)
+      least = fmax(least, sqrt(2.0 * CONTACT_LOWEST * of->rounding[row] / of->second_terms[row]));
+  }
+  return least;
 }

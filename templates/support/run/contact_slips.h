@@ -6,6 +6,7 @@ enum {
 };
 
 #define CONTACT_BRAKES 0.25 /* longest parts relative to the time to its stop .. */
+#define CONTACT_LEAST 4.0 /* .. and of those, relative to that in which rounding displaces gaps .. */
 #define CONTACT_GROWS 0.2 /* .. to that from its beginning .. */
 #define CONTACT_RELAXES 2.0 /* .. and to the relaxation of its direction, for which iterations on stages converge */
 #define CONTACT_STIFF 0.25 /* relaxation relative to a part and those times, below which it is not followed */
@@ -262,7 +263,8 @@ static slip_pace pace_of(const event_step *step, const contact_terms *of, int k,
   pace.by_rate = (stops ? CONTACT_BRAKES : CONTACT_GROWS) * fmax(size, CONTACT_SLOW * *fastest) / fabs(rate);
   pace.relaxes = CONTACT_RELAXES * size / by_friction;
   pace.is_stiff = CONTACT_RELAXES * rate <= CONTACT_STIFF * CONTACT_GROWS * by_friction;
-  pace.keeps = size <= CONTACT_SLOW * *fastest && (rate < -CONTACT_BRAKED * by_friction || !pace.is_stiff);
+  const int is_slow = size <= CONTACT_SLOW * *fastest || (stops && pace.by_rate < CONTACT_LEAST * time_of_rounding(of));
+  pace.keeps = is_slow && (rate < -CONTACT_BRAKED * by_friction || !pace.is_stiff);
   pace.renews = pace.keeps != kept || (!kept && start[2] * w[0] + start[3] * w[1] < CONTACT_TURN * size);
   return pace;
 }
