@@ -255,7 +255,7 @@ class TestHonesty:
         ends = [stepper.integrate(q, p, h=advice.h / n, steps=n * advice.steps).q[-1, 0] for n in (1, 4)]
         assert abs(ends[0] - ends[1]) <= 4e-9 * max(*np.abs(q), *np.abs(p))
 
-    @pytest.mark.quick
+    @pytest.mark.tiers(4)
     @pytest.mark.parametrize(
         ("changes", "message"),
         [

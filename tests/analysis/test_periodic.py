@@ -166,6 +166,7 @@ def test_adaptive_steps_reach_the_bound(galaxy, restricted):
     assert_allclose(adaptive.monodromy, adaptive.run().tangent()[-1], rtol=0, atol=1e-9)
 
 
+@pytest.mark.second
 def test_galactic_orbits_are_found_by_energy(galaxy):
     """The stable one at y = 0.3 or so, the unstable one below; and turned by a third, as the potential may be."""
     energy = 1 / 8

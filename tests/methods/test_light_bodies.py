@@ -71,6 +71,7 @@ def test_rods_in_line_throw_a_light_body():
         assert m < 1e-5 or np.abs(run.q[-1] - exact.view(float)).max() < 1e-12
 
 
+@pytest.mark.second
 def test_masses_of_zero_that_nothing_replaces_are_refused_by_name(pendulum):
     with pytest.raises(sc.StateError, match=r"x, y, a have no kinetic energy there.*with_parameters\(m=0\)"):
         pendulum[0].integrate(POSITION, [0.0] * 5, parameters={"m": 0.0, "M": 1.0}, h=0.005, steps=10)
@@ -128,6 +129,7 @@ def test_a_massless_rod_in_two_words():
     assert np.abs(run.constraint_values()).max() < 1e-30
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("power", [-40, 3, 50])
 def test_masses_times_powers_of_two_give_equal_bits(pendulum, power):
     """But where Newton's method chooses other pivots."""

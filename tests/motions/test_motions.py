@@ -18,7 +18,7 @@ CASES = [
 
 DEAR = ("two_words", "packages", "hessians")
 """Properties that compile several integrators, or much code, for several seconds: always rotated."""
-LATER = ("work_and_impulses", "flows")
+LATER = ("work_and_impulses", "flows", "events", "changes", "restarts", "controlled", "single_precision")
 """Properties of the second tier."""
 
 pytestmark = pytest.mark.long

@@ -373,6 +373,7 @@ def test_systems_without_an_invariant_measure_are_refused(arguments, message):
         sc.LagrangianSystem.from_text("well", **{**WELL, **arguments})
 
 
+@pytest.mark.second
 def test_what_a_heat_bath_excludes_is_refused_by_name(tmp_path):
     well = compiled("svi:2", "well", **WELL)
     run = well.integrate([1.0], [0.0], h=0.1, steps=3)

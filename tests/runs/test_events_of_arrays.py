@@ -84,7 +84,7 @@ def test_impacts_pass_through_discs_that_touch(gas):
     assert np.ptp(run.events[0].t) == 0.0
 
 
-@pytest.mark.quick
+@pytest.mark.second
 def test_more_impacts_in_a_step_than_memory_for_them(gas, monkeypatch):
     """A step whose crossings do not fit is repeated: 20 impacts at different times in one step, and memory for 8."""
     monkeypatch.setattr(detection, "INITIAL_CAPACITY", 8)

@@ -97,7 +97,7 @@ def test_restored_runs_have_the_same_bits_at_kinks(family):
         assert {*ends} == {(run.t, *run.q, *run.p)}
 
 
-@pytest.mark.tiers(3, 3)
+@pytest.mark.tiers(1, 3)
 @families
 @pytest.mark.parametrize("plan", [{}, {"tolerance": 1e-6}, {"h": 0.01}], ids=["round-off", "tolerance", "fixed"])
 def test_trajectories_of_ensembles_have_the_bits_of_runs(family, plan):

@@ -483,7 +483,7 @@ TURNS = sc.LagrangianSystem.from_text(
 RESTS = sc.LagrangianSystem.from_text("rests", ["y"], "y_dot**2/2 - y", contacts=[sc.contact("y")])
 
 
-@pytest.mark.quick
+@pytest.mark.tiers(16)
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -715,6 +715,7 @@ def test_kinks_of_friction_coefficients_are_located() -> None:
     assert [round(float(t), 12) for t in run.switches[0].t] == [round(first, 12)]
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("steps", [{"h": 0.05}, {"h": 0.7}, {}])
 @pytest.mark.parametrize(
     ("dry", "height", "end"),
