@@ -461,7 +461,8 @@ class Runs:
         """Return the estimate of the error of a run by others; the last runs are compared with all of them."""
         self.compared = compared = _Samples(trajectory, self.start, self.interface)
         safety = SAFETY if len(others) == 1 else SAFETIES_OF_ROUNDING[-1]
-        floor = max(smallest_estimate(self.words), 0.0 if tolerance is None else tolerance)
+        missed = 0.0 if trajectory.modes is None else trajectory.modes.missed
+        floor = max(smallest_estimate(self.words), 0.0 if tolerance is None else tolerance, missed)
         for number, other in enumerate(others if compared.end != self.start else ()):
             if number == 2 and SAFETIES_OF_ROUNDING[1] * compared.largest() <= self.requested:
                 safety = SAFETIES_OF_ROUNDING[1]

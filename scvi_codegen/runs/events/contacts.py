@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.codegen.native.options import REASONS
-from scvi_codegen.common.errors import ContactError, EventWarning, MethodError, warn
+from scvi_codegen.common.errors import AccuracyWarning, ContactError, EventWarning, MethodError, warn
 from scvi_codegen.runs.results.saved_states import Array, SavedStates, parameters_on_sides
 from scvi_codegen.runs.states.validation import Parameters, States
 from scvi_codegen.runs.stepping.integrator import Integrator
@@ -29,6 +29,12 @@ REFUSALS = {
     4: "the impacts at t = {t:.17g} do not end: contacts close a corner; set a restitution to 0",
 }
 """Messages by the reasons of contacts.h."""
+NOISE = 1e-9
+"""Part of the momenta that rounding changes in a step, from which on it may be why adaptive steps fail."""
+ROUNDED = (
+    "rounding of the gaps of closed contacts changes the momenta by {part:.1e} of their size in a step, and by more in "
+    "shorter ones, as on nearly straight legs: give fixed steps (h=), or a larger tolerance"
+)
 
 
 def refusal_of(stepper: Integrator, watch: Any, t: float) -> ContactError | None:
@@ -46,7 +52,9 @@ def modes_in_failure(stepper: Integrator, watch: Any) -> str:
     named = dict(zip(stepper.modes, list(watch.mode), strict=False)) if contacts and watch.begun else {}
     modes = [(k, contact, contact.mode(named)) for k, contact in enumerate(contacts, 1) if named]
     closed = [f"contact {k} ({of.title}): {mode}" for k, of, mode in modes if mode is not ContactMode.OPEN]
-    return f". Modes of contacts: {', '.join(closed)}" if closed else ""
+    part = getattr(watch, "rounded", 0.0)
+    reason = f". Or {ROUNDED.format(part=part)}" if part > NOISE else ""
+    return f"{reason}. Modes of contacts: {', '.join(closed)}" if closed else ""
 
 
 def check_forward(run: Any) -> None:
@@ -57,7 +65,7 @@ def check_forward(run: Any) -> None:
 
 
 def warn_of_choices(stepper: Integrator, watch: Any) -> None:
-    """Warn of several possible motions, of impacts without collision, and of a restitution that was replaced."""
+    """Warn of several motions, of impacts without collision, a replaced restitution, and a missed tolerance."""
     if getattr(watch, "ambiguous", 0):
         warn(
             "a transition has several motions, with contacts open, sticking or sliding, as in Painleve's paradox; the "
@@ -74,6 +82,11 @@ def warn_of_choices(stepper: Integrator, watch: Any) -> None:
     if law := getattr(watch, "law", 0):
         used = "it was 0" if law > 1 else "that of the impulses was used (Poisson's law)"
         warn(f"the restitution of an impact would have created kinetic energy with friction: {used}", EventWarning)
+    if missed := getattr(watch, "missed", 0.0):
+        warn(
+            f"some adaptive steps have a tolerance of up to {missed:.2g}: {ROUNDED.format(part=watch.rounded)}",
+            AccuracyWarning,
+        )
 
 
 def in_first_modes(stepper: Integrator, q: States, p: States, t: float, parameters: Parameters) -> tuple[Array, Array]:

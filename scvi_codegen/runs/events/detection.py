@@ -229,7 +229,8 @@ class CrossingSearch:
         records = records[records["acted"] != 0]
         latest = np.array(list(self.watch.mode))
         values = np.concatenate([records["mode"], latest[np.newaxis]])
-        return ModeHistory(records["t"], values, bool(getattr(self.watch, "ambiguous", 0)))
+        ambiguous, missed = (getattr(self.watch, name, 0) for name in ("ambiguous", "missed"))
+        return ModeHistory(records["t"], values, bool(ambiguous), float(missed))
 
     def _joined(self, recorded: Sequence[NDArray[Any]]) -> Any:
         none = self.binding.records(self.binding.new("crossing[1]"), 0)

@@ -88,11 +88,13 @@ class ModeHistory:
         t: (k,) times of changes, in the order of the run.
         values: (k + 1, modes) values before the first change and after each.
         ambiguous: whether several motions of contacts were consistent at a transition since the start.
+        missed: tolerance of an adaptive step that missed that of the run, by rounding of the gaps of contacts, else 0.
     """
 
     t: Array
     values: Array
     ambiguous: bool = False
+    missed: float = 0.0
 
     def at(self, t: float, forward: float) -> Array:
         """Return (modes,) values after time t; ``forward`` is -1 for a run backward in time."""
@@ -105,15 +107,15 @@ class ModeHistory:
         if not len(inside):  # no change since the last one before
             earlier = (self.t < low) if not len(self.t) or self.t[0] <= self.t[-1] else (self.t > high)
             last = int(np.count_nonzero(earlier))
-            return ModeHistory(self.t[:0], self.values[last : last + 1], self.ambiguous)
-        return ModeHistory(self.t[inside], self.values[inside[0] : inside[-1] + 2], self.ambiguous)
+            return ModeHistory(self.t[:0], self.values[last : last + 1], self.ambiguous, self.missed)
+        return ModeHistory(self.t[inside], self.values[inside[0] : inside[-1] + 2], self.ambiguous, self.missed)
 
     @classmethod
     def joined(cls, histories: Sequence[ModeHistory]) -> ModeHistory:
         """Return the history of consecutive parts of a run."""
         values = [*(part.values[:-1] for part in histories), histories[-1].values[-1:]]
-        ambiguous = any(part.ambiguous for part in histories)
-        return cls(np.concatenate([part.t for part in histories]), np.concatenate(values), ambiguous)
+        ambiguous, missed = any(part.ambiguous for part in histories), max(part.missed for part in histories)
+        return cls(np.concatenate([part.t for part in histories]), np.concatenate(values), ambiguous, missed)
 
 
 def parameters_on_sides(states: SavedStates, t: float) -> Array:

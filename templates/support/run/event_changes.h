@@ -21,6 +21,10 @@ enum {
 #define CHANGE_RATIO 1e-3 /* relative spread of the ratios of intervals that accumulate */
 #define CHANGE_PACE 1e-3 /* least time of so many changes, relative to that mean */
 #define CHANGE_REST 1e-8 /* relative to the time since the first of them: remaining time at which a contact closes */
+#define CHANGE_LOOSER 16.0 /* ratio of the tolerances of steps that do not meet that of a run, by rounding of gaps */
+#define CHANGE_LOOSEST 0.01 /* beyond which none is tried */
+#define CHANGE_NOISE 64.0 /* largest part of the momenta that rounding changes in such a step, relative to it */
+#define CHANGE_CAUSE 1e-6 /* the least: below it the error has another cause, as a collision */
 #define CHANGE_END 1e-6 /* relative to a step: remaining time at which an accumulation ends the run */
 
 /* Records the interval since the last hit. If the last intervals decrease geometrically and the remaining ones are
@@ -622,6 +626,68 @@ static int take_step(event_run *run, real t_end, const step_control *control, co
   return status;
 }
 
+#if defined(EVENT_CONTACTS) && EVENTS_CONTROLLED
+/* Part of the momenta by which rounding changes them in a step of h. Gaps have errors u r_k, which move positions by
+ * X_k u r_k, X = M^-1 G^T W^-1, sqrt((W^-1)_kk) u r_k in the kinetic metric of the motion h sqrt(p v): where W is
+ * nearly singular, as on nearly straight legs, the more the shorter the step is. */
+static int part_by_rounding(const event_step *step, event_run *run, real h, real *part)
+{
+  const event_sample at = {.t = run->t, .q = run->q, .p = run->p};
+  contact_terms of;
+  contact_mode mode[EVENT_CONTACTS];
+  real force[CONTACT_ROWS], after[CONTACT_ROWS], square = 0.0, power = DBL_MIN;
+  TRY(terms_at(step, &at, &of)); /* and the velocities */
+  modes_at(&of, step->watch->mode, mode);
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    real right[CONTACT_ROWS] = {0.0};
+    const int row = CONTACTS[k].normal;
+    if (row < 0 || !mode[k].closed)
+      continue;
+    right[row] = of.rounding[row];
+    solve_contacts(&of, mode, right, force, after, NULL);
+    square += of.rounding[row] * fabs(force[row]);
+  }
+  for (int i = 0; i < M; i++)
+    power += at.p[i] * step->memory[3 * M + i];
+  *part = sqrt(square / power) / h;
+  return OK;
+}
+
+/* Takes an adaptive step where none meets the tolerance since gaps of closed contacts are rounded, whose part of the
+ * error grows as steps get shorter: with the least larger tolerance that one of any size so far meets, its equations
+ * solved as those of fixed steps. The next step has a half of that tolerance, then a quarter .. */
+static int take_rounded_step(event_run *run, event_run *before, real t_end, const step_control *control,
+    const event_step *step, real *size, int *iterations)
+{
+  event_watch *const watch = step->watch;
+  const solver_options fixed = step->options ? *step->options : NAME(default_options)();
+  event_step exact = *step;
+  step_control loose = *control;
+  real part;
+  int status = STATUS(STEP_SIZE_UNDERFLOW);
+  exact.options = &fixed;
+  loose.max_step = fmin(loose.max_step, watch->pace > 0.0 ? watch->pace / CONTACT_PACE : t_end - before->t);
+  loose.first_step = &loose.max_step;
+  loose.tolerance = fmax(loose.tolerance, DBL_EPSILON);
+  TRY(part_by_rounding(step, before, loose.max_step, &part));
+  while ((status != OK || part > CHANGE_NOISE * loose.tolerance) && loose.tolerance < CHANGE_LOOSEST) {
+    loose.tolerance *= CHANGE_LOOSER;
+    copy_run(run, before);
+    run->error_before = 0.0;
+    run->steps_to_compare = 1;
+    status = take_step(run, t_end, &loose, &exact, size, iterations);
+    if (status == OK)
+      TRY(part_by_rounding(step, before, *size, &part));
+  }
+  watch->rounded = fmax(watch->rounded, part);
+  if (status != OK || part > CHANGE_NOISE * loose.tolerance || part < CHANGE_CAUSE * loose.tolerance)
+    return STATUS(STEP_SIZE_UNDERFLOW);
+  watch->tolerance = loose.tolerance;
+  watch->missed = fmax(watch->missed, loose.tolerance);
+  return OK;
+}
+#endif
+
 int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, const step_control *control,
     long long steps, const real *parameters, const solver_options *options, long long states, real *t, real *q, real *p,
     real *length, int *iterations, long long *number, long long room, event_crossing *found, long long *filled,
@@ -642,6 +708,7 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
   const stored_states to = {states, number, t, q, p, length, iterations};
   int status = OK;
 #ifdef EVENT_CONTACTS
+  real opened = NAN; /* time at which a contact was opened that others nearly hold */
   real unsolved = INFINITY; /* largest size of an adaptive step after one whose parts were not solved */
 #endif
   memset(report, 0, sizeof *report);
@@ -711,6 +778,8 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
       shorter = *control;
       shorter.max_step = fmin(shorter.max_step, fmin(longest, unsolved));
       unsolved = INFINITY;
+      watch->tolerance *= watch->tolerance > DBL_EPSILON ? 0.5 : 0.0;
+      shorter.tolerance = fmax(control->tolerance, watch->tolerance);
       limited = &shorter;
     }
 #endif
@@ -718,6 +787,21 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
       status = take_step(run, t_end, limited, &step, &size, &count);
     else if (status == OK)
       status = NOT_CONVERGED;
+#if EVENTS_CONTROLLED
+    if (status == STATUS(STEP_SIZE_UNDERFLOW) || (status == OK && size == 0.0))
+      status = take_rounded_step(run, &before, t_end, &shorter, &step, &size, &count);
+    if (status == STATUS(STEP_SIZE_UNDERFLOW) && opened != before.t) { /* as where no part of a fixed step is solved */
+      event_sample at = {.t = opened = before.t, .q = run->q, .p = run->p};
+      int opens;
+      copy_run(run, &before);
+      step.whole = watch->pace / CONTACT_PACE;
+      run->error_before = 0.0;
+      TRY(open_nearly_held(&step, &at, &opens));
+      status = opens ? OK : status;
+      if (opens)
+        continue;
+    }
+#endif
     if (status == OK && control)
       watch->pace = fmax(watch->pace, CONTACT_PACE * size);
     if (watch->begun && !control && may_be_halved(&step, status, run->h, 0.0)) { /* by parts: only time advances */
