@@ -104,7 +104,7 @@ UNREAD = {
     '<general joint="x" dyntype="muscle"/>': "dyntype='muscle', which changes the motion and is not read",
     '<general joint="x" class="m"/>': "has gaintype='muscle', which must be fixed or affine",
     '<general joint="x" delay="1" nsample="1"/>': "delay='1', which changes the motion",
-    '</actuator><tendon><fixed name="f" actuatorfrcrange="-1 1"><joint joint="x" coef="1"/></fixed></tendon>'
+    '</actuator><tendon><fixed name="f" actuatorfrcrange="1 2"><joint joint="x" coef="1"/></fixed></tendon>'
     '<actuator><motor tendon="f" name="m"/><motor tendon="f"/>': ":3: <motor> 'm' is one of several on a tendon",
     '<motor cranksite="t" slidersite="t" cranklength="1"/>': "<motor> 'motor' acts on no joint, tendon or site",
 }

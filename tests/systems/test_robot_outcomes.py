@@ -50,8 +50,10 @@ ELLIPSOIDS = (
     '<geom type="{}" size="{}" pos=".1 0 .2" euler=".3 .2 .1" fluidshape="ellipsoid" fluidcoef=".3 .2 1 .7 .6"/>'
 )
 TENDONS = """<tendon><fixed name="s" range="-.4 .7"><joint joint="x" coef=".5"/><joint joint="y" coef="-2"/></fixed>
-<spatial name="t" actuatorfrcrange="-.1 .2"><site site="w"/><site site="e"/></spatial></tendon><actuator>
-<position tendon="s" kp="2" gear="3" inheritrange=".8"/><velocity tendon="t" kv="3" gear="2"/></actuator>"""
+<spatial name="t" actuatorfrcrange="-.1 .2"><site site="w"/><site site="e"/></spatial><fixed name="r"
+actuatorfrcrange="-.1 .2"><joint joint="y" coef=".5"/></fixed></tendon><actuator>
+<position tendon="s" kp="2" gear="3" inheritrange=".8"/><velocity tendon="t" kv="3" gear="2"/>
+<motor tendon="r" gear="2"/><position tendon="r" kp="3" gear="-3"/></actuator>"""
 FLUID = {"option": 'density="9" viscosity="1"'}
 BALL, FREE = '<joint name="x" type="ball"/>', '<freejoint name="f"/>'
 READ = {

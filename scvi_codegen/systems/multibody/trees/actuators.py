@@ -12,9 +12,10 @@ from collections.abc import Mapping, Sequence
 from itertools import chain
 
 import numpy as np
-from sympy import Expr, Matrix, S
+from sympy import Add, Expr, Matrix, S
 
 from scvi_codegen.systems.formulas.intermediates import intermediate
+from scvi_codegen.systems.formulas.kinks import positive_part
 from scvi_codegen.systems.formulas.symbols import DOT, input_parameters, symbol
 from scvi_codegen.systems.multibody.trees.closures import frames_in_common
 from scvi_codegen.systems.multibody.trees.document import Element
@@ -123,6 +124,23 @@ def actuator_of(
     at, along, against = (exact_number(g) * symbol(name) + exact_number(b) for g, b in zip(gain, bias, strict=True))
     length, rate = motion[0], intermediate(motion[1])
     return label, name, controls, (between(at + along * length + against * rate, forces), rate)
+
+
+def in_shared_ranges(
+    acting: Sequence[Actuator], targets: Sequence[tuple[str, str]], tendons: Sequence[Tendon]
+) -> list[Actuator]:
+    """Return the actuators, several of a tendon with forces scaled so that their sum is in its range around 0."""
+    shared = [*acting]
+    for tendon in tendons:
+        places = [k for k, target in enumerate(targets) if target == ("tendon", tendon.name)]
+        total, scale = intermediate(Add(*(acting[k][3][0] for k in places))), S.One
+        for bound in map(exact_number, tendon.pull if tendon.pull and len(places) > 1 else ()):
+            sign = 1 if bound > 0 else -1
+            scale *= bound / (bound + sign * positive_part(sign * (total - bound)))
+        for k in places:
+            label, name, controls, (force, rate) = acting[k]
+            shared[k] = label, name, controls, (force * scale, rate)
+    return shared
 
 
 def clamped(inner: Range, outer: Range, factor: float) -> Range:

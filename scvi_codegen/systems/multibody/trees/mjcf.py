@@ -27,6 +27,7 @@ from scvi_codegen.systems.multibody.trees.actuators import (
     actuator_of,
     clamped,
     damping_ratio,
+    in_shared_ranges,
     is_servo,
     motion_of,
     motion_of_sites,
@@ -70,7 +71,7 @@ def links_of_mjcf(path: str | PathLike[str], parts: Collection[str] = ()) -> tup
     """
     root = document_of(Path(path))
     model = _MujocoModel(root, parts)
-    acting = [*model.actuators(tendons := [*model.tendons()])]
+    acting = model.actuators(tendons := [*model.tendons()])
     keys = dict(model.keyframes([x[1] for x in acting]))
     others = [*model.closures(tendons)], tendons, [*model.touches()], acting, keys
     model.unread.warn(root.file)
@@ -288,8 +289,9 @@ class _MujocoModel:
             element.refuse(f"has {prefix}range without {prefix}limited, which autolimits='false' requires: give it")
         return (low, high) if limited == "true" or (limited == "auto" and low < high) else None
 
-    def actuators(self, tendons: Sequence[Tendon]) -> Iterator[Actuator]:
-        """Yield the actuators, if they are read."""
+    def actuators(self, tendons: Sequence[Tendon]) -> list[Actuator]:
+        """Return the actuators, if they are read."""
+        acting: list[Actuator] = []
         elements = [*self.entries("actuator")] if "actuators" in self.parts and "actuation" not in self.disabled else []
         names = {name: "" for element in elements if (name := element.node.get("name"))}
         targets = [next(((x, element.text(x)) for x in ACTED if element.has(x)), ("", "")) for element in elements]
@@ -311,9 +313,9 @@ class _MujocoModel:
                 parts: Mapping[str, Joint | Tendon] = paths if target[0] == "tendon" else joints
                 part = element.named_by(target[0], target[0].removesuffix("inparent"), parts)
                 motion = motion_of(self.links, part, gear, target[0] == "jointinparent")
-            pull = paths[target[1]].pull if target[0] == "tendon" else None
-            if pull and targets.count(target) > 1:
-                element.refuse("is one of several on a tendon with actuatorfrcrange, which is read of single ones only")
+            pull, several = paths[target[1]].pull if target[0] == "tendon" else None, targets.count(target) > 1
+            if pull and several and not pull[0] < 0 < pull[1]:
+                element.refuse("is one of several on a tendon with actuatorfrcrange, which must contain 0")
             law, inherited = activation_of(element), self.inherited(element, target)
             controls = self.bounds(element, "ctrl", inherited)
             activations = self.bounds(element, "act", inherited if law == "integrator" else (0, 0))
@@ -321,7 +323,7 @@ class _MujocoModel:
                 element.refuse("has actrange, the range of an activation, which its dyntype does not have")
             unclamped = law == "integrator" or "clampctrl" in self.disabled
             controls = clamped(None if unclamped else controls, activations, 1.0)
-            ranges = controls, clamped(self.bounds(element, "force"), pull, 1.0)
+            ranges = controls, clamped(self.bounds(element, "force"), None if several else pull, 1.0)
             inverse = inverses.get(target[1]) if target[0] in JOINTED else None
             actuator = actuator_of(self.links, element, motion, gear[0], names, *ranges, inverse)
             names[actuator[0]] = actuator[1]
@@ -330,7 +332,8 @@ class _MujocoModel:
             if law != "none":
                 self.activated.add(actuator[1])
                 self.unread.add(f"the law of activations (dyntype '{law}'), which are the inputs, of", actuator[0])
-            yield actuator
+            acting.append(actuator)
+        return in_shared_ranges(acting, targets, tendons)
 
     def inherited(self, element: Element, target: tuple[str, str]) -> Sequence[float]:
         """Return the range of a control by ``inheritrange``, this multiple of that of its part; (0, 0) without."""
