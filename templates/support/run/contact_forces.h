@@ -130,8 +130,8 @@ static int reduce_equations(const contact_terms *of, const contact_unknowns *in,
 }
 
 /* Largest of some rates, and of those by moved forces, relative to the terms of right + W f, of given sizes at least,
- * with the bounds sqrt(W_rr W_jj) of abs(W_rj): entries that cancel, as of slips at rest with normal forces, have the rounding of
- * these. */
+ * with the bounds sqrt(W_rr W_jj) of abs(W_rj): entries that cancel, as of slips at rest with normal forces, have the
+ * rounding of these. */
 static real discord_of(const contact_terms *of, const real *rates, const real *moved, const real *right,
     const real *sizes, const real *force)
 {

@@ -299,8 +299,8 @@ static int solve_cones(contact_problem *in, real *force)
 }
 
 /* Forces by projection onto the friction cones, contact by contact (M. Jean, Comput. Methods Appl. Mech. Eng. 177,
- * 1999), from those given, which keeps equal directions of friction, then by Newton's method; role: whether a contact is
- * closed, and its friction any (sticks) or in its direction. */
+ * 1999), from those given, which keeps equal directions of friction, then by Newton's method; role: whether a contact
+ * is closed, and its friction any (sticks) or in its direction. */
 static void relax(contact_problem *in, real *force)
 {
   const contact_terms *const of = in->of;

@@ -35,7 +35,7 @@ enum {
 };
 
 #define CONTACT_ROUNDING 1e-10 /* part of their size below which gaps, rates and forces count as 0 */
-/* Second rate whose change of a slip in a step counts as 0, relative to its fastest, and to CONTACT_ROUNDING of terms. */
+/* Second rate whose change of a slip in a step counts as 0, relative to the fastest so far, by CONTACT_ROUNDING. */
 #define CONTACT_AT_REST (DBL_EPSILON / CONTACT_ROUNDING)
 
 static const real AT_REST[2] = {0.0, 0.0};
