@@ -450,6 +450,20 @@ def test_a_body_on_points_with_friction_alone_comes_to_rest(count: int) -> None:
 
 
 @pytest.mark.second
+@pytest.mark.parametrize("names", [["x"], ["x", "y"]])
+def test_friction_that_grows_from_zero_acts_on_a_body_that_begins_to_move(names: list[str]) -> None:
+    """x'' = 1 - t/5."""
+    energy = f"({' + '.join(f'{name}_dot**2' for name in names)})/2 + x"
+    slip: Any = [f"{name}_dot" for name in names] if len(names) == 2 else "x_dot"
+    rough = sc.friction(slip, limit="t/5")
+    pushed = sc.LagrangianSystem.from_text("pushed", names, energy, contacts=[rough])
+    start = {"q": [0.0] * len(names), "velocity": [0.0] * len(names)}
+    run = sc.compile_stepper(pushed, "svi:3").integrate(**start, h=0.1, t_end=2.0)
+    assert run.q[-1, 0] == pytest.approx(2 - 8 / 30, abs=1e-14)
+    assert run.contact_modes == [(0.0, ("slip",))]
+
+
+@pytest.mark.second
 def test_slip_in_space_that_begins_after_a_long_step_has_any_unit_of_time() -> None:
     """The step during which a belt carries a puck is no measure of the slip, nor is the unit."""
     belt = sc.contact("z", slip=["x_dot - u", "y_dot - u/3"], friction=0.13, static_friction=0.2)

@@ -303,7 +303,10 @@ WALKER = f"""<body pos="0 0 .43"><joint name="x" type="slide" axis="1 0 0"/><joi
 @pytest.mark.rotated
 @pytest.mark.parametrize(("speed", "changes"), [(0.0, 2), (0.1, None)])
 def test_a_robot_lands_on_straight_legs(speed, changes, tmp_path):
-    """Gaps of three feet are of rank two where knees are straight, and almost so in the oscillation about it."""
+    """Gaps of three feet are of rank two where knees are straight, and almost so in the oscillation about it.
+
+    Where they slide rounding decides which foot carries, and ends at any step size scatter by 3e-5.
+    """
     names, ends = ["x", "z", "p", "h0", "k0", "h1", "k1", "h2", "k2"], []
     start, velocity = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0.0) | {"x": speed}
     for run in fallen(GROUND, WALKER, tmp_path, start, velocity, steps=[{"h": h} for h in (0.005, 0.004, 0.0025)]):
@@ -311,7 +314,7 @@ def test_a_robot_lands_on_straight_legs(speed, changes, tmp_path):
         assert changes in (None, len(run.contact_modes))
         assert (np.abs(slip) <= 0.8 * normal * (1 + 1e-9) + 1e-6).all()
         ends.append(run.q[-1])
-    assert ends[1:] == [pytest.approx(ends[0], abs=2e-6)] * 2
+    assert ends[1:] == [pytest.approx(ends[0], abs=2e-6 if changes else 5e-5)] * 2
     if changes:  # at rest
         assert ends[0] == pytest.approx([0, -0.01, *[0] * 7], abs=1e-12)
         assert normal[-1].sum() == pytest.approx(7.95 * 9.81)

@@ -222,11 +222,12 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
         return energies
 
     def energy_error(self) -> Array:
-        """Return (k,) errors of the energy as of :meth:`Trajectory.energy_error`; NaN for undefined energies."""
+        """Return (k,) errors of the energy as of :meth:`Trajectory.energy_error`; NaN where it is unknown."""
         energies, errors = np.asarray(self.energy(), float), np.full(len(self), np.nan)
         for j in range(len(self)):
             if (reached := self._reached(j)).any() and np.isfinite(energies[reached, j]).all():
-                errors[j] = self[j].energy_error()
+                with suppress(StateError):  # work at impacts
+                    errors[j] = self[j].energy_error()
         return errors
 
     def action(self, *, cumulative: bool = False) -> Array:

@@ -28,7 +28,7 @@ REPORTED = 1e-3
 def undefined_energy(q: Array, p: Array) -> StateError:
     """Return the error of states whose energy is no number."""
     largest = max(float(abs(np.asarray(x)).max(initial=0.0)) for x in (q, p))
-    overflow = f"a term overflows at coordinates or momenta of {largest:.0e}: choose larger units"
+    overflow = f"a term overflows at coordinates or momenta of {largest:.0e}: choose larger units, or a smaller step"
     reason = overflow if HUGE < largest < np.inf else "a value is infinite or NaN"
     return StateError(f"the energy of a state cannot be computed: {reason}")
 

@@ -69,7 +69,7 @@ static int is_consistent(const contact_problem *in, const contact_mode *mode, re
 {
   const contact_terms *const of = in->of;
   const real *const sizes = in->scale ? of->speed : of->second_terms;
-  if (solve_rows(of, mode, in->right, sizes, force, after, NULL) > CONTACT_ROUNDING)
+  if (solve_rows(of, mode, in->right, sizes, force, after, NULL) > CONTACT_OUTSIDE)
     return 0;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
@@ -387,8 +387,13 @@ static int modes_of_forces(contact_problem *in, int trial, const real *force, co
     const int slip = CONTACTS[k].tangential;
     const int slips = mode[k].closed && !mode[k].sticks && role[k].sticks ? CONTACTS[k].slips : 0;
     const real length = length_of(force + slip, slips), limit = friction_limit(of, k, 0, force);
+    real after[2] = {0.0};
     for (int i = 0; i < slips && length > 0.0 && limit > 0.0; i++)
       mode[k].direction[i] = -force[slip + i] / length * (mode[k].held ? length / limit : 1.0);
+    for (int i = 0; i < slips; i++)
+      after[i] = rate_after(of, in->right, force, slip + i);
+    for (int i = 0; i < slips && !(length > 0.0 && limit > 0.0) && length_of(after, slips) > 0.0; i++)
+      mode[k].direction[i] = after[i] / length_of(after, slips); /* friction may grow from 0 */
     if (slips > 0 && !mode[k].held && in->limit[k]) {
       in->limit[k] = 0;
       changed |= of->coefficient[3 * k] != of->coefficient[3 * k + 1];

@@ -55,7 +55,7 @@ static int slips_at(const event_step *step, const event_sample *at, contact_term
     return OK;
   TRY(terms_at(step, at, of));
   modes_at(of, modes, mode);
-  *any = solve_contacts(of, mode, of->second, force, second, NULL) <= CONTACT_ROUNDING;
+  *any = solve_contacts(of, mode, of->second, force, second, NULL) <= CONTACT_OUTSIDE;
   return OK;
 }
 
