@@ -195,16 +195,3 @@ static int terms_at(const event_step *step, const event_sample *at, contact_term
   }
   return OK;
 }
-
-/* Time in which accelerations displace gaps by as much as rounding does, sqrt(2 u r / |r''|), by the terms of both and
- * with the roundings of CONTACT_LOWEST: those of shorter parts of a step change momenta by more than forces. */
-static real time_of_rounding(const contact_terms *of)
-{
-  real least = 0.0;
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const int row = CONTACTS[k].normal;
-    if (row >= 0 && of->second_terms[row] > 0.0)
-      least = fmax(least, sqrt(2.0 * CONTACT_LOWEST * of->rounding[row] / of->second_terms[row]));
-  }
-  return least;
-}

@@ -6,7 +6,6 @@ enum {
 };
 
 #define CONTACT_BRAKES 0.25 /* longest parts relative to the time to its stop .. */
-#define CONTACT_LEAST 4.0 /* .. and of those, relative to that in which rounding displaces gaps .. */
 #define CONTACT_GROWS 0.2 /* .. to that from its beginning .. */
 #define CONTACT_RELAXES 2.0 /* .. and to the relaxation of its direction, for which iterations on stages converge */
 #define CONTACT_STIFF 0.25 /* relaxation relative to a part and those times, below which it is not followed */
@@ -242,7 +241,7 @@ static int turn_slips(const event_step *step, const event_sample *at, const cont
 /* Times of a slip in space, and what is done with its direction at the beginning of a part of a step: it is kept, new,
  * or turned in the part. by_rate: to its stop or from its beginning; relaxes: of its direction. */
 typedef struct {
-  int moves, keeps, renews, is_stiff;
+  int moves, may_keep, keeps, renews, is_stiff;
   real by_rate, relaxes;
 } slip_pace;
 
@@ -263,10 +262,30 @@ static slip_pace pace_of(const event_step *step, const contact_terms *of, int k,
   pace.by_rate = (stops ? CONTACT_BRAKES : CONTACT_GROWS) * fmax(size, CONTACT_SLOW * *fastest) / fabs(rate);
   pace.relaxes = CONTACT_RELAXES * size / by_friction;
   pace.is_stiff = CONTACT_RELAXES * rate <= CONTACT_STIFF * CONTACT_GROWS * by_friction;
-  const int is_slow = size <= CONTACT_SLOW * *fastest || (stops && pace.by_rate < CONTACT_LEAST * time_of_rounding(of));
-  pace.keeps = is_slow && (rate < -CONTACT_BRAKED * by_friction || !pace.is_stiff);
+  pace.may_keep = rate < -CONTACT_BRAKED * by_friction || !pace.is_stiff;
+  pace.keeps = pace.may_keep && (size <= CONTACT_SLOW * *fastest || (stops && step->watch->keeps[k]));
   pace.renews = pace.keeps != kept || (!kept && start[2] * w[0] + start[3] * w[1] < CONTACT_TURN * size);
   return pace;
+}
+
+/* Keeps the directions of slips that brake to their stops from a state on, before which parts of a step are too short
+ * for gaps that are rounded; whether there are any, in *any. */
+static int keep_directions(const event_step *step, const event_sample *at, int *any)
+{
+  contact_terms of;
+  contact_mode mode[EVENT_CONTACTS];
+  real force[CONTACT_ROWS], second[CONTACT_ROWS];
+  int slips;
+  *any = 0;
+  TRY(slips_at(step, at, &of, mode, force, second, &slips));
+  for (int k = 0; k < EVENT_CONTACTS && slips; k++) {
+    const slip_pace pace = pace_of(step, &of, k, mode + k, force, second);
+    if (!pace.moves || pace.keeps || !pace.may_keep || !pace.is_stiff)
+      continue;
+    step->watch->keeps[k] = 1;
+    *any = 1;
+  }
+  return OK;
 }
 
 /* Slips in space at the beginning of a part of a step, of at most *longest. Where they stop and where they begin

@@ -137,11 +137,18 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
   return OK;
 }
 
+/* Time in which accelerations displace gaps by as much as rounding does, sqrt(2 u r / |r''|), by the terms of both and
+ * with the roundings of CONTACT_LOWEST: those of shorter parts of a step change momenta by more than forces. */
 static int least_part(const event_step *step, const event_sample *at, real *least)
 {
   contact_terms of;
+  *least = 0.0;
   TRY(terms_at(step, at, &of));
-  *least = time_of_rounding(&of);
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int row = CONTACTS[k].normal;
+    if (row >= 0 && of.second_terms[row] > 0.0)
+      *least = fmax(*least, sqrt(2.0 * CONTACT_LOWEST * of.rounding[row] / of.second_terms[row]));
+  }
   return OK;
 }
 

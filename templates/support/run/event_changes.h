@@ -423,7 +423,11 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       longest = 0.5 * fabs(part);
       TRY(least_part(step, &left, &least));
       if (longest <= least) {
-        TRY(open_nearly_held(step, &left, &opens));
+#ifdef CONTACTS_IN_SPACE
+        TRY(keep_directions(step, &left, &opens));
+#endif
+        if (!opens)
+          TRY(open_nearly_held(step, &left, &opens));
         longest = INFINITY;
       }
       if (opens || longest < INFINITY)
