@@ -42,10 +42,6 @@ degree_count = partial(checked_count, least=1, most=MAX_STAGES, error=MethodErro
 Specification = Mapping[str, str | int | bool | Sequence[float]]
 
 
-OF_SMALL_STEPS = 8
-"""Small adaptive steps of which one measures the growth of errors, a power of 2."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Exactness:
     """Momentum maps that a method conserves to round-off at any step size; by default none is claimed.

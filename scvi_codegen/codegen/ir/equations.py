@@ -13,7 +13,7 @@ from enum import Enum, auto
 from typing import ClassVar, Literal, TypeAlias
 
 from scvi_codegen.codegen.ir.kernel import Kernel, Number, NumberTable, RolledKernel
-from scvi_codegen.methods.method import OF_SMALL_STEPS
+from scvi_codegen.codegen.native.options import OF_SMALL_STEPS
 from scvi_codegen.methods.recurrence import StepTables
 
 

@@ -11,6 +11,16 @@ static int line_from(const step_data *step, newton_data *data)
   return OK;
 }
 
+/* Sign of the determinant of a factorised matrix. */
+static int sign_of_determinant(const real *a, const band *shape, const real *pivot)
+{
+  int sign = 1;
+  for (int k = 0; k < shape->rows; k++)
+    if (((int)pivot[k] == k) == (a[shape->first + k * (shape->stride + 1)] < 0))
+      sign = -sign;
+  return sign;
+}
+
 /* Stages that solve the equations with a step size near 0 belong to a branch, on which those of the step lie. Newton's
  * method from far away may converge to another root, a spurious solution: so may every method, and steps of one stage
  * have no error estimate that shows it. Roots that are not near the line are computed by continuation in the step size
