@@ -10,10 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum, auto
-from typing import ClassVar, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 from scvi_codegen.codegen.ir.kernel import Kernel, Number, NumberTable, RolledKernel
-from scvi_codegen.codegen.native.options import OF_SMALL_STEPS
 from scvi_codegen.methods.recurrence import StepTables
 
 
@@ -473,10 +472,8 @@ class ErrorGrowth:
         tables: by the number of knots, times at which the tangent vector is evaluated; the last for vectors of eight
             lanes. With eight columns, from values at the points to those at the knots, from accelerations there to
             tangent vectors, and to Taylor's coefficients at the end of a step.
-        OF_SMALL_STEPS: the number of small steps of which one measures the growth, a power of 2.
     """
 
-    OF_SMALL_STEPS: ClassVar[int] = OF_SMALL_STEPS
     partials: Kernel
     product: Kernel
     energy: Kernel | None

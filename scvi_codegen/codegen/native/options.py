@@ -10,9 +10,6 @@ from scvi_codegen.codegen.rendering.text import MAX_ITERATIONS, TOLERANCE
 from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.common.validation import checked_count
 
-OF_SMALL_STEPS = 8
-"""Small adaptive steps of which one measures the growth of errors, a power of 2."""
-
 OUTCOMES = ("not converged", "singular", "not finite", "step size underflow", "spurious solution", "no memory")
 STATUS = dict(enumerate(OUTCOMES, 1))
 REASONS = {

@@ -42,6 +42,7 @@ from scvi_codegen.codegen.rendering.text import (
     INPUT_PRECISION,
     LARGEST_VIOLATION,
     MAX_ITERATIONS,
+    OF_SMALL_STEPS,
     ROUNDING_UNITS,
     HeaderRecord,
     wrapped_functions,
@@ -459,9 +460,10 @@ def render_embedded(program: Program, precision: Embedded, control: Control | No
 
 def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") -> Source:
     """Return the source of entry templates from their context, with defaults for all of them."""
-    common = {"prefix": prefix, "target": DOUBLE, "real": DOUBLE.scalar, "max_iterations": MAX_ITERATIONS}
+    common = {"prefix": prefix, "target": DOUBLE, "real": DOUBLE.scalar}
+    numbers = {"max_iterations": MAX_ITERATIONS, "of_small_steps": OF_SMALL_STEPS}
     absent = {"two_words": None, "rattle_in_pairs": False, "derivatives": None, "fallback": "none", "embedded": False}
-    environment, context = template_environment(), {"diagonal_masses": None, **common, **absent, **context}
+    environment, context = template_environment(), {"diagonal_masses": None, **common, **numbers, **absent, **context}
     context["diagonal_masses"] = None if context["two_words"] else context["diagonal_masses"]
     record = HeaderRecord(cast(str, context["prefix"]), cast(str, context["real"]))
     recorded = context | {"prototype": record.prototype, "optional": record.optional}

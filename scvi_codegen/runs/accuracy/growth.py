@@ -17,7 +17,7 @@ from typing import cast
 
 import numpy as np
 
-from scvi_codegen.codegen.native.options import OF_SMALL_STEPS
+from scvi_codegen.codegen.rendering.text import OF_SMALL_STEPS
 from scvi_codegen.common.errors import AccuracyWarning, StateError, StepFailedError, warn
 from scvi_codegen.common.representation import counted
 from scvi_codegen.runs.accuracy.size import (
