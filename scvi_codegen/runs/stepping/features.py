@@ -157,9 +157,10 @@ FEATURES = {
         ("in transformed time", "hessian", f"use first derivatives, or {_ORIGINAL}"),
         ("in transformed time of a first-order system", _FIRST, "use the system in physical time"),
         ("for a first-order system", "hessian", "use first derivatives and differences of them"),
+        ("with events that set parameters", _DERIVATIVES, "make them terminal, and restart with the new parameters"),
         (
             "with events that change the state",
-            "error device observe_ensemble check_growth hessian chaos_ensemble flow advice shadow_energy",
+            "error device observe_ensemble single check_growth hessian chaos_ensemble flow advice shadow_energy",
             "make them terminal and restart",
         ),
         (
@@ -169,7 +170,6 @@ FEATURES = {
         ),
         ("where L or H jumps", "shadow_energy", "use energy()"),
         ("where L or H jumps", " ".join(BY_FORMULAS), "use runs, ensembles of runs and their first derivatives"),
-        ("with events that set parameters", _DERIVATIVES, "make them terminal, and restart with the new parameters"),
         (
             "with contacts",
             f"check_growth device observe_ensemble single hessian chaos_ensemble flow advice {_ACTIONS}",
