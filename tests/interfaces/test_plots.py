@@ -70,7 +70,7 @@ def test_failed_picture_leaves_no_file(kepler, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.rotated
+@pytest.mark.second
 def test_robots_are_drawn_to_scale_in_all_axes():
     robot = sc.LagrangianSystem.from_mjcf(Path(__file__).parents[1] / "systems/robots/ball.xml")
     run = sc.compile_stepper(robot, "svi:1").integrate([0.4, 2.0, 0.0, 0.0, 0.0], velocity=[0.0] * 5, h=0.01, steps=50)
