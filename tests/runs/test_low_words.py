@@ -198,7 +198,7 @@ def test_coefficients_and_their_low_words_are_exact(text: str) -> None:
             assert abs(Fraction(two) + Fraction(one) - Fraction(str(x))) <= Fraction(abs(two)) / 2**52, name
 
 
-BY_DESIGN = ("Newton", "rattle", "lobatto")
+BY_DESIGN = ("Newton", "rattle", "lobatto", "composition of an array")
 """Forces at the start of their steps are those of the high word: an error like a rounding of the increment."""
 
 

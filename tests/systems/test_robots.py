@@ -499,7 +499,7 @@ def test_trials_and_last_steps_continue_curves_at_sizes_off_the_grid(tmp_path):
         (0.0, 1e-2, 10, 5),
         (0.0, 1e-5, 13, 5),
         (-0.3, 1e-2, 6, 3),
-        (-0.3, 1e-5, 7, 3),
+        (-0.3, 1e-5, 7, 5),
         (1, 1e-2, 14, 5),
         (1, 1e-5, 20, 8),
     )
