@@ -23,6 +23,7 @@ enum {
 #define CHANGE_REST 1e-8 /* relative to the time since the first of them: remaining time at which a contact closes */
 #define CHANGE_LOOSER 16.0 /* ratio of the tolerances of steps that do not meet that of a run, by rounding of gaps */
 #define CHANGE_LOOSEST 0.01 /* beyond which none is tried */
+#define CHANGE_SHORT 0x1p-10 /* steps relative to the pace below which rounding may change momenta */
 #define CHANGE_NOISE 64.0 /* largest part of the momenta that rounding changes in such a step, relative to it */
 #define CHANGE_CAUSE 1e-6 /* the least: below it the error has another cause, as a collision */
 #define CHANGE_END 1e-6 /* relative to a step: remaining time at which an accumulation ends the run */
@@ -112,7 +113,11 @@ static int refine_crossing(const event_step *step, long long first, const event_
   at->t = crossing->t;
   copy_state(at->q, at->p, crossing->q, crossing->p);
 #ifdef EVENT_CONSTRAINTS /* momenta of constrained steps of the size of rounding are ill-conditioned: interpolated */
-  const real short_part = fmax(EVENT_TIE * fabs(step->whole), 4.0 * DBL_EPSILON * fabs(step->t));
+  real short_part = fmax(EVENT_TIE * fabs(step->whole), 4.0 * DBL_EPSILON * fabs(step->t));
+#ifdef EVENT_CONTACTS
+  TRY(least_part(step, at, &least));
+  short_part = fmax(short_part, least);
+#endif
   for (int k = 0; k < M && fabs(*part) < short_part; k++)
     at->p[k] = step->p[k] + *part / step->h * (right->p[k] - step->p[k]);
   for (long long i = first; i < *step->filled; i++)
@@ -657,6 +662,19 @@ static int part_by_rounding(const event_step *step, event_run *run, real h, real
   return OK;
 }
 
+/* Whether a step is so short that rounding changes its momenta by more than the tolerance. */
+static int is_rounded(const event_step *step, event_run *before, real size, real tolerance, int *rounded)
+{
+  real part = INFINITY;
+  *rounded = 0;
+  if (fabs(size) >= CHANGE_SHORT * step->watch->pace)
+    return OK;
+  if (size != 0.0)
+    TRY(part_by_rounding(step, before, fabs(size), &part));
+  *rounded = part > CHANGE_NOISE * tolerance;
+  return OK;
+}
+
 /* Takes an adaptive step where none meets the tolerance since gaps of closed contacts are rounded, whose part of the
  * error grows as steps get shorter: with the least larger tolerance that one of any size so far meets, its equations
  * solved as those of fixed steps. The next step has a half of that tolerance, then a quarter .. */
@@ -778,6 +796,7 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
     const step_control *limited = control;
 #if EVENTS_CONTROLLED
     step_control shorter;
+    int rounded = 0;
     if (control) {
       shorter = *control;
       shorter.max_step = fmin(shorter.max_step, fmin(longest, unsolved));
@@ -792,7 +811,9 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
     else if (status == OK)
       status = NOT_CONVERGED;
 #if EVENTS_CONTROLLED
-    if (status == STATUS(STEP_SIZE_UNDERFLOW) || (status == OK && size == 0.0))
+    if (status == OK && control && run->t != t_end)
+      TRY(is_rounded(&step, &before, size, shorter.tolerance, &rounded));
+    if (status == STATUS(STEP_SIZE_UNDERFLOW) || rounded)
       status = take_rounded_step(run, &before, t_end, &shorter, &step, &size, &count);
     if (status == STATUS(STEP_SIZE_UNDERFLOW) && opened != before.t) { /* as where no part of a fixed step is solved */
       event_sample at = {.t = opened = before.t, .q = run->q, .p = run->p};
