@@ -8,6 +8,7 @@ enum {
 #define CONTACT_BRAKES 0.25 /* longest parts relative to the time to its stop .. */
 #define CONTACT_GROWS 0.2 /* .. to that from its beginning .. */
 #define CONTACT_RELAXES 2.0 /* .. and to the relaxation of its direction, for which iterations on stages converge */
+#define CONTACT_SLOWER 16.0 /* times CONTACT_SLOW, of slips that turn before parts of a step that are not solved */
 #define CONTACT_STIFF 0.25 /* relaxation relative to a part and those times, below which it is not followed */
 #define CONTACT_BRAKED 0.03 /* braking relative to friction, above which slow slips keep their direction to the stop */
 #define CONTACT_TURNED 1e-7 /* change of a direction at which iterations end */
@@ -263,13 +264,16 @@ static slip_pace pace_of(const event_step *step, const contact_terms *of, int k,
   pace.relaxes = CONTACT_RELAXES * size / by_friction;
   pace.is_stiff = CONTACT_RELAXES * rate <= CONTACT_STIFF * CONTACT_GROWS * by_friction;
   pace.may_keep = rate < -CONTACT_BRAKED * by_friction || !pace.is_stiff;
-  pace.keeps = pace.may_keep && (size <= CONTACT_SLOW * *fastest || (stops && step->watch->keeps[k]));
+  real slow = CONTACT_SLOW * *fastest;
+  if (step->watch->keeps[k])
+    slow = pace.is_stiff ? INFINITY : CONTACT_SLOWER * slow;
+  pace.keeps = pace.may_keep && size <= slow;
   pace.renews = pace.keeps != kept || (!kept && start[2] * w[0] + start[3] * w[1] < CONTACT_TURN * size);
   return pace;
 }
 
-/* Keeps the directions of slips that brake to their stops from a state on, before which parts of a step are too short
- * for gaps that are rounded; whether there are any, in *any. */
+/* Keeps the directions of slips that brake to their stops from a state on, or of slow ones that forces turn, where parts
+ * of a step are too short for gaps that are rounded; whether there are any, in *any. */
 static int keep_directions(const event_step *step, const event_sample *at, int *any)
 {
   contact_terms of;
@@ -280,10 +284,11 @@ static int keep_directions(const event_step *step, const event_sample *at, int *
   TRY(slips_at(step, at, &of, mode, force, second, &slips));
   for (int k = 0; k < EVENT_CONTACTS && slips; k++) {
     const slip_pace pace = pace_of(step, &of, k, mode + k, force, second);
-    if (!pace.moves || pace.keeps || !pace.may_keep || !pace.is_stiff)
+    if (!pace.moves || pace.keeps)
       continue;
     step->watch->keeps[k] = 1;
-    *any = 1;
+    step->watch->keeps[k] = pace_of(step, &of, k, mode + k, force, second).keeps;
+    *any |= step->watch->keeps[k];
   }
   return OK;
 }
