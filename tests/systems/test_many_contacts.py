@@ -413,9 +413,13 @@ def test_bent_legs_with_friction_swing_on_their_feet(h: float) -> None:
     ],
 )
 def test_nearly_straight_legs_pass_through_straight(start: dict[str, Any]) -> None:
-    """Rounding determines loads there: a foot without a definite zero lifts, gaps sink, tolerances are missed."""
-    run, lowest = swing(1e-6, **start)
-    assert (lowest > -1e-9, np.diff(run.energy()).max() < 1e-8 + run.modes.missed) == (True, True)
+    """Rounding determines loads there: a foot without a definite zero lifts, gaps sink, tolerances are missed.
+
+    Of landings by steps down to rounding one in three starts gained energy, up to 6 % of it.
+    """
+    for k in range(6 if "tolerance" in start else 1):
+        run, lowest = swing(1e-6 + k * 1e-10, **start)
+        assert (lowest > -1e-9, np.diff(run.energy()).max() < 1e-8) == (True, True)
 
 
 @pytest.mark.second
