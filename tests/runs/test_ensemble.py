@@ -22,6 +22,7 @@ from samples import ensemble_runs, pushed_pendulum, sample_named, stepper_for
 
 import scvi_codegen as sc
 from benchmarks.cases.robots import chain
+from scvi_codegen.codegen.native.options import FAILURES
 from scvi_codegen.interfaces.models.model_files.ensemble_file import load_ensemble
 from scvi_codegen.methods import Method
 from scvi_codegen.runs.ensembles.lanes import LaneRuns
@@ -121,6 +122,7 @@ class Case:
     def check(self) -> None:
         runs, stepper = self.run(), stepper_of(self.system, self.method)
         assert runs.ok.tolist() == [j != self.failing for j in range(self.count)]
+        assert [*runs.failures] == [j for j in range(self.count) if j == self.failing]
         energies, errors = runs.energy(), runs.momentum_errors()
         conserved = stepper.interface.changes_energy is None
         drifts = runs.energy_error() if conserved else np.empty(0)
@@ -135,6 +137,7 @@ class Case:
                 run, status = error.trajectory, error.status
             tolerance = self.tolerance * (1.0 if status == "ok" else 1e3)  # near a singularity errors grow
             assert (runs.status[j], steps) == (status, run.steps)
+            assert status == "ok" or FAILURES[status][0] in runs.failures[j]
             assert np.array_equal(t, run.t)
             for found, expected in ((q, run.q), (p, run.p)):
                 assert np.abs(found - expected).max() <= tolerance * np.abs(expected).max()

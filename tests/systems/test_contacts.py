@@ -756,6 +756,7 @@ def test_coefficients_that_become_negative_end_a_run(
         [[0, height]] * 2, velocity=[[2, 0]] * 2, parameters={"a": [0.3, 1.9]}, **start
     )
     assert [*both.status] == ["event failed", "ok"]
+    assert both.failures == {0: str(caught.value)}
 
 
 @pytest.mark.parametrize("steps", [{"h": 0.05}, {"h": 0.7}, {}])

@@ -131,7 +131,7 @@ def _failures(result: EnsembleTrajectory) -> Iterator[str]:
         equal = result.h is not None and not result.spans and result.t.ndim == 1
         t = result.t[0] + result.steps[j] * result.h if equal else result.ends[0][j]
         status = str(result.status[j])
-        why = FAILURES[status][0] if status in FAILURES else status
+        why = FAILURES[status][0] if status in FAILURES else result.failures[int(j)]
         failed = f"step {result.steps[j]} at t = {t:g} failed"
         if status == TOO_MANY_STATES:
             failed, why = f"ended after step {result.steps[j]} at t = {t:g}", f"{why}: use --save-every"

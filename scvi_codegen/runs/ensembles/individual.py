@@ -51,6 +51,7 @@ class IndividualRuns:
         successive: the trajectories as C integrates them in one call, ``None`` if ``integrate`` does.
         stored: states of completed trajectories, and the initial states.
         status, steps, fallback_steps, events: (k,) of each trajectory.
+        messages: of the errors with which trajectories ended, by their numbers.
         plans: adaptive steps of each; with ``error=`` their tolerances differ.
         confirmations: with ``error=``, of each trajectory.
     """
@@ -70,6 +71,7 @@ class IndividualRuns:
         self.most_states = math.inf if self.t_eval is not None else room_for_states() / (8 * numbers * max(count, 1))
         self.status = np.full(count, INTERRUPTED, dtype="<U32")
         self.steps, self.fallback_steps = np.zeros((2, count), np.int64)
+        self.messages: dict[int, str] = {}
         self.events: list[tuple[Crossings, ...]] = [()] * count
         self.modes: list[ModeHistory | None] = [None] * count
         self.stored = [self._start()]
@@ -158,14 +160,13 @@ class IndividualRuns:
                     return
             try:
                 states = integrate()
-            except StepFailedError as failure:
-                states, status = Trajectory.before(failure), failure.status
-            except EventError as failure:
+            except (StepFailedError, EventError) as failure:
                 if failure.trajectory is None:
                     raise
-                states, status = cast(Trajectory, failure.trajectory), EVENT_FAILED
-            except StateError:  # a sum of finite terms has overflowed
-                self.status[j] = "not finite"
+                states, status = cast(Trajectory, failure.trajectory), getattr(failure, "status", EVENT_FAILED)
+                self.messages[j] = str(failure)
+            except StateError as failure:  # a sum of finite terms has overflowed
+                self.status[j], self.messages[j] = "not finite", str(failure)
                 return
         if ensemble.fixed is not None and self.t_eval is not None:
             rows = self._common_rows(states, ensemble.fixed.h)
@@ -233,6 +234,7 @@ class IndividualRuns:
         for k, trajectory in enumerate(trajectories.each()):
             actions, tau = (None if values is None else values[: len(trajectory[0]), k] for values in along)
             self._append(part.start + k, trajectory, int(fallback_steps[k]), actions, tau)
+        self.messages |= {part.start + k: message for k, message in trajectories.messages.items()}
         if trajectories.events:
             self.events[part] = trajectories.events
         if trajectories.modes:
@@ -264,6 +266,7 @@ class IndividualRuns:
             fallback_steps=self.fallback_steps,
             events=tuple(self.events) if stepper.events else (),
             modes=tuple(self.modes) if stepper.modes else (),
+            messages=self.messages,
             h=None if fixed is None else fixed.h,
             plans=self.plans,
             confirmations=tuple(self.confirmations),

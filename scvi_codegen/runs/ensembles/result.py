@@ -13,6 +13,7 @@ from typing import IO, TYPE_CHECKING, Any, TypeAlias, cast, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.codegen.native.options import FAILURES
 from scvi_codegen.common.atomic import write_atomically
 from scvi_codegen.common.display.cards import card, grid, listed, plain, sparkline
 from scvi_codegen.common.errors import StateError
@@ -105,6 +106,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
             empty.
         events: (k,) crossings of the events of each trajectory, parallel to ``stepper.events``; empty without events.
         modes: (k,) values of ``stepper.modes`` along each trajectory, as of :class:`Trajectory`; empty without modes.
+        messages: of the errors of trajectories that were integrated one by one, by their numbers; see :attr:`failures`.
     """
 
     q: Array
@@ -115,6 +117,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
     confirmations: tuple[GlobalError | None, ...] = field(default=(), repr=False)
     events: tuple[tuple[Crossings, ...], ...] = field(default=(), repr=False)
     modes: tuple[ModeHistory | None, ...] = field(default=(), repr=False)
+    messages: Mapping[int, str] = field(default_factory=dict, repr=False)
 
     @overload
     def __getitem__(self, j: int) -> Trajectory: ...
@@ -184,6 +187,13 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
             curves = zip(names, q[:: max(1, -(-len(q) // MOST_DRAWN))].T, strict=False)
             rows.append([plain(f"trajectory {j}"), *(sparkline(values.tolist(), name) for name, values in curves)])
         return card(self.stepper.title, facts, grid(rows, head=("", *names)))
+
+    @property
+    def failures(self) -> dict[int, str]:
+        """Why each trajectory that failed did, by its number: as a single run says, or the cause by its status."""
+        failed = np.flatnonzero(~self.ok & (self.status != INTERRUPTED)).tolist()
+        causes = (self.messages.get(j) or ". ".join(FAILURES[str(self.status[j])]) for j in failed)
+        return dict(zip(failed, causes, strict=True))
 
     @property
     def ends(self) -> tuple[Array, Array, Array]:
