@@ -4,7 +4,8 @@ import difflib
 import importlib
 import sys
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 PACKAGE = __name__.partition(".")[0]
@@ -134,6 +135,15 @@ class CacheWarning(UserWarning):
 
 class MissingLibraryError(ScviCodegenError, ImportError):
     """An optional library that is not installed; the message names the extra that provides it."""
+
+
+@contextmanager
+def of_trajectory(number: int) -> Iterator[None]:
+    """Name a trajectory of an ensemble in the message of an error of its start."""
+    try:
+        yield
+    except (StateError, EventError) as error:
+        raise type(error)(f"trajectory {number}: {error}") from error
 
 
 def missing(library: str, extra: str) -> MissingLibraryError:

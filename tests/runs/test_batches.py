@@ -129,7 +129,7 @@ def test_initial_states_of_two_kinds_equal_those_of_single_runs() -> None:
         assert runs.p[:, j].tobytes() == run.p.tobytes()
     with pytest.warns(sc.AccuracyWarning, match="the initial state violates"):
         one.integrate_ensemble(1.01 * q, velocity=v, h=0.05, steps=1)
-    with pytest.raises(sc.StateError, match="violates the constraints"):
+    with pytest.raises(sc.StateError, match=rf"^trajectory {COUNT}: .* violates the constraints"):
         one.integrate_ensemble(np.vstack([q, [[3.0, 4.0]]]), np.zeros((COUNT + 1, 2)), h=0.05, steps=1)
 
 

@@ -656,6 +656,8 @@ def test_a_start_within_rounding_of_a_gap_at_the_origin_is_in_contact(height: fl
     assert [modes for _, modes in run.contact_modes] == [("slip",), ("stick",)]
     with pytest.raises(sc.ContactError, match="must not be negative"):
         stepper.integrate([0.0, -1e-6], velocity=[1.0, 0.0], h=0.05, t_end=0.5)
+    with pytest.raises(sc.ContactError, match=r"^trajectory 1: .* must not be negative"):
+        stepper.integrate_ensemble([[0.0, height], [0.0, -1e-6]], velocity=[[1.0, 0.0]] * 2, h=0.05, t_end=0.5)
 
 
 def test_an_impact_lets_dry_friction_slip_that_is_finite() -> None:

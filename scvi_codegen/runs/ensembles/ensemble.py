@@ -14,7 +14,7 @@ from scvi_codegen.codegen.native.arguments import real_array
 from scvi_codegen.codegen.native.cuda import DEVICES, Device, has_device_memory
 from scvi_codegen.codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.codegen.variants import Lanes
-from scvi_codegen.common.errors import MethodError, StateError
+from scvi_codegen.common.errors import MethodError, StateError, of_trajectory
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.driver.segments import (
     ALL,
@@ -77,14 +77,18 @@ def momenta_of_each(
     positions, velocities = checked_ensemble(stepper, q, velocity, "velocity")
     t, values = stepper._states.time(t), stepper._states.parameters_of_each(parameters, len(positions))
     interface = stepper.interface
+
+    def momentum_of(j: int) -> Array:
+        with of_trajectory(j):
+            return stepper.initial_momentum(positions[j], velocities[j], t, values[j])
+
     if interface.words > 1 or interface.in_tau or interface.layout.momenta:
-        starts = zip(positions, velocities, values, strict=True)
-        return stacked([stepper.initial_momentum(position, v, t, value) for position, v, value in starts])
+        return stacked([momentum_of(j) for j in range(len(positions))])
     momenta = np.empty_like(positions)  # p = dL/dv
     done = stepper.binding.of_each("momenta", t, values, positions, velocities, momenta)
     dropped = ((momenta[:done] == 0.0) & (velocities[:done] != 0.0)).any(axis=1)
     for j in (*np.flatnonzero(dropped).tolist(), *range(done, len(momenta))):
-        momenta[j] = stepper.initial_momentum(positions[j], velocities[j], t, values[j])  # may raise
+        momenta[j] = momentum_of(j)
     return momenta
 
 
@@ -99,8 +103,9 @@ def start_of_ensemble(
         if stepper.interface.words == 1:
             positions, momenta = map(np.ascontiguousarray, (positions, momenta))
         if stepper.interface.contacts:
-            for k, start in enumerate(zip(positions.copy(), momenta.copy(), values, strict=True)):
-                positions[k], momenta[k] = in_first_modes(stepper, *start[:2], t, start[2])
+            for k, value in enumerate(values):
+                with of_trajectory(k):
+                    positions[k], momenta[k] = in_first_modes(stepper, positions[k], momenta[k], t, value)
         else:
             make_consistent(stepper, positions, momenta, t, values)
     return positions, momenta, values

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native.capacity import TOO_MANY_STATES, room_for_states, too_many_states
 from scvi_codegen.codegen.native.options import FAILURES
-from scvi_codegen.common.errors import AccuracyWarning, EventError, StateError, StepFailedError, warn
+from scvi_codegen.common.errors import AccuracyWarning, EventError, StateError, StepFailedError, of_trajectory, warn
 from scvi_codegen.common.validation import LARGEST_COUNT
 from scvi_codegen.runs.accuracy.global_error import GlobalError
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
@@ -162,7 +162,8 @@ class IndividualRuns:
                 states = integrate()
             except (StepFailedError, EventError) as failure:
                 if failure.trajectory is None:
-                    raise
+                    with of_trajectory(j):
+                        raise
                 states, status = cast(Trajectory, failure.trajectory), getattr(failure, "status", EVENT_FAILED)
                 self.messages[j] = str(failure)
             except StateError as failure:  # a sum of finite terms has overflowed

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.codegen.native.options import REASONS, STATUS
 from scvi_codegen.codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
-from scvi_codegen.common.errors import AccuracyWarning, StateError, warn
+from scvi_codegen.common.errors import AccuracyWarning, StateError, of_trajectory, warn
 from scvi_codegen.runs.states.validation import Array, Parameters, States, inputs_not_given, missing_input
 from scvi_codegen.runs.states.words import quotient_of
 from scvi_codegen.runs.stepping.features import require
@@ -103,7 +103,8 @@ def make_consistent(stepper: Integrator, q: Array, p: Array, t: float, parameter
     """Replace (k, m) states by those of :func:`consistent`, each with its own parameters."""
     of_two_words = stepper.interface.words > 1  # one by one
     for k in range(len(q) if of_two_words else 1):
-        q[k], p[k] = consistent(stepper, q[k], p[k], t, parameters[k], check_rank=k == 0)
+        with of_trajectory(k):
+            q[k], p[k] = consistent(stepper, q[k], p[k], t, parameters[k], check_rank=k == 0)
     if of_two_words:
         return
     q1, p1, apart = np.empty_like(q), np.empty_like(p), np.empty((len(q), 2))
@@ -112,7 +113,8 @@ def make_consistent(stepper: Integrator, q: Array, p: Array, t: float, parameter
     by_typing = (moved > ROUNDING_UNITS * np.finfo(float).eps) & (moved <= INPUT_PRECISION)
     q[by_typing], p[by_typing] = q1[by_typing], p1[by_typing]
     for k in np.flatnonzero(~(moved <= INPUT_PRECISION)).tolist():
-        q[k], p[k] = consistent(stepper, q[k], p[k], t, parameters[k], check_rank=False)
+        with of_trajectory(k):
+            q[k], p[k] = consistent(stepper, q[k], p[k], t, parameters[k], check_rank=False)
 
 
 def _worst(stepper: Integrator, q: Array, p: Array, t: float, parameters: Parameters) -> str:
