@@ -523,7 +523,7 @@ RESTS = sc.LagrangianSystem.from_text("rests", ["y"], "y_dot**2/2 - y", contacts
         ),
         *(
             (
-                lambda dry=dry: of(PLANE, "x y", [dry], "svi:2", a=-0.1).integrate([0, 1], [0, 0], h=0.1, steps=9),
+                lambda dry=dry: of(PLANE, "x y", [dry], "svi:2", a=-0.1).integrate([0, 1], [0, -2], h=0.1, steps=9),
                 "imposs",
             )
             for dry in (
@@ -759,6 +759,41 @@ def test_coefficients_that_become_negative_end_a_run(
     )
     assert [*both.status] == ["event failed", "ok"]
     assert both.failures == {0: str(caught.value)}
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize("steps", [{"h": 0.05}, {"h": 0.7}, {}])
+@pytest.mark.parametrize(
+    ("dry", "end"),
+    [
+        (sc.contact("y", slip="x_dot", friction=0.3, static_friction="0.5 - 0.2*t"), 1.0),
+        (sc.contact("y", slip="x_dot", friction="0.3 + t/10", static_friction=0.4), 1.0),
+        (sc.friction("x_dot", limit="0.3 + t/10", static_limit="0.5 - t/10"), 1.0),
+        (sc.contact("y", slip="x_dot", friction="0.3 + abs(x_dot)/5", static_friction=0.3), None),
+        (sc.contact("y", slip="x_dot", friction="0.2 + 0.1*exp(-abs(x_dot))", static_friction=0.3), None),
+    ],
+)
+def test_static_friction_below_that_of_sliding_ends_a_run_at_rest(
+    dry: Any, end: float | None, steps: dict[str, Any]
+) -> None:
+    """While it slides it does not count."""
+    block = of(f"{PLANE} - y", "x y", [dry], "svi:2")
+    if end is None:
+        assert block.integrate([0, 0], velocity=[0.1, 0], t_end=1.6, **steps).contact_modes[-1][1] == ("stick",)
+        return
+    with pytest.raises(sc.ContactError, match=r"nor static friction at rest less") as caught:
+        block.integrate([0, 0], velocity=[0.1, 0], t_end=1.6, **steps)
+    assert float(re.findall(r"t = ([\d.]+),", str(caught.value))[0]) == pytest.approx(end, rel=1e-8)
+    run = block.integrate([0, 0], velocity=[2, 0], t_end=1.6, **steps)
+    assert [modes for _, modes in run.contact_modes] == [("slip",)]
+
+
+def test_coefficients_of_open_contacts_do_not_count() -> None:
+    """Friction is 1 - x/3 < 0 at the start, above the floor, and 1 where the block lands after a fall of t = 1."""
+    block = of(f"{PLANE} - y", "x y", [sc.contact("y", slip="x_dot", friction="1 - x/3")], "svi:2")
+    run = block.integrate([4, 0.5], velocity=[-4, 0], h=0.05, t_end=1.0 + 1e-9)
+    assert run.contact_modes[-1][1] == ("slip",)
+    assert run.velocity[-1, 0] == pytest.approx(-3.0, abs=1e-8)
 
 
 @pytest.mark.parametrize("steps", [{"h": 0.05}, {"h": 0.7}, {}])

@@ -7,8 +7,9 @@ the functions of transitions are 1 in modes that they do not end. Runs choose th
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from fractions import Fraction
 from functools import partial
 from itertools import repeat
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
     from scvi_codegen.systems.lagrangian import LagrangianSystem
 
 
+EQUAL = Fraction(1, 10**10)
+"""Part by which static friction may be less than that of sliding, ``CONTACT_ROUNDING`` of ``contact_rows.h``."""
 LEAST_SLIP = 10**200
 """Inverse fourth power of a slip that is no direction: formulas of a vector that may be 0 are finite."""
 
@@ -304,7 +307,6 @@ class _Binding:
             tangential = rows[0]
             normal_force = self._multiplier(normal) if normal is not None else self.sympy.S.One
             limit = normal_force * static_limit(item)
-            transitions |= self._watched(item.friction if of_gap else item.limit, closed)
             transitions["stops"] = (1 - held) * moving.ahead + held
             tau = [self._multiplier(row) for row in rows]
             if len(slips) == 1:
@@ -314,22 +316,28 @@ class _Binding:
                 transitions["begins"] = sticks[0] * (limit**2 - tau[0] ** 2 - tau[1] ** 2) + 1 - sticks[0]
         names = closed and closed.name, tuple(mask.name for mask in sticks), moving.names if moving else (), held.name
         leaves = [("leaves", closed * u + (1 - closed) ** 2) for u in conditions if closed is not None]  # u if closed
-        quantities = self._add_quantities(number, [*transitions.values(), *conditions])
+        drives = [("drives", function) for function in self._watched(item, closed, sticks)] if moving else []
+        quantities = self._add_quantities(
+            number, [*transitions.values(), *(function for _, function in drives), *conditions]
+        )
         where = [f"{self._text_of(u)} >= 0" for u in conditions]
         functions = tuple(
             (kind, self._text_of(function), *(where if kind == "closes" else ()))
-            for kind, function in (*transitions.items(), *leaves)
+            for kind, function in (*transitions.items(), *leaves, *drives)
         )
         shown = () if item.name else (item.gap,) if of_gap else slips
         title = item.name or f"{'gap' if of_gap else 'slip'} '{' and '.join(map(self.system.text_of, shown))}'"
         law = getattr(item, "impacts", Impacts.SEQUENTIAL)
         return ContactRows(normal, tangential, len(slips), *names, title, functions, law, quantities)
 
-    def _watched(self, friction: Expr, closed: Symbol | None) -> dict[str, Expr]:
-        """Return a coefficient or limit that may become negative along a run, 1 while its contact is open."""
-        if friction.is_nonnegative or friction.free_symbols <= {*self.system.parameters}:
-            return {}
-        return {"drives": friction if closed is None else closed * friction + 1 - closed}
+    def _watched(self, item: Any, closed: Symbol | None, sticks: Sequence[Symbol]) -> Iterator[Expr]:
+        """Yield what must not become negative: friction, and by how much that at rest exceeds it; 1 in other modes."""
+        sliding: Any = item.friction if isinstance(item, Contact) else item.limit
+        static = static_limit(item)
+        excess = self.sympy.S.Zero if static == sliding else static - (1 - EQUAL) * sliding
+        for formula, mask in ((sliding, closed), (excess, sticks[0])):
+            if not (formula.is_nonnegative or formula.free_symbols <= {*self.system.parameters}):
+                yield formula if mask is None else mask * formula + 1 - mask
 
     def _slipping(self, number: int, slips: Sequence[Expr]) -> Slipping:
         """Return the direction of a slip w: a parameter d in a plane, else that of (ahead.w) w + start."""

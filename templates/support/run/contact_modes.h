@@ -503,13 +503,12 @@ static int refuse(const event_step *step, int reason, int k, real value)
 
 /* Whether friction is negative, less static than sliding at rest, or the restitution of a contact that meets others is
  * not in [0, 1]; that number. */
-static int is_impossible(const contact_terms *of, int k, int meets, real *number)
+static int is_impossible(const contact_terms *of, int k, int rests, int meets, real *number)
 {
   const real mu = of->coefficient[3 * k], held = of->coefficient[3 * k + 1], e = of->coefficient[3 * k + 2];
-  const int slip = CONTACTS[k].tangential;
-  const int rests = slip >= 0 && length_of(of->rate + slip, CONTACTS[k].slips) <= CONTACT_ROUNDING * of->speed[slip];
-  const int is_friction = !(mu >= 0.0 && held >= 0.0) || (rests && held < (1.0 - CONTACT_ROUNDING) * mu);
-  *number = is_friction ? fmin(mu, held) : e;
+  const int is_friction = !(mu >= 0.0) || (rests && !(held >= (1.0 - CONTACT_ROUNDING) * mu));
+  *number = !is_friction ? e : rests ? fmin(mu, held)
+                                     : mu;
   return is_friction || (meets && !(e >= 0.0 && e <= 1.0));
 }
 
@@ -524,15 +523,19 @@ static int choose_modes(const event_step *step, const contact_terms *of, const c
 {
   contact_problem in = {.of = of, .right = of->second, .is_strict = 1, .lifts = now->lifts};
   contact_mode best[EVENT_CONTACTS], other[EVENT_CONTACTS];
-  real second[CONTACT_ROWS];
+  real second[CONTACT_ROWS], impossible = 0.0;
   int imposed[CONTACT_ROWS] = {0}, directed[EVENT_CONTACTS] = {0};
   contact_mode present[EVENT_CONTACTS];
   modes_at(of, step->watch->mode, present);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     allow_modes(&in, k, now, step->watch->fastest[k]);
     const real *const start = step->watch->mode + CONTACTS[k].direction + 1, *const d = present[k].direction;
-    directed[k] = CONTACTS[k].slips == 2 && in.role[k].closed && !in.limit[k] && start[-1] != 0.0 && !present[k].held &&
-        keeps_direction(start, of->rate + CONTACTS[k].tangential);
+    const int slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
+    const int is_still = in.limit[k] && length_of(of->rate + slip, slips) <= CONTACT_ROUNDING * of->speed[slip];
+    if (!in.is_free[k] && is_impossible(of, k, is_still, 0, &impossible))
+      return refuse(step, CONTACT_IMPOSSIBLE, k, impossible);
+    directed[k] = slips == 2 && in.role[k].closed && !in.limit[k] && start[-1] != 0.0 && !present[k].held &&
+        keeps_direction(start, of->rate + slip);
     for (int i = 0; directed[k] && i < 2; i++)
       in.role[k].direction[i] = d[i] / length_of(d, 2); /* friction would jump to that of the rate */
   }

@@ -105,7 +105,7 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
     now->rests[k] = mode.sticks || (mode.closed && mode.held) || (now->stops[k] && stops_at(step, &of, k));
     now->rests[k] &= !now->begins[k];
     const int meets = is_met(&of, now, closed, k);
-    if ((meets || (mode.closed && !now->leaves[k])) && is_impossible(&of, k, meets, &impossible))
+    if ((meets || (mode.closed && !now->leaves[k])) && is_impossible(&of, k, 0, meets, &impossible))
       return refuse(step, CONTACT_IMPOSSIBLE, k, impossible);
     approach |= meets && /* also one that just does not close yet */
         of.rate[CONTACTS[k].normal] < (now->closes[k] ? 0.0 : -CONTACT_ROUNDING * of.speed[CONTACTS[k].normal]);
@@ -272,7 +272,6 @@ static int begin_contacts(const event_step *step, event_sample *at)
 {
   contact_terms of;
   contact_change now;
-  real impossible = 0.0;
   memset(&now, 0, sizeof now);
   for (int k = 0; k < EVENT_CONTACTS; k++)
     put_mode(CONTACTS + k, CONTACT_IS_OPEN, AT_REST, 0.0, step->watch->mode);
@@ -282,8 +281,9 @@ static int begin_contacts(const event_step *step, event_sample *at)
     const int row = CONTACTS[k].normal;
     if (row >= 0 && !of.absent[k] && of.value[row] < -CONTACT_PENETRATION * of.size[row])
       return refuse(step, CONTACT_PENETRATES, k, of.value[row]);
-    if (is_impossible(&of, k, 1, &impossible))
-      return refuse(step, CONTACT_IMPOSSIBLE, k, impossible);
+    for (int i = 0; i < 3; i++)
+      if (!is_finite(of.coefficient[3 * k + i])) /* steps contain those of open contacts */
+        return refuse(step, CONTACT_IMPOSSIBLE, k, of.coefficient[3 * k + i]);
     now.closes[k] = row >= 0 && !of.absent[k] && fabs(of.value[row]) <= CONTACT_ROUNDING * of.size[row];
   }
   return change_modes(step, at, &now);
@@ -396,18 +396,22 @@ static real least_gap(const event_step *step, const contact_terms *of, int trans
       (row < 0 ? 0.0 : CONTACT_ROUNDING * of->size[row]);
 }
 
-/* Fails if friction is negative by more than rounding at a node of a part of a step before its first transition. */
+/* Fails if friction is impossible at a node of a part of a step after its start, before its first transition. */
 static int check_friction(const event_step *step)
 {
+  contact_terms of;
+  event_sample at;
+  real impossible = 0.0;
   for (int i = 0; i < TRANSITIONS; i++) {
-    const int e = EVENT_FIRST[FIRST_TRANSITION + i];
-    real largest = 0.0;
-    for (int j = 0; j <= EVENT_DEGREE && TRANSITION[i][1] == CONTACT_DRIVES; j++) {
-      const real value = values_at(step, j)[e];
-      largest = fmax(largest, fabs(value));
-      step->report->t = step->t + EVENT_NODES[j] * step->h;
-      if (value < -CONTACT_ROUNDING * largest && EVENT_NODES[j] <= step->horizon->fraction)
-        return refuse(step, CONTACT_IMPOSSIBLE, TRANSITION[i][0], value);
+    const int e = EVENT_FIRST[FIRST_TRANSITION + i], k = TRANSITION[i][0];
+    for (int j = 1; j <= EVENT_DEGREE && TRANSITION[i][1] == CONTACT_DRIVES; j++) {
+      if (!(values_at(step, j)[e] < 0.0) || EVENT_NODES[j] > step->horizon->fraction)
+        continue;
+      TRY(state_at(step, EVENT_NODES[j], &at));
+      TRY(terms_at(step, &at, &of));
+      step->report->t = at.t;
+      if (is_impossible(&of, k, mode_of(step->watch->mode, k).sticks, 0, &impossible))
+        return refuse(step, CONTACT_IMPOSSIBLE, k, impossible);
     }
   }
   return OK;
