@@ -788,6 +788,19 @@ def test_static_friction_below_that_of_sliding_ends_a_run_at_rest(
     assert [modes for _, modes in run.contact_modes] == [("slip",)]
 
 
+@pytest.mark.parametrize("steps", [{"h": 0.05}, {"h": 0.7}, {}])
+def test_friction_that_is_negative_within_rounding_is_0(steps: dict[str, Any]) -> None:
+    """Differences of large terms: 0 everywhere, and 0.7 (x - b)^2 at rest at and beside b; 1e-14 less is negative."""
+    for friction, speed in (("1 - cos(x)**2 - sin(x)**2", 2.0), ("a*x**2 - 2*a*b*x + a*b**2 - c", 0.0)):
+        contact = sc.contact("y", slip="x_dot", friction=friction)
+        block = of(f"{PLANE} - y", "x y", [contact], "svi:2", a=0.7, b=1 / 3, c=0)
+        for x in (1 / 3, 1 / 3 + 1e-9):
+            run = block.integrate([x, 0], velocity=[speed, 0], t_end=1.0, **steps)
+            assert run.q[-1, 0] == pytest.approx(x + speed, rel=1e-14)
+    with pytest.raises(sc.ContactError, match="friction must not be negative"):
+        block.integrate([1 / 3, 0], velocity=[0, 0], t_end=1.0, parameters={"c": 1e-14}, **steps)
+
+
 def test_coefficients_of_open_contacts_do_not_count() -> None:
     """Friction is 1 - x/3 < 0 at the start, above the floor, and 1 where the block lands after a fall of t = 1."""
     block = of(f"{PLANE} - y", "x y", [sc.contact("y", slip="x_dot", friction="1 - x/3")], "svi:2")

@@ -149,6 +149,7 @@ class Constraints:
         directions: (k, i) of the entries of D.
         masked: number of the last constraints, which are imposed in some modes only.
         coefficients: friction, static friction and restitution of each contact at u = (q, v), or ``None``.
+        coefficient_rounding: bounds of their rounding errors, in units of the round-off.
     """
 
     formulas: tuple[str, ...]
@@ -160,6 +161,7 @@ class Constraints:
     directions: tuple[tuple[int, int], ...] = ()
     masked: int = 0
     coefficients: Kernel | None = None
+    coefficient_rounding: Kernel | None = None
 
     @property
     def count(self) -> int:

@@ -327,6 +327,7 @@ class Program:
                 constraints and constraints.motion,
                 constraints and constraints.reactions,
                 constraints and constraints.coefficients,
+                constraints and constraints.coefficient_rounding,
                 self.damping,
                 self.bath and self.bath.kernel,
                 *(rattle.kernels if rattle else ()),

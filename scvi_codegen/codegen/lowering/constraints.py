@@ -298,4 +298,12 @@ def _reactions(system: LagrangianSystem) -> dict[str, Any]:
             u=(*system.coordinates, *system.velocities),
             purpose="Friction, static friction and restitution of each contact at u = (q, v).",
         ),
+        "coefficient_rounding": system_kernel(
+            system,
+            "coefficient_rounding",
+            coefficients(system),
+            u=(*system.coordinates, *system.velocities),
+            purpose="Rounding errors of these coefficients at u = (q, v), in units of the round-off.",
+            of_rounding=True,
+        ),
     }

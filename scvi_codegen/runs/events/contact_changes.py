@@ -48,12 +48,12 @@ class Rows(NamedTuple):
             for name in contact.masks:
                 place = stepper.interface.parameters.index(name)
                 idle[place], imposed[place] = 0.0, float(name in contact.imposing)
-        numbers, binding = np.zeros(k * (5 + k + m) + 3 * len(contacts)), stepper.binding
+        numbers, binding = np.zeros(k * (5 + k + m) + 6 * len(contacts)), stepper.binding
         blocks = map(binding.pointer, (state[:m], state[m:], idle, imposed, numbers))
         if status := binding.function("contact_terms")(t, *blocks, binding.workspace()):
             raise StateError(f"the contacts at t = {t:.17g}, q = {state[:m]} are undefined: {REASONS[status]}")
         _, rate, second, _, _, inverse, gradients, others = np.split(numbers, np.cumsum([k, k, k, k, k, k * k, k * m]))
-        return cls(rate, second, inverse.reshape(k, k), gradients.reshape(k, m), others.reshape(-1, 3))
+        return cls(rate, second, inverse.reshape(k, k), gradients.reshape(k, m), others.reshape(2, -1, 3)[0])
 
 
 class Part(NamedTuple):

@@ -235,8 +235,8 @@ int NAME(multipliers)(long long count, const real *t, const real *q, const real 
 #ifdef MASKED_CONSTRAINTS
 /* Masked constraints at a state, for the choice of their modes and for impacts: values g, rates G v + .., second rates
  * without forces of these constraints, rounding errors of g, the terms of second rates by whose rounding these differ,
- * |G M^-1| |F| + .., the matrix W = G M^-1 G^T by rows, G by rows, then the coefficients of the contacts. M^-1 includes
- * the reactions of the other constraints. Parameters with masks of 0, and of 1. */
+ * |G M^-1| |F| + .., the matrix W = G M^-1 G^T by rows, G by rows, then the coefficients of the contacts and their
+ * rounding errors. M^-1 includes the reactions of the other constraints. Parameters with masks of 0, and of 1. */
 int NAME(contact_terms)(real t, const real *q, const real *p, const real *idle, const real *imposed, real *terms,
     real *workspace)
 {
@@ -285,6 +285,7 @@ int NAME(contact_terms)(real t, const real *q, const real *p, const real *idle, 
     second_terms[k] += MATH(fabs)(value[M + CONSTRAINTS + FIRST + k]);
   }
   contact_coefficients(u, t, imposed, G + MASKED * M);
+  coefficient_rounding(u, t, imposed, G + MASKED * M + COEFFICIENTS);
   return all_finite(terms, MASKED * (5 + MASKED + M)) ? OK : NOT_FINITE;
 }
 #endif

@@ -506,10 +506,12 @@ static int refuse(const event_step *step, int reason, int k, real value)
 static int is_impossible(const contact_terms *of, int k, int rests, int meets, real *number)
 {
   const real mu = of->coefficient[3 * k], held = of->coefficient[3 * k + 1], e = of->coefficient[3 * k + 2];
-  const int is_friction = !(mu >= 0.0) || (rests && !(held >= (1.0 - CONTACT_ROUNDING) * mu));
+  const real *const noise = of->noise + 3 * k;
+  const int is_less = !(held >= (1.0 - CONTACT_ROUNDING) * mu - noise[0] - noise[1]);
+  const int is_friction = !(mu >= 0.0) || (rests && is_less);
   *number = !is_friction ? e : rests ? fmin(mu, held)
                                      : mu;
-  return is_friction || (meets && !(e >= 0.0 && e <= 1.0));
+  return is_friction || (meets && !(e >= 0.0 && e <= 1.0 + noise[2]));
 }
 
 /* Whether the direction (ahead.w) w + start of a slip in space is that of its second term. */

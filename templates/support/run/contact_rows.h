@@ -44,12 +44,12 @@ static const contact_mode CONTACT_STICKS = {1, 3, 0, {0.0, 0.0}};
 static const contact_mode CONTACT_SLIPS = {1, 0, 0, {0.0, 0.0}};
 
 /* Rows at a state: values and rates, second rates b, the terms of values and of b by whose rounding these differ, W and
- * G by rows, coefficients (mu, mu_s, e; limits of friction without gap), the sizes of values and rates, the rounding of
- * values, and rates at rest. */
+ * G by rows, coefficients (mu, mu_s, e; limits of friction without gap), their roundings, the sizes of values and
+ * rates, the rounding of values, and rates at rest. */
 typedef struct {
   real numbers[CONTACT_NUMBERS];
-  const real *value, *rate, *second, *terms, *W, *G, *coefficient;
-  real *second_terms;
+  const real *value, *rate, *second, *terms, *W, *G;
+  real *second_terms, *coefficient, *noise;
   real size[CONTACT_ROWS], speed[CONTACT_ROWS], rounding[CONTACT_ROWS], drift[CONTACT_ROWS];
   int absent[EVENT_CONTACTS]; /* whether a condition of the contact fails, or the state is behind it */
 } contact_terms;
@@ -133,7 +133,7 @@ static void put_in_all(contact_mode now, real *parameters)
   put_modes(mode, parameters);
 }
 
-/* Evaluates the numbers of the rows at a state. */
+/* Evaluates the numbers of the rows at a state; coefficients that are negative within rounding are 0. */
 static int rows_at(real t, const real *q, const real *p, const real *parameters, contact_terms *of, real *workspace)
 {
   real idle[PARAMETERS], imposed[PARAMETERS];
@@ -148,8 +148,15 @@ static int rows_at(real t, const real *q, const real *p, const real *parameters,
   of->second_terms = of->numbers + 4 * CONTACT_ROWS;
   of->W = of->second_terms + CONTACT_ROWS;
   of->G = of->W + CONTACT_ROWS * CONTACT_ROWS;
-  of->coefficient = of->G + CONTACT_ROWS * M;
-  return NAME(contact_terms)(t, q, p, idle, imposed, of->numbers, workspace);
+  of->coefficient = of->numbers + CONTACT_ROWS * (5 + CONTACT_ROWS + M);
+  of->noise = of->coefficient + 3 * EVENT_CONTACTS;
+  TRY(NAME(contact_terms)(t, q, p, idle, imposed, of->numbers, workspace));
+  for (int i = 0; i < 3 * EVENT_CONTACTS; i++) { /* differences of large terms vanish within rounding */
+    of->noise[i] = is_finite(of->noise[i]) ? CONTACT_LOWEST * DBL_EPSILON * of->noise[i] : 0.0;
+    if (of->coefficient[i] < 0.0 && of->coefficient[i] >= -of->noise[i])
+      of->coefficient[i] = 0.0;
+  }
+  return OK;
 }
 
 static int terms_at(const event_step *step, const event_sample *at, contact_terms *of)
