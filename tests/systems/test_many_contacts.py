@@ -205,6 +205,29 @@ def test_a_bar_slips_about_the_end_that_sticks(first: int) -> None:
     assert [run.q[-1, 2], run.velocity[-1, 2]] == pytest.approx(true, abs=3e-8)
 
 
+@pytest.mark.rotated
+@pytest.mark.parametrize(
+    ("limits", "start", "velocity"),
+    [
+        ((0.1, 0.1, 0.1), 5.7773739487652485, [0.9128992053017935, -0.28041214429472394, -0.7823985759494164]),
+        ((0.05, 0.1, 0.1), 3.2975621260383567, [0.345584192064786, 0.8216181435011584, 0.9053558666731177]),
+    ],
+)
+def test_adaptive_steps_pass_a_slip_that_stops_by_a_small_part_of_its_friction(
+    limits: tuple[float, ...], start: float, velocity: list[float]
+) -> None:
+    """The forces of the other points drive it by .98 of that: its direction relaxes faster than it slows down."""
+    feet = [
+        sc.friction([f"x_dot - {end}*sin(a)*a_dot", f"y_dot + {end}*cos(a)*a_dot"], limit=limit)
+        for end, limit in zip((-0.3, 0, 2), limits, strict=True)
+    ]
+    bar = sc.LagrangianSystem.from_text("bar", ["x", "y", "a"], "(x_dot**2 + y_dot**2 + a_dot**2/20)/2", contacts=feet)
+    stepper = sc.compile_stepper(bar, "svi:3")
+    fixed, run = (stepper.integrate([0, 0, start], velocity=velocity, t_end=12, **steps) for steps in ({"h": 0.01}, {}))
+    assert run.contact_modes[-1][1] == ("stick",) * 3
+    assert run.q[-1] == pytest.approx(fixed.q[-1], abs=2e-5)
+
+
 def test_balls_close_at_once_by_one_formula() -> None:
     floor = sc.contact("y[i] for i in 12", slip="x_dot[i]", friction="mu[i]")
     text, mu = "sum(i in 12, (x_dot[i]**2 + y_dot[i]**2)/2 - 9.81*y[i])", 0.01 * np.arange(1, 13)

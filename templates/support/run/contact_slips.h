@@ -242,7 +242,7 @@ static int turn_slips(const event_step *step, const event_sample *at, const cont
 /* Times of a slip in space, and what is done with its direction at the beginning of a part of a step: it is kept, new,
  * or turned in the part. by_rate: to its stop or from its beginning; relaxes: of its direction. */
 typedef struct {
-  int moves, may_keep, keeps, renews, is_stiff;
+  int moves, stops, may_keep, keeps, renews, is_stiff;
   real by_rate, relaxes;
 } slip_pace;
 
@@ -258,9 +258,10 @@ static slip_pace pace_of(const event_step *step, const contact_terms *of, int k,
   real *const fastest = step->watch->fastest + k;
   const real rate = d[0] * second[slip] + d[1] * second[slip + 1];
   const real by_friction = length_of(force + slip, 2) * of->W[slip * (CONTACT_ROWS + 1)];
-  const int stops = rate < -CONTACT_ROUNDING * by_friction, kept = keeps_direction(start, w);
+  const int kept = keeps_direction(start, w);
+  pace.stops = rate < -CONTACT_ROUNDING * by_friction;
   *fastest = fmax(*fastest, fmax(size, of->speed[slip]));
-  pace.by_rate = (stops ? CONTACT_BRAKES : CONTACT_GROWS) * fmax(size, CONTACT_SLOW * *fastest) / fabs(rate);
+  pace.by_rate = (pace.stops ? CONTACT_BRAKES : CONTACT_GROWS) * fmax(size, CONTACT_SLOW * *fastest) / fabs(rate);
   pace.relaxes = CONTACT_RELAXES * size / by_friction;
   pace.is_stiff = CONTACT_RELAXES * rate <= CONTACT_STIFF * CONTACT_GROWS * by_friction;
   pace.may_keep = rate < -CONTACT_BRAKED * by_friction || !pace.is_stiff;
@@ -302,8 +303,9 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
   contact_terms of;
   contact_mode mode[EVENT_CONTACTS];
   slip_pace pace[EVENT_CONTACTS];
-  real force[CONTACT_ROWS], second[CONTACT_ROWS], part = *longest, smooth = part;
-  int turns[EVENT_CONTACTS] = {0}, turning = 0, changes = 0, status = OK, any;
+  real force[CONTACT_ROWS], second[CONTACT_ROWS], part = *longest, smooth = INFINITY;
+  const real uncut = step->watch->is_cut ? fmax(part, step->watch->pace) : part;
+  int turns[EVENT_CONTACTS] = {0}, turning = 0, stopping = 0, changes = 0, status = OK, any;
   *longest = INFINITY;
   TRY(slips_at(step, at, &of, mode, force, second, &any));
   if (!any)
@@ -315,8 +317,10 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
   }
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int keeps = pace[k].keeps, follows = pace[k].moves && !keeps;
-    turns[k] = follows && pace[k].is_stiff && pace[k].relaxes <= CONTACT_STIFF * smooth;
+    const real size = pace[k].stops ? uncut : part; /* adaptive steps would shrink with a slip to its stop */
+    turns[k] = follows && pace[k].is_stiff && pace[k].relaxes <= CONTACT_STIFF * fmin(size, smooth);
     turning |= turns[k];
+    stopping |= turns[k] && pace[k].stops;
     changes |= turns[k] || pace[k].renews;
     if (keeps && !pace[k].is_stiff)
       *longest = fmin(*longest, fmax(CONTACT_BEGIN * fabs(step->whole), pace[k].by_rate));
@@ -324,7 +328,7 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
       *longest = fmin(*longest, turns[k] ? step->watch->part[k] : fmin(pace[k].by_rate, pace[k].relaxes));
     step->watch->part[k] = turns[k] ? step->watch->part[k] : INFINITY;
   }
-  part = fmin(part, *longest);
+  part = fmin(stopping ? uncut : part, *longest);
   if (changes)
     TRY(add_change(step, FIRST_TRANSITION, at));
   for (int k = 0; k < EVENT_CONTACTS; k++) {

@@ -829,6 +829,9 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
 #endif
     if (status == OK && control)
       watch->pace = fmax(watch->pace, CONTACT_PACE * size);
+#ifdef CONTACTS_IN_SPACE
+    watch->is_cut = size * exp2(0.25) >= longest; /* by a level of sizes */
+#endif
     if (watch->begun && !control && may_be_halved(&step, status, run->h, 0.0)) { /* by parts: only time advances */
       put_in_all(CONTACT_IS_OPEN, own);
       copy_run(run, &before);
