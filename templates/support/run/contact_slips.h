@@ -273,8 +273,8 @@ static slip_pace pace_of(const event_step *step, const contact_terms *of, int k,
   return pace;
 }
 
-/* Keeps the directions of slips that brake to their stops from a state on, or of slow ones that forces turn, where parts
- * of a step are too short for gaps that are rounded; whether there are any, in *any. */
+/* Keeps the directions of slips that brake to their stops from a state on, or of slow ones that forces turn, where
+ * parts of a step are too short for gaps that are rounded; whether there are any, in *any. */
 static int keep_directions(const event_step *step, const event_sample *at, int *any)
 {
   contact_terms of;
