@@ -420,7 +420,7 @@ def test_impacts_of_constrained_systems_equal_those_of_free_coordinates(b, e):
         cotangents[-1] = 1.0, 2.0, 3.0, 4.0
         gradient = one.pullback(cotangents)
         adjoint = np.concatenate([gradient.q, gradient.p, gradient.parameters]) @ initial
-        assert np.abs(adjoint - cotangents[-1] @ found).max() < 1e-13 * np.abs(found).max()
+        assert np.abs(adjoint - cotangents[-1] @ found).max() < 4e-13 * np.abs(found).max()
 
 
 def test_impacts_with_a_time_transformation():
