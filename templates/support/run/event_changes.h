@@ -24,6 +24,7 @@ enum {
 #define CHANGE_LOOSER 16.0 /* ratio of the tolerances of steps that do not meet that of a run, by rounding of gaps */
 #define CHANGE_LOOSEST 0.01 /* beyond which none is tried */
 #define CHANGE_SHORT 0x1p-10 /* steps relative to the pace below which rounding may change momenta */
+#define CHANGE_COUPLED 1e3 /* ratio of its effects with all gaps and with each alone, of rows that nearly depend */
 #define CHANGE_NOISE 64.0 /* largest part of the momenta that rounding changes in such a step, relative to it */
 #define CHANGE_CAUSE 1e-6 /* the least: below it the error has another cause, as a collision */
 #define CHANGE_END 1e-6 /* relative to a step: remaining time at which an accumulation ends the run */
@@ -638,13 +639,13 @@ static int take_step(event_run *run, real t_end, const step_control *control, co
 #if defined(EVENT_CONTACTS) && EVENTS_CONTROLLED
 /* Part of the momenta by which rounding changes them in a step of h. Gaps have errors u r_k, which move positions by
  * X_k u r_k, X = M^-1 G^T W^-1, sqrt((W^-1)_kk) u r_k in the kinetic metric of the motion h sqrt(p v): where W is
- * nearly singular, as on nearly straight legs, the more the shorter the step is. */
-static int part_by_rounding(const event_step *step, event_run *run, real h, real *part)
+ * nearly singular, as on nearly straight legs, the more the shorter it is. *apart: of each gap as the only one. */
+static int part_by_rounding(const event_step *step, event_run *run, real h, real *part, real *apart)
 {
   const event_sample at = {.t = run->t, .q = run->q, .p = run->p};
   contact_terms of;
   contact_mode mode[EVENT_CONTACTS];
-  real force[CONTACT_ROWS], after[CONTACT_ROWS], square = 0.0, power = DBL_MIN;
+  real force[CONTACT_ROWS], after[CONTACT_ROWS], square = 0.0, alone = 0.0, power = DBL_MIN;
   TRY(terms_at(step, &at, &of)); /* and the velocities */
   modes_at(&of, step->watch->mode, mode);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
@@ -655,23 +656,25 @@ static int part_by_rounding(const event_step *step, event_run *run, real h, real
     right[row] = of.rounding[row];
     solve_contacts(&of, mode, right, force, after, NULL);
     square += of.rounding[row] * fabs(force[row]);
+    alone += of.rounding[row] * of.rounding[row] / of.W[row * (CONTACT_ROWS + 1)];
   }
   for (int i = 0; i < M; i++)
     power += at.p[i] * step->memory[3 * M + i];
   *part = sqrt(square / power) / h;
+  *apart = sqrt(alone / power) / h;
   return OK;
 }
 
-/* Whether a step is so short that rounding changes its momenta by more than the tolerance. */
+/* Whether a step is so short that rounding changes its momenta by more than the tolerance, as rows nearly depend on
+ * each other. */
 static int is_rounded(const event_step *step, event_run *before, real size, real tolerance, int *rounded)
 {
-  real part = INFINITY;
-  *rounded = 0;
-  if (fabs(size) >= CHANGE_SHORT * step->watch->pace)
+  real part, apart;
+  *rounded = size == 0.0;
+  if (*rounded || fabs(size) >= CHANGE_SHORT * step->watch->pace)
     return OK;
-  if (size != 0.0)
-    TRY(part_by_rounding(step, before, fabs(size), &part));
-  *rounded = part > CHANGE_NOISE * tolerance;
+  TRY(part_by_rounding(step, before, fabs(size), &part, &apart));
+  *rounded = part > CHANGE_NOISE * tolerance && part > CHANGE_COUPLED * apart;
   return OK;
 }
 
@@ -685,13 +688,13 @@ static int take_rounded_step(event_run *run, event_run *before, real t_end, cons
   const solver_options fixed = step->options ? *step->options : NAME(default_options)();
   event_step exact = *step;
   step_control loose = *control;
-  real part;
+  real part, apart;
   int status = STATUS(STEP_SIZE_UNDERFLOW);
   exact.options = &fixed;
   loose.max_step = fmin(loose.max_step, watch->pace > 0.0 ? watch->pace / CONTACT_PACE : t_end - before->t);
   loose.first_step = &loose.max_step;
   loose.tolerance = fmax(loose.tolerance, DBL_EPSILON);
-  TRY(part_by_rounding(step, before, loose.max_step, &part));
+  TRY(part_by_rounding(step, before, loose.max_step, &part, &apart));
   while ((status != OK || part > CHANGE_NOISE * loose.tolerance) && loose.tolerance < CHANGE_LOOSEST) {
     loose.tolerance *= CHANGE_LOOSER;
     copy_run(run, before);
@@ -699,7 +702,7 @@ static int take_rounded_step(event_run *run, event_run *before, real t_end, cons
     run->steps_to_compare = 1;
     status = take_step(run, t_end, &loose, &exact, size, iterations);
     if (status == OK)
-      TRY(part_by_rounding(step, before, *size, &part));
+      TRY(part_by_rounding(step, before, *size, &part, &apart));
   }
   watch->rounded = fmax(watch->rounded, part);
   if (status != OK || part > CHANGE_NOISE * loose.tolerance || part < CHANGE_CAUSE * loose.tolerance)
