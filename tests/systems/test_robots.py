@@ -510,3 +510,17 @@ def test_trials_and_last_steps_continue_curves_at_sizes_off_the_grid(tmp_path):
         assert run.iterations[1] <= first
         assert run.iterations[-1] <= last
         assert abs(run.q[-1] - exact.q[-1]).max() < tolerance
+
+
+@pytest.mark.second
+def test_splittings_of_bodies_with_inclined_axes_of_inertia_have_two_words(tmp_path):
+    """These axes are numbers of 60 digits."""
+    ball = '<joint name="b" type="ball"/><geom type="capsule" size=".04" fromto="0 0 0 .1 0 -.5"/>'
+    (tmp_path / "ball.xml").write_text(f"<mujoco><worldbody><body>{ball}</body></worldbody></mujoco>")
+    system = sc.LagrangianSystem.from_mjcf(tmp_path / "ball.xml")
+    start = {"q": {"R_b": [1, 0, 0, 0]}, "velocity": {"omega_b": [0.3, 0.4, 0.5]}, "h": 0.002, "steps": 50}
+    one, two = (
+        sc.compile_stepper(system, "stoermer-verlet", precision=precision).integrate(**start)
+        for precision in ("double", "double-double")
+    )
+    assert two.q == pytest.approx(one.q, abs=1e-14)

@@ -19,7 +19,7 @@ from functools import lru_cache
 from itertools import pairwise, permutations
 from typing import Any
 
-from sympy import Add, Expr, Float, Matrix, Quaternion, S, atan2, cos, expand, eye, sin, sqrt, zeros
+from sympy import Add, Expr, Matrix, Quaternion, Rational, S, atan2, cos, expand, eye, sin, sqrt, zeros
 
 from scvi_codegen.common.precision import DIGITS, VANISHING, mp
 from scvi_codegen.systems.derived_expressions import forms_of
@@ -172,7 +172,7 @@ def _body(first: int, v: Sequence[Expr], p: Sequence[Expr], system: MechanicalSy
         return "products of inertia depend on parameters (write them as numbers, or choose principal axes as body axes)"
     values, axes = mp.eigsy(mp.matrix([[str(x.evalf(DIGITS)) for x in row] for row in inverse.tolist()]))
     axes *= mp.sign(mp.det(axes))
-    moments, *rows = ([Float(str(x), DIGITS) for x in row] for row in (values, *axes.tolist()))
+    moments, *rows = ([Rational(str(x)) for x in row] for row in (values, *axes.tolist()))
     return *_axes(first, moments, system), Matrix(rows)
 
 
