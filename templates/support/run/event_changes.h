@@ -114,11 +114,7 @@ static int refine_crossing(const event_step *step, long long first, const event_
   at->t = crossing->t;
   copy_state(at->q, at->p, crossing->q, crossing->p);
 #ifdef EVENT_CONSTRAINTS /* momenta of constrained steps of the size of rounding are ill-conditioned: interpolated */
-  real short_part = fmax(EVENT_TIE * fabs(step->whole), 4.0 * DBL_EPSILON * fabs(step->t));
-#ifdef EVENT_CONTACTS
-  TRY(least_part(step, at, &least));
-  short_part = fmax(short_part, least);
-#endif
+  const real short_part = fmax(EVENT_TIE * fabs(step->whole), 4.0 * DBL_EPSILON * fabs(step->t));
   for (int k = 0; k < M && fabs(*part) < short_part; k++)
     at->p[k] = step->p[k] + *part / step->h * (right->p[k] - step->p[k]);
   for (long long i = first; i < *step->filled; i++)
