@@ -83,6 +83,27 @@ static int stop_together(const event_step *step, event_sample *at, contact_terms
 }
 #endif
 
+/* Closes contacts that touch within rounding and separate by no more than that: those of two feet alternate without end
+ * where each opens until slips stop, which begin with the impact of the other. With others they stop together. */
+static int rest_low(const event_step *step, event_sample *at, contact_terms *of, const real *force, const int *closed,
+    contact_change *now)
+{
+  int any = 0;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int row = CONTACTS[k].normal;
+    const int rests = is_met(of, now, closed, k) && of->value[row] <= CONTACT_LOWEST * of->rounding[row] &&
+        of->rate[row] > 0.0 && is_low(step, of, force, 0.0, k);
+    now->touches[k] |= rests;
+    any |= rests;
+  }
+  if (any)
+    TRY(settle(step, at, of, now));
+#ifdef CONTACTS_IN_SPACE
+  TRY(stop_together(step, at, of, now));
+#endif
+  return OK;
+}
+
 /* Impacts and new modes at a state, which is projected onto their constraints. That may turn slow slips, and modes are
  * chosen again if it makes their forces impossible; none that remain so are kept. */
 static int change_modes(const event_step *step, event_sample *at, contact_change *now)
@@ -113,10 +134,8 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
   forces_at(at->t, at->q, at->p, step->own, present, force, step->workspace);
   if (approach)
     TRY(collide(step, at, &of, closed, none, now));
-#ifdef CONTACTS_IN_SPACE
   else
-    TRY(stop_together(step, at, &of, now));
-#endif
+    TRY(rest_low(step, at, &of, force, closed, now));
   for (int pass = 0; first >= 0 && pass <= EVENT_CONTACTS; pass++) {
     const int status = choose_modes(step, &of, now, force);
     if (status != OK && step->watch->refusal == CONTACT_WITHOUT_MODE && pass < EVENT_CONTACTS &&
