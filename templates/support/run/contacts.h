@@ -104,8 +104,24 @@ static int rest_low(const event_step *step, event_sample *at, contact_terms *of,
   return OK;
 }
 
+/* First contact whose friction acts along its slip in the present modes, -1: none; it would supply energy. */
+static int find_driven(const event_step *step, const contact_terms *of)
+{
+  contact_mode mode[EVENT_CONTACTS];
+  modes_at(of, step->watch->mode, mode);
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const real *const d = mode[k].direction, *const w = of->rate + CONTACTS[k].tangential;
+    real along = 0.0;
+    for (int i = 0; i < CONTACTS[k].slips && mode[k].closed && !mode[k].sticks && !mode[k].held; i++)
+      along += d[i] * w[i];
+    if (along < 0.0 && along < -CONTACT_ROUNDING * of->speed[CONTACTS[k].tangential])
+      return k;
+  }
+  return -1;
+}
+
 /* Impacts and new modes at a state, which is projected onto their constraints. That may turn slow slips, and modes are
- * chosen again if it makes their forces impossible; none that remain so are kept. */
+ * chosen again if it reverses these or makes forces impossible; none that remain so are kept. */
 static int change_modes(const event_step *step, event_sample *at, contact_change *now)
 {
   contact_terms of;
@@ -145,6 +161,8 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
     TRY(satisfy_constraints(step, at->t, at->q, at->p, 1));
     TRY(terms_at(step, at, &of));
     first = find_outside(step, &of, CONTACT_ROUNDING, outside);
+    if (first < 0)
+      first = find_driven(step, &of);
   }
   if (first >= 0)
     first = find_outside(step, &of, CONTACT_OUTSIDE, outside);
