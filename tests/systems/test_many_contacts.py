@@ -604,3 +604,60 @@ def test_slips_that_depend_without_roll_relax_in_few_parts(seed: int) -> None:
     assert np.diff(run.energy()).max() < 0
     assert len(run) < 3500
     assert np.abs(run.q[-1] - fine.q[-1]).max() < 1e-5
+
+
+SQUARE = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
+
+
+def slips_of_foot(x: Any, y: Any) -> list[str]:
+    return [f"x_dot - ({x}*sin(a) + {y}*cos(a))*a_dot", f"y_dot + ({x}*cos(a) - {y}*sin(a))*a_dot"]
+
+
+@cache
+def plate(e: float, force: float) -> Any:
+    """Return the stepper of a plate on four feet that turns by a, in the first order of its tilts b, c."""
+    feet = [sc.contact(f"z + {x}*b + {y}*c", slip=slips_of_foot(x, y), friction=0.3, restitution=e) for x, y in SQUARE]
+    energy = "(x_dot**2 + y_dot**2 + z_dot**2)/2 + 0.05*a_dot**2 + 0.04*b_dot**2 + 0.03*c_dot**2 - 9.81*z"
+    loads = {"x": f"{15 * force}", "a": f"{force}"}
+    system = sc.LagrangianSystem.from_text("plate", [*"xyzabc"], energy, contacts=feet, forces=loads)
+    return sc.compile_stepper(system, "svi:3")
+
+
+@pytest.mark.filterwarnings("ignore:a transition has several motions")
+@pytest.mark.parametrize(("speed", "yaw"), [(1.0, 1e-6), (1.0, 0.05), (3.0, 1e-6), (3.0, 1.0)])
+def test_a_plate_falls_flat_on_four_feet_by_impulses_in_the_cones(speed: float, yaw: float) -> None:
+    """Its momenta change by a sum of N (n - mu w/|w|) with N >= 0 and the slips w after the impact."""
+    run = plate(0.0, 0.0).integrate([0, 0, 0.5, 0.3, 0, 0], velocity=[speed, 0, 0, yaw, 0, 0], h=0.01, t_end=0.4)
+    row = np.flatnonzero(run.t == run.contact_modes[1][0])[-1]
+    v, sine, cosine, pushes = run.velocity[row], np.sin(run.q[row, 3]), np.cos(run.q[row, 3]), []
+    for x, y in SQUARE:
+        slips = np.array([[1, 0, 0, -x * sine - y * cosine, 0, 0], [0, 1, 0, x * cosine - y * sine, 0, 0]])
+        pushes.append([0, 0, 1, 0, x, y] - 0.3 * (slips @ v) @ slips / np.hypot(*slips @ v))
+    change = np.diag([1, 1, 1, 0.1, 0.08, 0.06]) @ (v - [speed, 0, -9.81 * run.t[row], yaw, 0, 0])
+    assert nnls(np.transpose(pushes), change)[1] < 1e-9
+    assert np.abs([run.q[row, 2], *v[[2, 4, 5]]]).max() < 1e-12
+
+
+@pytest.mark.filterwarnings("ignore:a transition has several motions")
+@pytest.mark.parametrize(
+    ("force", "height", "velocity"),
+    [(0.0, 0.02, [-0.778, -1.193, 0, -1.405, 0.625, 0.0765]), (0.02, 0.5, [-0.26, 1.339, 0, 0, 0, 0])],
+)
+def test_bounces_of_a_plate_accumulate_until_it_rests(force: float, height: float, velocity: list[float]) -> None:
+    """Adaptive steps bounce on the same feet as fixed ones; slips that stop with each bounce end no run."""
+    start = {"q": [0, 0, height, 0.3, 0, 0], "velocity": velocity, "t_end": 2.0}
+    fixed, run = (plate(0.4, force).integrate(**start, **steps) for steps in ({"h": 0.001}, {"tolerance": 1e-9}))
+    assert (run.t[-1], run.contact_modes[-1][1]) == (2.0, 4 * ("stick",))
+    assert (run.q[:, 2, None] + run.q[:, 4:] @ SQUARE.T).min() > -2e-10
+    assert np.abs(run.q[-1] - fixed.q[-1]).max() < 3e-5
+
+
+@pytest.mark.parametrize("unit", [100.0, 1000.0])
+def test_a_bar_on_two_points_rests_in_any_unit_of_length(unit: float) -> None:
+    """Momenta of rounding become denormal numbers; the bar stops at v^2/(2 a)."""
+    points = [sc.friction(slips_of_foot(x * unit, 0.0), limit=0.5 * unit) for x in (-0.5, 0.5)]
+    energy = f"(x_dot**2 + y_dot**2)/2 + {0.05 * unit**2}*a_dot**2"
+    bar = sc.LagrangianSystem.from_text("bar", ["x", "y", "a"], energy, contacts=points)
+    run = sc.compile_stepper(bar, "svi:3").integrate([0, 0, 0.3], velocity=[0.3 * unit, 0, 0], h=0.01, t_end=2.0)
+    assert np.abs(run.q[-1] - [0.045 * unit, 0, 0.3]).max() < 1e-12 * unit
+    assert not run.velocity[-1].any()

@@ -374,8 +374,10 @@ static int modes_of_forces(contact_problem *in, int trial, const real *force, co
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal;
     const real tau = length_of(force + CONTACTS[k].tangential, CONTACTS[k].slips);
+    real least = in->scale || normal < 0 ? 0.0 : rounding_at_row(in, in->right, normal);
+    for (int r = 0; in->scale && normal >= 0 && r < CONTACT_ROWS; r++) /* residuals of impulses, which others take */
+      least = fmax(least, CONTACT_EXACT * fabs(of->W[normal * CONTACT_ROWS + r] * force[r]));
     mode[k] = role[k];
-    const real least = in->scale || normal < 0 ? 0.0 : rounding_at_row(in, in->right, normal);
     if (normal >= 0 && force[normal] * of->W[normal * (CONTACT_ROWS + 1)] <= least)
       mode[k] = CONTACT_IS_OPEN;
     if ((trial == 0 && in->begins[k]) ||

@@ -176,15 +176,15 @@ static int terms_at(const event_step *step, const event_sample *at, contact_term
     for (int i = 0; i < M; i++)
       by_velocity += of->G[r * M + i] * v[i];
     /* |G v| <= sqrt(G M^-1 G^T) sqrt(v^T M v), and changes of the rate in a step, by forces that stop others, too */
-    of->speed[r] = sqrt(fabs(of->W[r * (CONTACT_ROWS + 1)] * power)) + fabs(of->rate[r] - by_velocity) +
-        fabs(of->second[r]) * duration;
+    const real fast = sqrt(fabs(of->W[r * (CONTACT_ROWS + 1)] * power)) + fabs(of->rate[r] - by_velocity);
+    of->speed[r] = fast + fabs(of->second[r]) * duration;
     for (int j = 0; j < CONTACT_ROWS; j++) { /* W_rj / W_jj: rate of r by a force that changes that of j by 1 */
       const real *const W = of->W + j * CONTACT_ROWS;
       of->speed[r] += j == r ? 0.0 : fabs(W[r] / fmax(W[j], DBL_MIN) * of->second[j]) * duration;
     }
     of->drift[r] = fabs(of->rate[r] - by_velocity);
     of->rounding[r] = DBL_EPSILON * (fmax(by_position, of->terms[r]) + fabs(at->t) * of->drift[r]);
-    of->size[r] = fmax(by_position, of->terms[r]) + of->speed[r] * duration;
+    of->size[r] = fmax(by_position, of->terms[r]) + fast * duration; /* low rebounds in long steps are above rounding */
   }
   for (int k = 0; k < EVENT_CONTACTS && duration > 0.0; k++) /* rounding of bodies at rest without forces */
     for (int i = 0; i < CONTACTS[k].slips; i++)

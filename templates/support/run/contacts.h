@@ -175,11 +175,12 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
 }
 
 /* Time in which accelerations displace gaps by as much as rounding does, sqrt(2 u r / |r''|), by the terms of both and
- * with the roundings of CONTACT_LOWEST: those of shorter parts of a step change momenta by more than forces. */
+ * with the roundings of CONTACT_LOWEST: those of shorter parts of a step change momenta by more than forces. At least
+ * the rounding of a step. */
 static int least_part(const event_step *step, const event_sample *at, real *least)
 {
   contact_terms of;
-  *least = 0.0;
+  *least = DBL_EPSILON * fabs(step->whole);
   TRY(terms_at(step, at, &of));
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int row = CONTACTS[k].normal;

@@ -57,10 +57,13 @@ static void note_hit(const event_step *step, event_crossing *crossing, real t)
   watch->changes -= watch->changes % CHANGES_IN_WINDOW; /* a geometric series ends */
   watch->window = watch->time;
 #ifdef EVENT_CONTACTS
-  if (is_transition(crossing->function) && TRANSITION[crossing->function - FIRST_TRANSITION][1] == CONTACT_CLOSES) {
+  if (is_transition(crossing->function)) { /* slips that stop and begin accumulate with impacts of other contacts */
+    const int *const transition = TRANSITION[crossing->function - FIRST_TRANSITION];
     const int rests = last * ratio / (1.0 - ratio) < CHANGE_REST * fabs(watch->time - history->since);
-    watch->accumulates[TRANSITION[crossing->function - FIRST_TRANSITION][0]] = rests;
-    history->hits *= !rests;
+    if (transition[1] == CONTACT_CLOSES) {
+      watch->accumulates[transition[0]] = rests;
+      history->hits *= !rests;
+    }
     return;
   }
 #endif
