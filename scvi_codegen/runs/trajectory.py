@@ -230,7 +230,8 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
             raise StateError(
                 f"the energy of '{self.stepper.interface.system}' changes ({account.reason}), and the work is "
                 "unknown, so that the change is no error: use energy(). Work requires a method with a curve, L or H "
-                "without time, and at impacts all states (save_every=1)"
+                "without time, and of impacts and contacts all states of integrate(..), save_every=1: ensembles do not "
+                "keep them"
             )
         if not np.isfinite(account.change).all():  # of arrays of run-time sizes
             raise undefined_energy(self.q, self.p)

@@ -153,7 +153,7 @@ class IndividualRuns:
         integrate = partial(ensemble.stepper.integrate, ensemble.q[j], ensemble.p[j], **arguments)
         with without_accuracy_warnings():
             if error is not None:
-                with suppress(StateError, StepFailedError):
+                with suppress(StateError, StepFailedError, EventError):
                     states = integrate(error=error)
                     self.confirmations[j], cast(list[Any], self.plans)[j] = states.confirmation, states.plan
                     self._store(j, states, rows, OK)

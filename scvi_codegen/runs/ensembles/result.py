@@ -190,10 +190,15 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
 
     @property
     def failures(self) -> dict[int, str]:
-        """Why each trajectory that failed did, by its number: as a single run says, or the cause by its status."""
-        failed = np.flatnonzero(~self.ok & (self.status != INTERRUPTED)).tolist()
-        causes = (self.messages.get(j) or ". ".join(FAILURES[str(self.status[j])]) for j in failed)
-        return dict(zip(failed, causes, strict=True))
+        """Why each trajectory that failed did, by its number: as a single run says, or the time and the cause."""
+        failed, ends = np.flatnonzero(~self.ok & (self.status != INTERRUPTED)).tolist(), self.ends[0]
+
+        def cause_of(j: int) -> str:
+            steps = int(self.steps[j])
+            t = ends[j] if self.h is None or self.tau is not None else self.times[0, j] + steps * self.h
+            return f"after t = {t:.6g}, {steps} steps: {'. '.join(FAILURES[str(self.status[j])])}"
+
+        return {j: self.messages.get(j) or cause_of(j) for j in failed}
 
     @property
     def ends(self) -> tuple[Array, Array, Array]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from scvi_codegen.codegen.native.options import REASONS
 from scvi_codegen.common.errors import AccuracyWarning, ContactError, EventWarning, MethodError, warn
+from scvi_codegen.runs.events.contact_changes import Rows
 from scvi_codegen.runs.results.saved_states import Array, SavedStates, parameters_on_sides
 from scvi_codegen.runs.states.validation import Parameters, States
 from scvi_codegen.runs.stepping.integrator import Integrator
@@ -17,9 +18,12 @@ REFUSALS = {
     1: "the run starts at t = {t:.17g} with the gap of contact {k} at {value:.6g}, which must not be negative: "
     "correct the initial positions, the range of the joint, or the sign of the gap",
     3: "no impulses satisfy the law of impact with friction at t = {t:.17g}, contact {k}: reduce its friction",
-    5: "contact {k} has an impossible coefficient at t = {t:.17g}, {value:.6g}: friction must not be negative, nor "
-    "static friction at rest less than that of sliding; restitution must be 0 to 1. Correct the formula or the number, "
-    "as with max(0, ..)",
+    5: "friction of contact {k} is {value:.6g} at t = {t:.17g}: friction must not be negative, nor undefined. Correct "
+    "the formula or the number, as with max(0, ..)",
+    8: "static friction of contact {k} is {value:.6g} at t = {t:.17g}: at rest it must not be less than that of "
+    "sliding. Correct one of the formulas or numbers, as with max(..)",
+    9: "restitution of contact {k} is {value:.6g} at t = {t:.17g}: it must not be negative, nor exceed 1. Correct the "
+    "formula or the number, as with max(0, min(1, ..))",
     2: "neither forces nor impulses of the contacts are consistent at t = {t:.17g}: the contacts contradict each "
     "other, or none were found. Reduce friction, or use fewer contacts",
     6: "contact {k} pulls, or exceeds its friction, at t = {t:.17g} in each mode that was tried: limit the steps by "
@@ -31,6 +35,10 @@ REFUSALS = {
 """Messages by the reasons of contacts.h."""
 NOISE = 1e-9
 """Part of the momenta that rounding changes in a step, from which on it may be why adaptive steps fail."""
+SOON = 1e-9
+"""Time relative to that of a failure of adaptive steps, after which friction is undefined if that is why they fail."""
+PARTS = 0.5 ** np.arange(4, -1, -1)
+"""Parts of a step after which friction is evaluated."""
 ROUNDED = (
     "rounding of the gaps of closed contacts changes the momenta by {part:.1e} of their size in a step, and by more in "
     "shorter ones, as on nearly straight legs: give fixed steps (h=), or a larger tolerance"
@@ -55,6 +63,25 @@ def modes_in_failure(stepper: Integrator, watch: Any) -> str:
     part = getattr(watch, "rounded", 0.0)
     reason = f". Or {ROUNDED.format(part=part)}" if part > NOISE else ""
     return f"{reason}. Modes of contacts: {', '.join(closed)}" if closed else ""
+
+
+def undefined_friction(run: Any, watch: Any) -> ContactError | None:
+    """Return the error of a closed contact whose friction is undefined in the step that failed, or soon."""
+    stepper, values = run.stepper, run.parameters.copy()
+    contacts = stepper.interface.contacts
+    if not (contacts and watch.begun):
+        return None
+    values[stepper.mode_columns] = list(watch.mode)[: len(stepper.modes)]
+    named, velocity = stepper.parameters_by_name(values), stepper.velocity(run.q, run.p, run.t, values)
+    closed = [k for k, contact in enumerate(contacts) if contact.mode(named) is not ContactMode.OPEN]
+    for ahead in (run._step_size or SOON * abs(run.t)) * PARTS:
+        state, t = np.concatenate([run.q + ahead * velocity, run.p]), run.t + ahead
+        friction = Rows.at(stepper, state, t, values).coefficients[:, :2].sum(axis=1)
+        for k in closed:
+            if not np.isfinite(friction[k]):
+                title = f"{k + 1} ({contacts[k].title})"
+                return ContactError(REFUSALS[5].format(k=title, value=friction[k], t=t))
+    return None
 
 
 def check_forward(run: Any) -> None:

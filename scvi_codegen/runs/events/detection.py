@@ -11,8 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native.options import step_failure
-from scvi_codegen.common.errors import EventError, EventWarning, warn
-from scvi_codegen.runs.events.contacts import check_forward, modes_in_failure, refusal_of, warn_of_choices
+from scvi_codegen.common.errors import EventError, EventWarning, StepFailedError, warn
+from scvi_codegen.runs.events.contacts import (
+    check_forward,
+    modes_in_failure,
+    refusal_of,
+    undefined_friction,
+    warn_of_choices,
+)
 from scvi_codegen.runs.results.saved_states import Array, ModeHistory, SavedStates
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.step_plan import Fixed
@@ -136,6 +142,8 @@ class CrossingSearch:
         self._record(crossings, int(filled[0]))
         report, count = run._report, int(run._report.stored) + 1
         failure = self._failure(status, report, number + int(report.steps), run._step_size) if status else None
+        if isinstance(failure, StepFailedError):
+            failure = undefined_friction(run, self.watch) or failure
         if not (failure or self.ended or report.steps == size or run.arrived):
             self._capacity *= 2  # too small for the crossings of a step
         t, q, p, lengths = (column[:count] for column in rows)

@@ -503,17 +503,22 @@ static int refuse(const event_step *step, int reason, int k, real value)
   return NOT_CONVERGED;
 }
 
-/* Whether friction is negative, less static than sliding at rest, or the restitution of a contact that meets others is
- * not in [0, 1]; that number. */
-static int is_impossible(const contact_terms *of, int k, int rests, int meets, real *number)
+/* Why a coefficient is impossible, 0 if none is: friction is negative or undefined, less static than sliding at rest,
+ * or the restitution of a contact that meets others is not in [0, 1]; that number. */
+static int impossible_reason(const contact_terms *of, int k, int rests, int meets, real *number)
 {
   const real mu = of->coefficient[3 * k], held = of->coefficient[3 * k + 1], e = of->coefficient[3 * k + 2];
   const real *const noise = of->noise + 3 * k;
-  const int is_less = !(held >= (1.0 - CONTACT_ROUNDING) * mu - noise[0] - noise[1]);
-  const int is_friction = !(mu >= 0.0) || (rests && is_less);
-  *number = !is_friction ? e : rests ? fmin(mu, held)
-                                     : mu;
-  return is_friction || (meets && !(e >= 0.0 && e <= 1.0 + noise[2]));
+  *number = e;
+  if (!(mu >= 0.0)) {
+    *number = mu;
+    return CONTACT_IMPOSSIBLE;
+  }
+  if (rests && !(held >= (1.0 - CONTACT_ROUNDING) * mu - noise[0] - noise[1])) {
+    *number = held;
+    return CONTACT_WEAKENS;
+  }
+  return meets && !(e >= 0.0 && e <= 1.0 + noise[2]) ? CONTACT_REPELS : 0;
 }
 
 /* Whether the direction (ahead.w) w + start of a slip in space is that of its second term. */
@@ -536,8 +541,9 @@ static int choose_modes(const event_step *step, const contact_terms *of, const c
     const real *const start = step->watch->mode + CONTACTS[k].direction + 1, *const d = present[k].direction;
     const int slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
     const int is_still = in.limit[k] && length_of(of->rate + slip, slips) <= CONTACT_ROUNDING * of->speed[slip];
-    if (!in.is_free[k] && is_impossible(of, k, is_still, 0, &impossible))
-      return refuse(step, CONTACT_IMPOSSIBLE, k, impossible);
+    const int reason = in.is_free[k] ? 0 : impossible_reason(of, k, is_still, 0, &impossible);
+    if (reason)
+      return refuse(step, reason, k, impossible);
     directed[k] = slips == 2 && in.role[k].closed && !in.limit[k] && start[-1] != 0.0 && !present[k].held &&
         keeps_direction(start, of->rate + slip);
     for (int i = 0; directed[k] && i < 2; i++)

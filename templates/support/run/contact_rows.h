@@ -14,9 +14,11 @@ enum {
   CONTACT_WITHOUT_MODE, /* and without impact: redundant contacts */
   CONTACT_WITHOUT_IMPULSE,
   CONTACT_IN_CORNER,
-  CONTACT_IMPOSSIBLE, /* coefficients */
+  CONTACT_IMPOSSIBLE, /* friction, or a coefficient that is undefined */
   CONTACT_LEAVES_CONE,
-  CONTACT_GAINS_ENERGY
+  CONTACT_GAINS_ENERGY,
+  CONTACT_WEAKENS, /* static friction at rest, below that of sliding */
+  CONTACT_REPELS /* restitution */
 };
 
 /* A contact without gap is always closed; one without friction does not stick, and has direction 0. Slip in space that

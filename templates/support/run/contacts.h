@@ -142,8 +142,10 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
     now->rests[k] = mode.sticks || (mode.closed && mode.held) || (now->stops[k] && stops_at(step, &of, k));
     now->rests[k] &= !now->begins[k];
     const int meets = is_met(&of, now, closed, k);
-    if ((meets || (mode.closed && !now->leaves[k])) && is_impossible(&of, k, 0, meets, &impossible))
-      return refuse(step, CONTACT_IMPOSSIBLE, k, impossible);
+    const int acts = meets || (mode.closed && !now->leaves[k]);
+    const int reason = acts ? impossible_reason(&of, k, 0, meets, &impossible) : 0;
+    if (reason)
+      return refuse(step, reason, k, impossible);
     approach |= meets && /* also one that just does not close yet */
         of.rate[CONTACTS[k].normal] < (now->closes[k] ? 0.0 : -CONTACT_ROUNDING * of.speed[CONTACTS[k].normal]);
   }
@@ -321,7 +323,7 @@ static int begin_contacts(const event_step *step, event_sample *at)
       return refuse(step, CONTACT_PENETRATES, k, of.value[row]);
     for (int i = 0; i < 3; i++)
       if (!is_finite(of.coefficient[3 * k + i])) /* steps contain those of open contacts */
-        return refuse(step, CONTACT_IMPOSSIBLE, k, of.coefficient[3 * k + i]);
+        return refuse(step, i < 2 ? CONTACT_IMPOSSIBLE : CONTACT_REPELS, k, of.coefficient[3 * k + i]);
     now.closes[k] = row >= 0 && !of.absent[k] && fabs(of.value[row]) <= CONTACT_ROUNDING * of.size[row];
   }
   return change_modes(step, at, &now);
@@ -448,8 +450,9 @@ static int check_friction(const event_step *step)
       TRY(state_at(step, EVENT_NODES[j], &at));
       TRY(terms_at(step, &at, &of));
       step->report->t = at.t;
-      if (is_impossible(&of, k, mode_of(step->watch->mode, k).sticks, 0, &impossible))
-        return refuse(step, CONTACT_IMPOSSIBLE, k, impossible);
+      const int reason = impossible_reason(&of, k, mode_of(step->watch->mode, k).sticks, 0, &impossible);
+      if (reason)
+        return refuse(step, reason, k, impossible);
     }
   }
   return OK;
