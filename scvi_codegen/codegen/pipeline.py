@@ -80,6 +80,7 @@ from scvi_codegen.methods.discretise import discretise, discretised_form
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import tables_in_two_words
 from scvi_codegen.systems.arrays.symmetry import momentum_maps
+from scvi_codegen.systems.constraints import dissipates
 from scvi_codegen.systems.contacts.modes import bound_contacts
 from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.derived_expressions import forms_of
@@ -202,6 +203,7 @@ def describe(
         constraints=program.constraints.formulas if program.constraints else (),
         masked=len(system.reactions),
         conserves_energy=not system.changes_energy and not system.inputs,
+        dissipates=bool(system.reactions) and dissipates(system),
         arrays=_arrays_of(system),
         indices=tuple(f"{name} = {value}" for name, value in system.indices.items()),
         rotations=tuple(rotation.declaration for rotation in system.rotations),

@@ -387,6 +387,7 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controll
         contact_rows=interface.masked,
         first_contact_row=len(interface.constraints) - interface.masked,
         transitions=tuple((event.contact, event.kind) for event in events if isinstance(event, Transition)),
+        dissipates=interface.dissipates and all(isinstance(e, Transition) for e in events if e.changes_state),
     )
 
 

@@ -183,6 +183,7 @@ class EventSearch:
         vectors: number of components of each coordinate, rotation and direction, in order.
         contact_rows, first_contact_row: number of rows, and of the constraints before them.
         transitions: contact and kind of each of their transitions, the events before the kinks.
+        dissipates: whether energy cannot grow, also at events.
         elements: number of functions of each event, one for each element of its loops.
         ENTRY: name of the entry templates.
     """
@@ -216,6 +217,7 @@ class EventSearch:
     contact_rows: int = 0
     first_contact_row: int = 0
     transitions: tuple[tuple[int, str], ...] = ()
+    dissipates: bool = False
     ENTRY: ClassVar[str] = "events"
 
     @property

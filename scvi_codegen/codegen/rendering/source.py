@@ -387,6 +387,7 @@ class Interface:
         conserves_energy: whether energy is a first integral.
         changes_energy: reason why it is not conserved; ``None`` if it is.
         balances_energy: whether it changes by the work of forces or damping only.
+        dissipates: whether it has contacts and cannot grow.
         arrays: declarations of arrays of known sizes, first those whose entries are the coordinates in order, then
             those whose entries are parameters; none without arrays.
         indices: sizes and index tables of these arrays, ``"N = 3"``, ``"pairs = [[0, 1], [1, 2]]"``.
@@ -436,6 +437,7 @@ class Interface:
     conserves_energy: bool = False
     changes_energy: str | None = None
     balances_energy: bool = False
+    dissipates: bool = False
     solver: str = ""
     arrays: tuple[str, ...] = ()
     indices: tuple[str, ...] = ()

@@ -30,6 +30,9 @@ REFUSALS = {
     "max_step= (or h=), or reduce its friction",
     7: "simultaneous impacts with friction would create kinetic energy by Newton's law at t = {t:.17g}, contact {k}: "
     'reduce their friction, or use impacts="sequential"',
+    10: "steps of all sizes create energy at t = {t:.17g}, at last {value:.3g}: the motion ends there (a collision, a "
+    "singularity), or closed contacts nearly depend on each other, as of legs that pass straight. Set t_end before "
+    "that time, or give another tolerance, or h (fixed step size)",
     4: "the impacts at t = {t:.17g} do not end: contacts close a corner; set a restitution to 0",
 }
 """Messages by the reasons of contacts.h."""

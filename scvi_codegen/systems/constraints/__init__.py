@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+import numpy as np
 import sympy
 from sympy import Expr, Symbol
 from sympy.core.function import AppliedUndef
@@ -136,6 +137,19 @@ def constraint_power(system: Constrained) -> Expr:
         apart = oblique.get((k, i), sympy.S.Zero) - ideal.get((k, i), sympy.S.Zero).xreplace(imposed)
         terms.append(constraint_multipliers(system)[k] * apart * system.velocities[i])
     return sympy.Add(*terms)
+
+
+def dissipates(system: Any) -> bool:
+    """Return whether energy cannot grow: by ideal constraints, friction, and forces -C v of numbers C >= 0."""
+    friction = {x: sympy.S.Zero for x in system.parameters if re.fullmatch(r"contact_\d+_(direction|slides)", x.name)}
+    at_rest = dict.fromkeys(system.velocities, sympy.S.Zero)
+    forces = [force.xreplace(friction) for force in system.forces or at_rest.values()]
+    rates = [force.diff(v) for force in forces for v in system.velocities]
+    acts_at_rest = any(x.xreplace(at_rest) for x in (*forces, *velocity_conditions(system)))
+    if system.depends_on_time or system.damping != 0 or system.inputs or acts_at_rest:
+        return False
+    matrix = np.array(rates, float).reshape(system.dimension, -1) if all(x.is_number for x in rates) else np.eye(1)
+    return bool(np.linalg.eigvalsh(matrix + matrix.T).max() <= 1e-12 * np.abs(matrix).max())
 
 
 def constraint_jacobian(system: Constrained) -> dict[tuple[int, int], Expr]:

@@ -18,7 +18,8 @@ enum {
   CONTACT_LEAVES_CONE,
   CONTACT_GAINS_ENERGY,
   CONTACT_WEAKENS, /* static friction at rest, below that of sliding */
-  CONTACT_REPELS /* restitution */
+  CONTACT_REPELS, /* restitution */
+  CONTACT_CREATES_ENERGY /* in steps of all sizes */
 };
 
 /* A contact without gap is always closed; one without friction does not stick, and has direction 0. Slip in space that

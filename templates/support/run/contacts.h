@@ -120,6 +120,16 @@ static int find_driven(const event_step *step, const contact_terms *of)
   return -1;
 }
 
+/* Removes residuals of slips that stop against the directions in which they begin, where they would stop again. */
+static int remove_residuals(const event_step *step, event_sample *at, contact_terms *of, const contact_change *now)
+{
+  int any = 0;
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    any |= now->rests[k] && CONTACTS[k].slips == 1 &&
+        step->watch->mode[CONTACTS[k].direction] * of->rate[CONTACTS[k].tangential] < 0.0;
+  return any ? settle(step, at, of, now) : OK;
+}
+
 /* Impacts and new modes at a state, which is projected onto their constraints. That may turn slow slips, and modes are
  * chosen again if it reverses these or makes forces impossible; none that remain so are kept. */
 static int change_modes(const event_step *step, event_sample *at, contact_change *now)
@@ -160,6 +170,7 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
         jump(step, at, &of, now))
       continue;
     TRY(status);
+    TRY(remove_residuals(step, at, &of, now));
     TRY(satisfy_constraints(step, at->t, at->q, at->p, 1));
     TRY(terms_at(step, at, &of));
     first = find_outside(step, &of, CONTACT_ROUNDING, outside);

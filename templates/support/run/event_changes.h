@@ -13,6 +13,7 @@
 enum {
   CHANGE_ROUNDS = 20, /* largest number of passes over the walls of a corner */
   CHANGES_IN_STEP = 100000, /* largest number of changes of the state in a step */
+  CHANGE_CREEPS = 64, /* largest number of successive adaptive steps in which time hardly advances */
   CHANGES_IN_WINDOW = 1000, /* number of changes whose time is compared with the mean time between changes */
   CHANGE_GAPS = 8 /* intervals between hits from which their accumulation is estimated */
 };
@@ -27,6 +28,9 @@ enum {
 #define CHANGE_COUPLED 1e3 /* ratio of its effects with all gaps and with each alone, of rows that nearly depend */
 #define CHANGE_NOISE 64.0 /* largest part of the momenta that rounding changes in such a step, relative to it */
 #define CHANGE_CAUSE 1e-6 /* the least: below it the error has another cause, as a collision */
+#define CHANGE_GAIN 1e3 /* part of the energy of motion by which a step may create some, relative to the tolerance .. */
+#define CHANGE_MOST 1e-2 /* .. and the largest one: by steps from rest, of 173 tolerances */
+#define CHANGE_FAIR 1e-9 /* least tolerance of energies: rounding of gaps changes them by 1e-11 in the shortest steps */
 #define CHANGE_END 1e-6 /* relative to a step: remaining time at which an accumulation ends the run */
 
 /* Records the interval since the last hit. If the last intervals decrease geometrically and the remaining ones are
@@ -52,8 +56,8 @@ static void note_hit(const event_step *step, event_crossing *crossing, real t)
   }
   watch->end = t + (step->h < 0.0 ? -1.0 : 1.0) * (ratio < 1.0 ? last * ratio / (1.0 - ratio) : 0.0);
   if (history->hits <= CHANGE_GAPS || high >= 1.0 ||
-      high - low > CHANGE_RATIO * ratio + 50.0 * DBL_EPSILON * fabs(t) / last + history->rounding / last)
-    return;
+      !(high - low <= CHANGE_RATIO * ratio + 50.0 * DBL_EPSILON * fabs(t) / last + history->rounding / last))
+    return; /* also where some are 0 */
   watch->changes -= watch->changes % CHANGES_IN_WINDOW; /* a geometric series ends */
   watch->window = watch->time;
 #ifdef EVENT_CONTACTS
@@ -677,6 +681,33 @@ static int is_rounded(const event_step *step, event_run *before, real size, real
   return OK;
 }
 
+/* Fails if a step with its changes creates energy, of a system that cannot, by more than parts of the largest p . v so
+ * far and of the work of normal forces, in given modes, along the sizes of their gaps, which are rounded. Independent
+ * of the error estimate: states in a step, in which straight legs fold at once, solve the equations of its parts. */
+static int check_energy(const event_step *step, event_run *before, event_run *run, const real *modes, real tolerance)
+{
+  const event_sample left = {.t = before->t, .q = before->q, .p = before->p};
+  contact_terms of;
+  contact_mode mode[EVENT_CONTACTS];
+  real force[CONTACT_ROWS], after[CONTACT_ROWS], first, last, power = 0.0, allowed, *const v = step->memory + 3 * M;
+  TRY(NAME(energy)(left.t, left.q, left.p, step->own, &first, step->workspace));
+  TRY(NAME(energy)(run->t, run->q, run->p, step->own, &last, step->workspace));
+  TRY(NAME(velocity)(run->t, run->q, run->p, step->own, v, step->workspace));
+  for (int i = 0; i < M; i++)
+    power += run->p[i] * v[i];
+  power = step->watch->vigour = fmax(step->watch->vigour, power);
+  allowed = fmin(CHANGE_GAIN * tolerance, CHANGE_MOST) * power + CONTACT_LOWEST * DBL_EPSILON * fabs(first);
+  if (last - first <= allowed)
+    return OK;
+  TRY(terms_at(step, &left, &of));
+  modes_at(&of, modes, mode);
+  solve_contacts(&of, mode, of.second, force, after, NULL);
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    allowed += CONTACTS[k].normal < 0 ? 0.0 : tolerance * fabs(force[CONTACTS[k].normal]) * of.size[CONTACTS[k].normal];
+  step->watch->gain = last - first > allowed ? last - first : 0.0;
+  return step->watch->gain > 0.0 ? NOT_CONVERGED : OK;
+}
+
 /* Takes an adaptive step where none meets the tolerance since gaps of closed contacts are rounded, whose part of the
  * error grows as steps get shorter: with the least larger tolerance that one of any size so far meets, its equations
  * solved as those of fixed steps. The next step has a half of that tolerance, then a quarter .. */
@@ -814,20 +845,10 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
       status = NOT_CONVERGED;
 #if EVENTS_CONTROLLED
     if (status == OK && control && run->t != t_end)
-      TRY(is_rounded(&step, &before, size, shorter.tolerance, &rounded));
+      status = is_rounded(&step, &before, size, shorter.tolerance, &rounded);
+    rounded |= watch->creeps > 8 * CHANGE_CREEPS;
     if (status == STATUS(STEP_SIZE_UNDERFLOW) || rounded)
       status = take_rounded_step(run, &before, t_end, &shorter, &step, &size, &count);
-    if (status == STATUS(STEP_SIZE_UNDERFLOW) && opened != before.t) { /* as where no part of a fixed step is solved */
-      event_sample at = {.t = opened = before.t, .q = run->q, .p = run->p};
-      int opens;
-      copy_run(run, &before);
-      step.whole = watch->pace / CONTACT_PACE;
-      run->error_before = 0.0;
-      TRY(open_nearly_held(&step, &at, &opens));
-      status = opens ? OK : status;
-      if (opens)
-        continue;
-    }
 #endif
     if (status == OK && control)
       watch->pace = fmax(watch->pace, CONTACT_PACE * size);
@@ -845,11 +866,32 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
 #endif
     if (status == OK)
       status = change_in_step(&before, run, &step, control != NULL, size, count, &to);
+#if defined(EVENT_CONTACTS) && EVENTS_CONTROLLED
+    if (ENERGY_DECREASES && status == OK && control)
+      status = check_energy(&step, &before, run, watched.begun ? watched.mode : watch->mode,
+          fmax(control->tolerance, CHANGE_FAIR));
+    watch->creeps = control && run->t - before.t < CONTACT_UNSOLVED * watch->pace ? watch->creeps + 1 : 0;
+    if (control && opened != before.t &&
+        (status == OK ? watch->creeps > CHANGE_CREEPS : status == STATUS(STEP_SIZE_UNDERFLOW))) {
+      int opens; /* as where no part of a fixed step is solved */
+      if (status != OK)
+        copy_run(run, &before);
+      event_sample at = {.t = opened = before.t, .q = run->q, .p = run->p};
+      step.whole = watch->pace / CONTACT_PACE;
+      run->error_before = 0.0;
+      const int changed = open_nearly_held(&step, &at, &opens);
+      status = changed == OK && !opens ? status : changed;
+      if (status == OK && opens)
+        continue;
+    }
+#endif
     if (status != OK) {
       int again = 0;
 #ifdef EVENT_CONTACTS
       unsolved = 0.5 * size;
       again = control && may_be_halved(&step, status, size, watch->pace);
+      if (watch->gain > 0.0 && !again)
+        refuse(&step, CONTACT_CREATES_ENERGY, -1, watch->gain);
 #endif
       copy_run(run, &before);
       report->stored = kept;
