@@ -156,8 +156,8 @@ def contact_modes(states: Any) -> list[tuple[float, tuple[str, ...]]]:
 def contact_forces(states: Any) -> Array:
     """Return (n, contacts, 1 + slips) normal and tangential forces, at a transition those after it.
 
-    Of contacts that depend on each other, as of the legs of a table, only the resultant is unique: these are the forces
-    of least norm, of friction relative to its limits, with a warning.
+    Of contacts that depend on each other, as of the legs of a table, only the resultant is unique: these are the
+    centre of the forces within the limits of friction, for small loads of least norm, with a warning.
     """
     stepper: Any = _with_contacts(states)
     contacts, binding, total = stepper.interface.contacts, stepper.binding, np.zeros(stepper.interface.masked)

@@ -3,13 +3,16 @@
 /* Forces of contacts in their modes: W f = -b for the imposed rows of r'' = b + W f (contacts.h). */
 enum {
   CONTACT_LEVELS = 3, /* of pivots, from 1 down to CONTACT_DEPENDENT */
-  CONTACT_PASSES = 4 /* over friction of dependent rows, by which it does not exceed its limit */
+  CONTACT_DESCENTS = 50 /* of the barrier of friction, for each of its extensions */
 };
 
 /* CONTACT_ROUNDING for modes that a run keeps, whose slips have turned since: directions of those as slow as
  * CONTACT_SLOW, from which on they are kept, have rounding errors of DBL_EPSILON / CONTACT_SLOW (measured: .6). */
 #define CONTACT_OUTSIDE (4.0 * DBL_EPSILON / CONTACT_SLOW)
-#define CONTACT_HEAVIER 1e3 /* weight of friction beyond its limit: what remains of the excess is the square of 1/1e3 */
+#define CONTACT_EXACT 0x1p-40 /* residual of refined forces in the friction cones, and least part of a descent */
+#define CONTACT_INSIDE 1e-12 /* least distance 1 - |u|^2 of friction from its limit with a barrier .. */
+#define CONTACT_NEARER 0.1 /* .. and ratio of those from 1 down to it */
+#define CONTACT_CENTRED 1e-12 /* relative descent of the barrier at which its minimum is found */
 #define CONTACT_DEPENDENT 1e-12 /* part of a column below which a pivot counts as 0 */
 
 /* Reduces the rows (A, b) by elimination with the pivots on the diagonal that are independent of those before but for
@@ -38,10 +41,11 @@ static int eliminate(real (*line)[CONTACT_ROWS + 1], int count, int *independent
   return others;
 }
 
-/* Moves a solution of dependent columns along their null vectors to that of the least sum of weight x^2. */
-static void reduce_norm(real (*line)[CONTACT_ROWS + 1], int count, const int *independent, const real *weight, real *x)
+/* Moves a solution of dependent columns along their null vectors to that of the least sum of weight x^2; the number of
+ * these vectors. */
+static int reduce_norm(real (*line)[CONTACT_ROWS + 1], int count, const int *independent, const real *weight, real *x,
+    real (*null)[CONTACT_ROWS])
 {
-  real null[CONTACT_ROWS][CONTACT_ROWS];
   int found = 0;
   for (int d = 0; d < count; d++) {
     real *const n = null[found], norm = 0.0, along = 0.0;
@@ -66,6 +70,7 @@ static void reduce_norm(real (*line)[CONTACT_ROWS + 1], int count, const int *in
     }
     found++;
   }
+  return found;
 }
 
 /* Rate of a row, right + W f. */
@@ -146,15 +151,97 @@ static real discord_of(const contact_terms *of, const real *rates, const real *m
   return largest;
 }
 
-/* Solves for the forces of the rows in given modes with after = right + W f = 0 in imposed rows, those of least norm,
- * friction relative to its limit, if these are dependent; what exceeds it weighs more in the later passes. Returns by
- * how much they contradict each other, or such forces differ in the rates, relative to these, whose terms have given
- * sizes at least. If `imposed` is not NULL, it becomes 1 for rows to impose, which are independent. */
+/* Sum over friction of L B(u), u = f / L, and over normal forces of N^2 / load: convex in both. B = -log z with
+ * z = 1 - |u|^2, for z < `least` its extension by a parabola (J. Hauser & A. Saccon, Proc. 45th IEEE Conf. Decis.
+ * Control, 2006). Also the equations of Newton's method along null vectors, and the smallest z. */
+static real state_barrier(const contact_terms *of, const contact_unknowns *in, real (*null)[CONTACT_ROWS], int vectors,
+    const real *x, real load, real least, real (*line)[CONTACT_ROWS + 1], real *smallest)
+{
+  real force[CONTACT_ROWS] = {0.0}, d[2][CONTACT_ROWS] = {{0.0}}, along[CONTACT_ROWS], sum = 0.0;
+  int next;
+  *smallest = INFINITY;
+  for (int i = 0; i < in->count; i++)
+    force[in->row[i]] = x[i];
+  for (int e = 0; e < vectors; e++)
+    memset(line[e], 0, sizeof *line);
+  for (int i = 0; i < in->count; i = next) {
+    const int k = in->owner[i];
+    const real bound = k < 0 ? load : friction_limit(of, k, 1, force), limit = fmax(bound, CONTACT_SLOW * load);
+    const real growth = k < 0 || CONTACTS[k].normal < 0 || bound < limit ? 0.0 : of->coefficient[3 * k + 1];
+    real u[2] = {0.0}, slope = -1.0, bend = 0.0;
+    for (next = i; next == i || (k >= 0 && next < in->count && in->owner[next] == k); next++)
+      u[next - i] = x[next] / limit;
+    const real z = 1.0 - u[0] * u[0] - u[1] * u[1], beyond = z / least - 2.0;
+    real value = 1.0 - z;
+    if (k >= 0) {
+      value = z < least ? 0.5 * (beyond * beyond - 1.0) - log(least) : -log(z);
+      slope = z < least ? beyond / least : -1.0 / z;
+      bend = pow(fmax(z, least), -2.0);
+      *smallest = fmin(*smallest, z);
+    }
+    for (int e = 0; e < vectors; e++) {
+      const real grows = growth > 0.0 ? growth * null[e][i - 1] : 0.0; /* of the limit, by the normal force */
+      along[e] = 0.0;
+      for (int j = i; j < next; j++) {
+        d[j - i][e] = null[e][j] - u[j - i] * grows;
+        along[e] += u[j - i] * d[j - i][e];
+      }
+      line[e][vectors] += 2.0 * slope * along[e] - grows * value;
+    }
+    for (int e = 0; e < vectors; e++)
+      for (int c = 0; c < vectors; c++)
+        for (int j = 0; j < next - i; j++)
+          line[e][c] += (4.0 * bend * along[e] * along[c] / (next - i) - 2.0 * slope * d[j][e] * d[j][c]) / limit;
+    sum += limit * value;
+  }
+  return sum;
+}
+
+/* Moves forces along null vectors of dependent rows to the centre of those within the limits of friction, by Newton's
+ * method: least norm, relative to the limits, for small loads; there is none at the load at which slip begins (theorems
+ * of limit analysis), where all friction that slips reaches its limit. What exceeds it beyond that is least. */
+static void centre_forces(const contact_terms *of, const contact_unknowns *in, real (*null)[CONTACT_ROWS], int vectors,
+    real load, real (*line)[CONTACT_ROWS + 1], real *x)
+{
+  real trial[CONTACT_ROWS], step[CONTACT_ROWS], slope[CONTACT_ROWS], smallest = -INFINITY;
+  int independent[CONTACT_ROWS];
+  for (real least = 1.0; least > CONTACT_INSIDE && smallest < least / CONTACT_NEARER; least *= CONTACT_NEARER) {
+    real sum = state_barrier(of, in, null, vectors, x, load, least, line, &smallest), descent = INFINITY, part = 1.0;
+    for (int i = 0; i < CONTACT_DESCENTS && part > CONTACT_EXACT && descent > CONTACT_CENTRED * load; i++) {
+      descent = 0.0;
+      for (int e = 0; e < vectors; e++)
+        slope[e] = line[e][vectors];
+      eliminate(line, vectors, independent);
+      for (int e = 0; e < vectors; e++) {
+        step[e] = independent[e] ? line[e][vectors] / line[e][e] : 0.0;
+        descent += slope[e] * step[e];
+      }
+      real next = INFINITY;
+      for (part = 2.0; part > CONTACT_EXACT && !(next <= sum - 1e-4 * part * descent);) {
+        part *= 0.5;
+        for (int r = 0; r < in->count; r++) {
+          trial[r] = x[r];
+          for (int e = 0; e < vectors; e++)
+            trial[r] += part * step[e] * null[e][r];
+        }
+        next = state_barrier(of, in, null, vectors, trial, load, least, line, &smallest);
+      }
+      if (next < sum)
+        memcpy(x, trial, (size_t)in->count * sizeof *x);
+      sum = next;
+    }
+  }
+}
+
+/* Solves for the forces of the rows in given modes with after = right + W f = 0 in imposed rows, those in the centre
+ * of the friction limits if these are dependent. Returns by how much they contradict each other, or such forces differ
+ * in the rates, relative to these, whose terms have given sizes at least. If `imposed` is not NULL, it becomes 1 for
+ * rows to impose, which are independent. */
 static real solve_rows(const contact_terms *of, const contact_mode *mode, const real *right, const real *sizes,
     real *force, real *after, int *imposed)
 {
   contact_unknowns in;
-  real matrix[CONTACT_ROWS][CONTACT_ROWS + 1];
+  real matrix[CONTACT_ROWS][CONTACT_ROWS + 1], null[CONTACT_ROWS][CONTACT_ROWS];
   real x[CONTACT_ROWS], least[CONTACT_ROWS], moved[CONTACT_ROWS] = {0.0}, left[CONTACT_ROWS] = {0.0};
   real weight[CONTACT_ROWS], load = DBL_MIN;
   int independent[CONTACT_ROWS];
@@ -164,20 +251,16 @@ static real solve_rows(const contact_terms *of, const contact_mode *mode, const 
     least[i] = x[i] = independent[i] ? matrix[i][count] / matrix[i][i] : 0.0;
     weight[i] = 1.0;
   }
-  for (int pass = 0; pass < CONTACT_PASSES && dependent; pass++) {
-    reduce_norm(matrix, count, independent, weight, least);
+  if (dependent) {
+    reduce_norm(matrix, count, independent, weight, least, null);
     for (int i = 0; i < count; i++) {
       moved[in.row[i]] = least[i];
       load = fmax(load, fabs(least[i]));
     }
-    for (int i = 0; i < count; i++) {
-      const int k = in.owner[i];
-      const real limit = k < 0 ? load : friction_limit(of, k, 1, moved);
-      if (pass == 0)
-        weight[i] = load / fmax(limit, CONTACT_SLOW * load); /* forces may all be 0 */
-      else if (k >= 0 && length_of(moved + CONTACTS[k].tangential, CONTACTS[k].slips) > limit)
-        weight[i] *= CONTACT_HEAVIER;
-    }
+    for (int i = 0; i < count; i++) /* forces may all be 0 */
+      weight[i] = in.owner[i] < 0 ? 1.0 : load / fmax(friction_limit(of, in.owner[i], 1, moved), CONTACT_SLOW * load);
+    const int vectors = reduce_norm(matrix, count, independent, weight, least, null);
+    centre_forces(of, &in, null, vectors, load, matrix, least);
   }
   memset(moved, 0, sizeof moved);
   for (int i = 0; i < count; i++)
@@ -236,7 +319,7 @@ int NAME(contact_forces)(real t, const real *q, const real *p, const real *param
   return forces_at(t, q, p, parameters, mode, force, workspace);
 }
 
-/* Multipliers and parameters for the functions of transitions: of dependent contacts the multipliers of least norm, and
+/* Multipliers and parameters for the functions of transitions: of dependent contacts those in the centre, and
  * the masks of all that are closed or stick. */
 static int distribute(real t, const real *q, const real *p, const real *parameters, real *multipliers, real *shown,
     real *workspace)

@@ -9,7 +9,6 @@ enum {
 };
 
 #define CONTACT_BEGIN 1e-4 /* first part of a slip in space, relative to a step: longer than that of rounding */
-#define CONTACT_EXACT 0x1p-40 /* residual of refined forces in the friction cones */
 #define CONTACT_REGULAR 1e-9 /* part of the diagonal of their equations, dimensionless, that is added to it */
 #define CONTACT_APART 1e-5 /* part of their size by which the rates of two motions differ */
 #define CONTACT_ASIDE 1e-9 /* largest angle between friction and slip in space */
