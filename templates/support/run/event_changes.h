@@ -31,6 +31,7 @@ enum {
 #define CHANGE_GAIN 1e3 /* part of the energy of motion by which a step may create some, relative to the tolerance .. */
 #define CHANGE_MOST 1e-2 /* .. and the largest one: by steps from rest, of 173 tolerances */
 #define CHANGE_FAIR 1e-9 /* least tolerance of energies: rounding of gaps changes them by 1e-11 in the shortest steps */
+#define CHANGE_CONFIRMED 1e-8 /* least tolerance of a part of a step up to a change of modes, by its half parts */
 #define CHANGE_END 1e-6 /* relative to a step: remaining time at which an accumulation ends the run */
 
 /* Records the interval since the last hit. If the last intervals decrease geometrically and the remaining ones are
@@ -380,10 +381,39 @@ static int may_be_halved(const event_step *step, int status, real part, real pac
 }
 #endif
 
-/* Searches a step of a run that was at `before`, changes the state at crossings and continues the step. */
-static int change_in_step(const event_run *before, event_run *run, event_step *step, int adaptive, real length,
-    int iterations, const stored_states *to)
+#if defined(EVENT_CONTACTS) && EVENTS_CONTROLLED
+/* Compares the positions after the part of an adaptive step up to a change of modes, `at`, with those after two half
+ * parts: the estimates of the step itself do not see forces between its points, as friction that depends on slow slips.
+ * Rounding is that of positions and of forces that cancel. */
+static int confirm_part(const event_step *step, const event_sample *left, const event_sample *at, real part,
+    real tolerance)
 {
+  event_sample middle = {.t = left->t + 0.5 * part, .q = step->memory, .p = step->memory + M};
+  event_sample end = {.q = step->memory + 2 * M, .p = step->memory + 3 * M};
+  contact_terms of;
+  real moved = 0.0, apart = 0.0, size = 0.0;
+  if (0.5 * fabs(step->h) <= CHANGE_SHORT * step->watch->pace)
+    return OK;
+  TRY(terms_at(step, at, &of));
+  TRY(step_from_left(step, left, 0.5 * part, &middle));
+  TRY(step_from_left(step, &middle, 0.5 * part, &end));
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    size = fmax(size, of.second_terms[r] * part * part);
+  for (int i = 0; i < M; i++) {
+    size = fmax(size, fabs(at->q[i]));
+    moved = fmax(moved, fabs(at->q[i] - left->q[i]));
+    apart = fmax(apart, fabs(end.q[i] - at->q[i]));
+  }
+  return apart <= fmax(tolerance, CHANGE_CONFIRMED) * moved + CHANGE_SAFETY * DBL_EPSILON * size ? OK : NOT_CONVERGED;
+}
+#endif
+
+/* Searches a step of a run that was at `before`, changes the state at crossings and continues the step: one of an
+ * adaptive run with `control`. */
+static int change_in_step(const event_run *before, event_run *run, event_step *step, const step_control *control,
+    real length, int iterations, const stored_states *to)
+{
+  const int adaptive = control != NULL;
   const long long within = adaptive ? before->step + 1 : -1;
   real *const states = step->memory + 9 * M;
   event_sample left = {.t = before->t, .q = states, .p = states + M};
@@ -469,6 +499,10 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
         group++;
       part *= step->found[group].fraction;
       TRY(refine_crossing(step, group, &right, &at, &part));
+#if defined(EVENT_CONTACTS) && EVENTS_CONTROLLED
+      if (adaptive)
+        TRY(confirm_part(step, &left, &at, part, control->tolerance));
+#endif
     }
     step->watch->time += part;
     cut &= !acts && !step->watch->ended;
@@ -825,8 +859,8 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
     watch->first = tried ? fabs(size) : INFINITY;
 #endif
 #endif
-#ifdef EVENT_CONTACTS
     const step_control *limited = control;
+#ifdef EVENT_CONTACTS
 #if EVENTS_CONTROLLED
     step_control shorter;
     int rounded = 0;
@@ -865,7 +899,7 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
       status = take_step(run, t_end, control, &step, &size, &count);
 #endif
     if (status == OK)
-      status = change_in_step(&before, run, &step, control != NULL, size, count, &to);
+      status = change_in_step(&before, run, &step, limited, size, count, &to);
 #if defined(EVENT_CONTACTS) && EVENTS_CONTROLLED
     if (ENERGY_DECREASES && status == OK && control)
       status = check_energy(&step, &before, run, watched.begun ? watched.mode : watch->mode,
