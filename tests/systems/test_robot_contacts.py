@@ -452,16 +452,16 @@ def test_a_biped_in_space_falls_on_soles_whose_rows_nearly_depend_on_each_other(
 
 
 HEEL_AND_TOE = "".join(f'<geom class="foot" pos="{x} 0 -.03" size=".027"/>' for x in (-0.07, 0.14))
-WALKER = "".join(f"""<body pos="0 {y} 0"><joint name="h{i}" axis="0 1 0" range="-60 60" damping="1" stiffness="10"
+ON_TWO_FEET = "".join(f"""<body pos="0 {y} 0"><joint name="h{i}" axis="0 1 0" range="-60 60" damping="1" stiffness="10"
 armature=".005"/><geom type="capsule" fromto="0 0 0 0 0 -.4" size=".04" mass="2"/>
 <body pos="0 0 -.4"><joint name="a{i}" axis="0 1 0" range="-40 40" stiffness="6" damping=".5" armature=".005"/>
 <geom type="capsule" fromto="-.07 0 0 .14 0 0" size=".027" mass=".5"/>{HEEL_AND_TOE}</body></body>
 """ for i, y in enumerate((-0.15, 0.15)))  # fmt: skip
-WALKER = f"""<mujoco><default><geom contype="0" conaffinity="0"/>
+ON_TWO_FEET = f"""<mujoco><default><geom contype="0" conaffinity="0"/>
 <default class="foot"><geom type="sphere" contype="1" mass=".05"/></default></default><worldbody>
 <geom type="plane" size="5 5 1" conaffinity="1" friction="1"/><body><joint name="x" type="slide" axis="1 0 0"/>
 <joint name="z" type="slide" axis="0 0 1"/><joint name="p" axis="0 1 0"/>
-<geom type="box" size=".1 .2 .1" mass="6"/>{WALKER}</body></worldbody></mujoco>"""
+<geom type="box" size=".1 .2 .1" mass="6"/>{ON_TWO_FEET}</body></worldbody></mujoco>"""
 
 
 @pytest.mark.filterwarnings("ignore:a transition has several motions")
@@ -469,7 +469,7 @@ WALKER = f"""<mujoco><default><geom contype="0" conaffinity="0"/>
 @pytest.mark.rotated
 def test_slips_that_an_impact_reverses_and_feet_that_alternate(tmp_path):
     """Friction along a slip supplies energy: 5e-3 of its range. Feet that open each other's contacts do so to rest."""
-    stepper = sc.compile_stepper(read(tmp_path, WALKER, **ALL, restitution=0.3), "svi:2", flags=("-O1",))
+    stepper = sc.compile_stepper(read(tmp_path, ON_TWO_FEET, **ALL, restitution=0.3), "svi:2", flags=("-O1",))
     for seed, most in ((51, 100), (113, 200), (293, 800)):
         random = np.random.default_rng(seed)
         start = [0.0, 0.62, 0.15 * random.normal(), *(0.3 * random.normal(size=4))]
