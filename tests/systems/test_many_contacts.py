@@ -723,6 +723,7 @@ def test_a_plate_falls_flat_on_four_feet_by_impulses_in_the_cones(speed: float, 
     assert np.abs([run.q[row, 2], *v[[2, 4, 5]]]).max() < 1e-12
 
 
+@pytest.mark.filterwarnings("ignore:the contacts depend")
 @pytest.mark.filterwarnings("ignore:a transition has several motions")
 @pytest.mark.parametrize(
     ("force", "height", "velocity"),
@@ -732,7 +733,11 @@ def test_bounces_of_a_plate_accumulate_until_it_rests(force: float, height: floa
     """Adaptive steps bounce on the same feet as fixed ones; slips that stop with each bounce end no run."""
     start = {"q": [0, 0, height, 0.3, 0, 0], "velocity": velocity, "t_end": 2.0}
     fixed, run = (plate(0.4, force).integrate(**start, **steps) for steps in ({"h": 0.001}, {"tolerance": 1e-9}))
-    assert (run.t[-1], run.contact_modes[-1][1]) == (2.0, 4 * ("stick",))
+    (*_, (_, modes)), (*_, force) = run.contact_modes, run.contact_forces()
+    assert run.t[-1] == 2.0
+    assert modes[::2] == ("stick", "stick")  # two on a diagonal may carry all
+    assert set(modes) <= {"stick", "open"}
+    assert np.abs([*run.velocity[-1], force[:, 0].sum() / 9.81 - 1]).max() < 1e-9
     assert (run.q[:, 2, None] + run.q[:, 4:] @ SQUARE.T).min() > -2e-10
     assert np.abs(run.q[-1] - fixed.q[-1]).max() < 3e-5
 

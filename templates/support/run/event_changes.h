@@ -383,18 +383,21 @@ static int may_be_halved(const event_step *step, int status, real part, real pac
 
 #if defined(EVENT_CONTACTS) && EVENTS_CONTROLLED
 /* Compares the positions after the part of an adaptive step up to a change of modes, `at`, with those after two half
- * parts: the estimates of the step itself do not see forces between its points, as friction that depends on slow slips.
- * Rounding is that of positions and of forces that cancel. */
+ * parts, where coefficients of friction change in it: the estimates of the step itself do not see these between its
+ * points, as of slow slips. Rounding is that of positions and of forces that cancel. */
 static int confirm_part(const event_step *step, const event_sample *left, const event_sample *at, real part,
     real tolerance)
 {
   event_sample middle = {.t = left->t + 0.5 * part, .q = step->memory, .p = step->memory + M};
   event_sample end = {.q = step->memory + 2 * M, .p = step->memory + 3 * M};
-  contact_terms of;
+  contact_terms of, first;
   real moved = 0.0, apart = 0.0, size = 0.0;
   if (0.5 * fabs(step->h) <= CHANGE_SHORT * step->watch->pace)
     return OK;
+  TRY(terms_at(step, left, &first));
   TRY(terms_at(step, at, &of));
+  if (memcmp(first.coefficient, of.coefficient, sizeof of.coefficient) == 0)
+    return OK;
   TRY(step_from_left(step, left, 0.5 * part, &middle));
   TRY(step_from_left(step, &middle, 0.5 * part, &end));
   for (int r = 0; r < CONTACT_ROWS; r++)
