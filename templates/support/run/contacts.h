@@ -91,8 +91,8 @@ static int rest_low(const event_step *step, event_sample *at, contact_terms *of,
   int any = 0;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int row = CONTACTS[k].normal;
-    const int rests = is_met(of, now, closed, k) && of->value[row] <= CONTACT_LOWEST * of->rounding[row] &&
-        of->rate[row] > 0.0 && is_low(step, of, force, 0.0, k);
+    const int rests = is_met(of, now, closed, k) && fabs(of->value[row]) <= CONTACT_LOWEST * of->rounding[row] &&
+        of->rate[row] > CONTACT_ROUNDING * of->speed[row] && is_low(step, of, force, 0.0, k);
     now->touches[k] |= rests;
     any |= rests;
   }
