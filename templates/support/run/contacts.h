@@ -357,9 +357,13 @@ static int rounding_of_contact(const event_step *step, int event, const event_sa
   contact_mode mode[EVENT_CONTACTS];
   real right[CONTACT_ROWS] = {0.0}, force[CONTACT_ROWS] = {0.0}, after[CONTACT_ROWS];
   *rounding = kind == CONTACT_DRIVES ? INFINITY : 0.0;
-  if (kind != CONTACT_CLOSES && kind != CONTACT_LIFTS)
+  if (kind != CONTACT_CLOSES && kind != CONTACT_LIFTS && kind != CONTACT_STOPS)
     return OK;
   TRY(terms_at(step, at, &of));
+  if (kind == CONTACT_STOPS) { /* slips begin within rounding before the load at which they do */
+    *rounding = DBL_EPSILON * of.speed[CONTACTS[TRANSITION[event - FIRST_TRANSITION][0]].tangential];
+    return OK;
+  }
   modes_at(&of, step->watch->mode, mode);
   for (int k = 0; k < EVENT_CONTACTS; k++)
     mode[k] = CONTACTS[k].normal < 0 && !mode[k].sticks ? CONTACT_IS_OPEN : mode[k]; /* of constant friction */
