@@ -734,6 +734,7 @@ static int check_energy(const event_step *step, event_run *before, event_run *ru
     power += run->p[i] * v[i];
   power = step->watch->vigour = fmax(step->watch->vigour, power);
   allowed = fmin(CHANGE_GAIN * tolerance, CHANGE_MOST) * power + CONTACT_LOWEST * DBL_EPSILON * fabs(first);
+  step->watch->gain = 0.0; /* later failures have other causes */
   if (last - first <= allowed)
     return OK;
   TRY(terms_at(step, &left, &of));
