@@ -1,10 +1,12 @@
 """Command ``python -m benchmarks``: timings of scvi_codegen and of other integrators at equal error."""
 
+import sys
 from pathlib import Path
 
 import click
 
 from benchmarks import PEERS, Plan, benchmark
+from benchmarks.guard import guard
 from scvi_codegen.interfaces.cli.command_group import (
     INTERRUPTED,
     CommandFailure,
@@ -66,6 +68,8 @@ def main(
     Examples:
       python -m benchmarks kepler:0.5 --peers heyoka --plot kepler.svg
       python -m benchmarks drift robots -o measured.json
+
+    `python -m benchmarks guard OLD NEW` says whether one checkout is slower than another.
     """
     for path, hint in ((output, "'-o'"), (plot, "'--plot'")):
         if path is not None:
@@ -81,4 +85,6 @@ def main(
 
 
 if __name__ == "__main__":
+    if sys.argv[1:2] == ["guard"]:
+        guard(sys.argv[2:], prog_name="python -m benchmarks guard")
     main()
