@@ -718,9 +718,11 @@ static int is_rounded(const event_step *step, event_run *before, real size, real
   return OK;
 }
 
-/* Fails if a step with its changes creates energy, of a system that cannot, by more than parts of the largest p . v so
- * far and of the work of normal forces, in given modes, along the sizes of their gaps, which are rounded. Independent
- * of the error estimate: states in a step, in which straight legs fold at once, solve the equations of its parts. */
+/* Fails if a step with its changes creates energy, of a system that cannot, by more than parts of the largest p . v and
+ * loss in a step so far, since motions end, and of the work of normal forces, in given modes, along the sizes of their
+ * gaps, which are rounded: those of their terms and of what they would fall in the step, at rest at the origin, too.
+ * Independent of the error estimate: states in a step, in which straight legs fold at once, solve the equations of its
+ * parts. */
 static int check_energy(const event_step *step, event_run *before, event_run *run, const real *modes, real tolerance)
 {
   const event_sample left = {.t = before->t, .q = before->q, .p = before->p};
@@ -732,7 +734,7 @@ static int check_energy(const event_step *step, event_run *before, event_run *ru
   TRY(NAME(velocity)(run->t, run->q, run->p, step->own, v, step->workspace));
   for (int i = 0; i < M; i++)
     power += run->p[i] * v[i];
-  power = step->watch->vigour = fmax(step->watch->vigour, power);
+  power = step->watch->vigour = fmax(step->watch->vigour, fmax(power, first - last));
   allowed = fmin(CHANGE_GAIN * tolerance, CHANGE_MOST) * power + CONTACT_LOWEST * DBL_EPSILON * fabs(first);
   step->watch->gain = 0.0; /* later failures have other causes */
   if (last - first <= allowed)
@@ -740,8 +742,11 @@ static int check_energy(const event_step *step, event_run *before, event_run *ru
   TRY(terms_at(step, &left, &of));
   modes_at(&of, modes, mode);
   solve_contacts(&of, mode, of.second, force, after, NULL);
-  for (int k = 0; k < EVENT_CONTACTS; k++)
-    allowed += CONTACTS[k].normal < 0 ? 0.0 : tolerance * fabs(force[CONTACTS[k].normal]) * of.size[CONTACTS[k].normal];
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int row = CONTACTS[k].normal;
+    const real size = row < 0 ? 0.0 : fmax(of.size[row], of.speed[row] * fabs(step->whole));
+    allowed += row < 0 ? 0.0 : tolerance * fabs(force[row]) * size;
+  }
   step->watch->gain = last - first > allowed ? last - first : 0.0;
   return step->watch->gain > 0.0 ? NOT_CONVERGED : OK;
 }
