@@ -236,19 +236,6 @@ def test_a_block_on_a_slope_creeps_nowhere() -> None:
         assert slides or not run.q.any()
 
 
-@pytest.mark.tiers(0, 1)
-@pytest.mark.parametrize("steps", [{"h": 0.05}, {}])
-@pytest.mark.parametrize("floor", [0, 0.5])
-def test_a_bouncing_ball_comes_to_rest(floor: float, steps: dict[str, float]) -> None:
-    contacts = [sc.contact(f"y - {floor}", restitution=0.7)]
-    stepper = of("y_dot**2/2 - g*y", "y", contacts, "svi:2", g=9.81)
-    run = stepper.integrate([1 + floor], velocity=[0], t_end=4, **steps)
-    assert [modes for _, modes in run.contact_modes] == [("open",), ("slip",)]
-    assert run.contact_modes[1][0] == pytest.approx(np.sqrt(2 / 9.81) * 1.7 / 0.3, abs=2e-7)
-    assert abs(run.q[-1, 0] - floor) < 1e-60 + 1e-15 * floor
-    assert run.contact_forces()[-1, 0, 0] == pytest.approx(9.81)
-
-
 @pytest.mark.parametrize("steps", [{"h": 0.02}, {}])
 @pytest.mark.parametrize("height", [0, 0.5])
 def test_a_bouncing_ball_comes_to_rest_on_a_floor_that_moves(steps: dict[str, float], height: float) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 import scvi_codegen as sc
 
-FALLS = 40
+FALLS = 50
 """Falls of each stepper."""
 RESTS = 1e-10
 """Rates at rest, relative to those of the fall."""
@@ -18,13 +18,14 @@ TAIL = 1e-7
 
 @cache
 def stepper(degree: int) -> Any:
-    """Return the stepper of a point that falls along a line or, with dry friction, in a plane."""
-    q, kinetic, slides = (
-        ("y", "y_dot**2", {}) if degree % 2 == 0 else ("x y", "(x_dot**2 + y_dot**2)", {"slip": "x_dot"})
-    )
-    floor: Any = sc.contact("y", restitution="e", **slides, **({"friction": "mu"} if slides else {}))
-    names = dict.fromkeys(["m", "g", "e", *(["mu"] if slides else [])], 1.0)
-    falls = sc.LagrangianSystem.from_text("falls", q.split(), f"m*{kinetic}/2 - m*g*y", parameters=names)
+    """Return the stepper of a point that falls along a line or, by an odd degree, in a plane with dry friction."""
+    numbers = {"m": 1.0, "g": 1.0, "e": 0.0}
+    if degree % 2:
+        floor = sc.contact("y", slip="x_dot", friction="mu", restitution="e")
+        text, names, numbers["mu"] = "m*(x_dot**2 + y_dot**2)/2 - m*g*y", ["x", "y"], 0.0
+    else:
+        floor, text, names = sc.contact("y", restitution="e"), "m*y_dot**2/2 - m*g*y", ["y"]
+    falls = sc.LagrangianSystem.from_text("falls", names, text, parameters=numbers)
     return sc.compile_stepper(falls, f"svi:{degree}", contacts=[floor])
 
 
@@ -59,15 +60,14 @@ class Fall(NamedTuple):
 
 
 def draw(random: np.random.Generator, in_plane: bool) -> Fall:
-    """Return a random fall: one in six at rest at the origin, halves without restitution, friction or velocity."""
-    unit, g = 10 ** random.uniform(-6, 6), 10 ** random.uniform(-2, 2)
-    e, mu = random.uniform(0, 0.9) * random.integers(2), random.uniform(0.05, 1) * random.integers(2) * in_plane
-    u = random.uniform(0.1, 3) * np.sqrt(g * unit) * random.integers(2) * in_plane
-    height = unit * random.uniform(0.3, 3) * (random.integers(6) > 0)
-    return Fall(10 ** random.uniform(-3, 3), g, e, mu, unit, height, u)
+    """Return a random fall: a sixth begins at rest at the origin; halves have restitution, friction, a velocity."""
+    unit, g, m = 10 ** random.uniform(-6, 6), 10 ** random.uniform(-2, 2), 10 ** random.uniform(-3, 3)
+    height = unit * random.uniform(0.3, 3) * (random.random() > 1 / 6)
+    e, mu, u = random.uniform([0, 0.05, 0.1], [0.9, 1, 3]) * random.integers(2, size=3) * [1, in_plane, in_plane]
+    return Fall(m, g, e, mu, unit, height, u * np.sqrt(g * unit))
 
 
-@pytest.mark.parametrize("degree", [1, 2, 3, 5, 8])
+@pytest.mark.parametrize("degree", [1, 2, 3, 8])
 def test_points_that_fall_come_to_rest(degree: int) -> None:
     random = np.random.default_rng(degree)
     falls, in_plane = stepper(degree), degree % 2 == 1
@@ -76,12 +76,13 @@ def test_points_that_fall_come_to_rest(degree: int) -> None:
         t_end = 1.2 * fall.settles
         h = fall.duration / random.uniform(2, 12)
         by = {"t_end": t_end} if degree > 1 and k % 3 else {"h": h, "steps": int(t_end / h) + 1}
-        numbers = {"m": fall.m, "g": fall.g, "e": fall.e, **({"mu": fall.mu} if in_plane else {})}
+        numbers = {name: getattr(fall, name) for name in ("m", "g", "e", *["mu"] * in_plane)}
         q, velocity = [0.0] * in_plane + [fall.height], [fall.u] * in_plane + [0.0]
         run = falls.integrate(q, velocity=velocity, parameters=numbers, **by)
         fastest, case = fall.g * fall.duration + fall.u, f"{fall}, {by}"
         assert abs(run.q[-1, -1]) <= RESTS * fall.unit, case
         assert abs(run.velocity[-1, -1]) <= RESTS * fastest, case
+        assert run.contact_forces()[-1, 0, 0] == pytest.approx(fall.m * fall.g), case
         if in_plane:
             x, rate = fall.after(run.t[-1])
             assert run.q[-1, 0] == pytest.approx(x, rel=TAIL, abs=TAIL * fall.unit), case
@@ -90,8 +91,7 @@ def test_points_that_fall_come_to_rest(degree: int) -> None:
 
 @pytest.mark.xfail(raises=sc.StepFailedError, strict=True, reason="steps shrink with the impacts to none")
 def test_many_impacts_in_adaptive_steps_of_svi_1_come_to_rest() -> None:
-    numbers = {"m": 1.0, "g": 1.0, "e": 0.1, "mu": 0.0}
-    run = stepper(1).integrate([0, 1], velocity=[0, 0], parameters=numbers, t_end=3, tolerance=1e-10)
+    run = stepper(1).integrate([0, 1], velocity=[0, 0], parameters={"e": 0.1}, t_end=3, tolerance=1e-10)
     assert abs(run.velocity[-1]).max() <= RESTS
 
 
