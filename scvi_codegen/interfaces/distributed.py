@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
 __all__ = ["integrate_ensemble"]
 
-OF_THIS_MACHINE = {"threads": "workers use one thread each", "device": "workers use their processors"}
-"""Arguments that ensembles on a cluster do not have, and why."""
 LANES = 8
 BLOCKS_A_THREAD = 4
 """Blocks per worker thread; several balance the load and limit the loss when a worker dies."""
@@ -55,7 +53,7 @@ def integrate_ensemble(
         progress: called with the number of completed trajectories.
         address: address of a scheduler, ``"tcp://10.0.0.1:8786"``; by default a cluster of threads in this process.
         blocks: number of blocks of trajectories, by default four for each thread of the cluster.
-        arguments: those of ``stepper.integrate_ensemble`` except ``threads`` and ``device``.
+        arguments: those of ``stepper.integrate_ensemble`` except ``threads``.
 
     Returns:
         An :class:`EnsembleTrajectory`, also if workers were lost during the computation.
@@ -67,7 +65,7 @@ def integrate_ensemble(
     """
     _check_arguments(stepper, arguments)
     velocity, action = arguments.pop("velocity", None), arguments.pop("action", False)
-    settings = EnsembleSettings(**{name: value for name, value in arguments.items() if name not in OF_THIS_MACHINE})
+    settings = EnsembleSettings(**{name: value for name, value in arguments.items() if name != "threads"})
     ensemble = stepper._ensemble(q, p, settings, velocity=velocity, action=action)
     runs = runs_of(ensemble)
     blocks = None if blocks is None else checked_count(blocks, "blocks", least=1)
@@ -83,8 +81,8 @@ def _check_arguments(stepper: Stepper, arguments: dict[str, Any]) -> None:
     for name, value in arguments.items():
         if name not in accepted:
             raise StateError(f"integrate_ensemble has no argument '{name}'{closest(name, accepted)}")
-        if name in OF_THIS_MACHINE and value is not None:
-            raise StateError(f"{name}= is not available on a cluster, whose {OF_THIS_MACHINE[name]}: omit it")
+        if name == "threads" and value is not None:
+            raise StateError("threads= is not available on a cluster, whose workers use one thread each: omit it")
     if arguments.get("error") is not None and stepper._precise is not None:
         raise StateError(
             "error= of a stepper with precision='auto' is not available on a cluster: compile the system with "

@@ -34,7 +34,6 @@ from scvi_codegen.runs.driver.bounded_motion import BoundedMotion
 from scvi_codegen.runs.driver.observation import Observe
 from scvi_codegen.runs.driver.run import Run
 from scvi_codegen.runs.driver.segments import InputSegments, checked_inputs, final_time
-from scvi_codegen.runs.ensembles.device import DeviceRuns
 from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings
 from scvi_codegen.runs.ensembles.individual import IndividualRuns, runs_of
 from scvi_codegen.runs.ensembles.lanes import CommonRuns
@@ -458,7 +457,6 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         progress: Callable[[int], None] | None = None,
         threads: int | None = None,
         error: float | None = None,
-        device: str | None = None,
         action: bool = False,
         observe: str | None = None,
         seed: int = 0,
@@ -484,9 +482,6 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             threads: number of threads, by default one per core.
             error: as of :meth:`integrate`, a bound of the relative global error of each trajectory, with a local
                 tolerance of its own: ``global_error``, ``confirmed_digits`` and ``confirmed_until`` of the result.
-            device: ``"cuda"`` for an NVIDIA GPU, one thread a trajectory (extra ``cuda``; experimental: not yet run on
-                a device), with fixed steps. Arrays may then be in its memory (CuPy, PyTorch, JAX). Trajectories whose
-                steps fail are continued on the processor.
             action: as of :meth:`integrate`.
             observe: what to record of the states after all fixed steps, saved or not, in ``observed`` of the result:
                 ``"extremes"`` of q and p, of the ``"energy"``, or numbers of ``"events"`` of the stepper
@@ -498,26 +493,20 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
                 whose step fails is continued in double precision.
 
         Returns:
-            An :class:`EnsembleTrajectory`, with ``device`` a
-            :class:`~scvi_codegen.runs.ensembles.device.DeviceEnsemble`; states equal those of :meth:`integrate` to
-            round-off. A trajectory that fails has NaN after the failure and the reason in ``status``; the others are
-            unaffected.
+            An :class:`EnsembleTrajectory`; states equal those of :meth:`integrate` to round-off. A trajectory that
+            fails has NaN after the failure and the reason in ``status``; the others are unaffected.
 
         Raises:
             StateError: if a shape, name or number is invalid.
-            MethodError: if the method has no trajectories in SIMD lanes, for ``observe``, ``device`` and single
-                precision.
-            BuildError: with ``device`` if there is no GPU, or too little memory on it.
+            MethodError: if the method has no trajectories in SIMD lanes, for ``observe`` and single precision.
         """
         times: Any = {"h": h, "steps": steps, "t_end": t_end, "save_every": save_every, "t": t, "t_eval": t_eval}
-        times |= {"max_step": max_step, "first_step": first_step, "options": options, "device": device}
+        times |= {"max_step": max_step, "first_step": first_step, "options": options}
         errors: Any = {"tolerance": tolerance, "absolute_tolerance": absolute_tolerance, "error": error}
         others: Any = {"inputs": inputs, "parameters": parameters, "seed": seed, "metropolis": metropolis}
         settings = EnsembleSettings(**times, **errors, **others, observe=observe, precision=precision)
         runs = runs_of(self._ensemble(q, p, settings, velocity=velocity, action=action))
         runs.run(progress=progress, threads=threads)
-        if isinstance(runs, DeviceRuns):
-            return cast("EnsembleTrajectory", runs.device_result())
         return checked_ensemble_result(runs)
 
     def _ensemble(
@@ -650,7 +639,7 @@ class StepperOfRunTimeSizes(Stepper):
     ) -> Any:
         """Call a method of the stepper that is bound to the arrays of the call."""
         if method in (Stepper.integrate_ensemble, Stepper._ensemble):
-            operations = {"device": "device", "observe": "observe_ensemble", "precision": "single"}
+            operations = {"observe": "observe_ensemble", "precision": "single"}
             for argument, operation in operations.items():
                 if named.get(argument) not in (None, "double"):
                     require(self, operation)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.runs.ensembles.result import EnsembleRuns
+from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
 
 
 def autoregressive(factor: float, shape: tuple[int, ...], seed: int) -> np.ndarray:
@@ -22,9 +22,10 @@ def run_of(n: int, interval: float) -> SimpleNamespace:
     return SimpleNamespace(t=interval * np.arange(n))
 
 
-def ensemble_of(n: int, k: int, interval: float) -> EnsembleRuns:
+def ensemble_of(n: int, k: int, interval: float) -> EnsembleTrajectory:
     t, none = interval * np.arange(n), np.zeros(k)
-    return EnsembleRuns(t=t, status=np.full(k, "ok"), steps=none.astype(int), h=interval, parameters=none, stepper=None)
+    states, about = np.zeros((n, k, 1)), {"h": interval, "parameters": none, "stepper": None}
+    return EnsembleTrajectory(t=t, q=states, p=states, status=np.full(k, "ok"), steps=none.astype(int), **about)
 
 
 @pytest.mark.parametrize("factor", [0.0, 0.9, 0.98])

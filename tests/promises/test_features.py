@@ -149,7 +149,6 @@ OPERATIONS = {
     "tables": lambda s: run_of(s, tables={}),
     "with_sizes": lambda s: s.with_sizes(N=2),
     "ensembles": lambda s: s.integrate_ensemble(*map(stacked, state_of(s)), h=0.1, steps=3),
-    "device": lambda s: s.integrate_ensemble(*map(stacked, state_of(s)), h=0.1, steps=3, device="cuda"),
     "observe_ensemble": lambda s: s.integrate_ensemble(*map(stacked, state_of(s)), h=0.1, steps=3, observe="extremes"),
     "single": lambda s: s.integrate_ensemble(*map(stacked, state_of(s)), h=0.1, steps=3, precision="single"),
     "checkpoint": lambda s: s.start(*state_of(s), h=0.1, **end_of(s)).checkpoint(),
@@ -222,7 +221,7 @@ def test_refusals_of_the_table_are_those_of_the_operations(situation, situations
 @pytest.mark.parametrize("situation", [name for name in SITUATIONS if name != "without derivatives"])
 def test_operations_that_a_stepper_supports_work(situation, half, situations):
     """In the default tier half of the operations in each situation, each operation in half of the situations."""
-    stepper, left_out = situations(situation), {"device", "observe_ensemble", "fit", "flow", "periodic_orbit", "energy"}
+    stepper, left_out = situations(situation), {"observe_ensemble", "fit", "flow", "periodic_orbit", "energy"}
     left_out |= OF_OTHER_STATES.get(situation, set())
     left_out |= {"work", "discrete_lagrangian", "chaos"} if stepper.run_time_sizes else set()
     with warnings.catch_warnings(action="ignore"):

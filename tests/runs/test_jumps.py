@@ -133,7 +133,7 @@ METHODS = ("svi:2", "gauss:2", "sc:3", "stoermer-verlet", "composition:4", "scvi
 ROWS = dict.fromkeys(METHODS, (MODES, MODES)) | dict.fromkeys(
     ("tau", "double-double", "arrays", "chaos_ensemble", "path", "flow"), (WARNS, REFUSED)
 )
-ROWS |= dict.fromkeys(("hessian", "device", "observe_ensemble"), (REFUSED, REFUSED))
+ROWS |= dict.fromkeys(("hessian", "observe_ensemble"), (REFUSED, REFUSED))
 USES = {
     "tau": lambda step: of_line(step, time_transformation="1/(1 + x**2)"),
     "double-double": lambda step: of_line(step, precision="double-double"),

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.common.errors import AccuracyWarning, StateError
 from scvi_codegen.common.validation import checks_arguments
-from scvi_codegen.runs.ensembles.result import EnsembleRuns
+from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
 from scvi_codegen.runs.states.validation import Array
 
 WINDOW, RELAXATION, LEAST_TIMES = 5.0, 10.0, 50.0
@@ -60,7 +60,7 @@ def average(run: Any, quantity: Callable[[Any], ArrayLike] | ArrayLike, *, burn_
             :class:`AccuracyWarning` if the values contain fewer than 50 autocorrelation times.
     """
     t, x = np.asarray(run.t), np.asarray(quantity(run) if callable(quantity) else quantity, dtype=float)
-    shape = (len(t), len(run)) if isinstance(run, EnsembleRuns) else (len(t),)
+    shape = (len(t), len(run)) if isinstance(run, EnsembleTrajectory) else (len(t),)
     if x.shape[: len(shape)] != shape:
         raise StateError(f"quantity has shape {x.shape}: it must have shape {shape}, one value per state, or more axes")
     if not (x.size and np.isfinite(x).all()):

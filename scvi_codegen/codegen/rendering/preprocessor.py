@@ -1,6 +1,6 @@
 """Support headers as one integrator uses them: without alternatives and macros that belong to others.
 
-Sources are compiled from the headers as they are. Packages, single files, kernels for GPUs and pages of derivations are
+Sources are compiled from the headers as they are. Packages, single files and pages of derivations are
 read by people, and the preprocessor of a C compiler cannot make them: it also removes comments, names of constants and
 conditions on the compiler and the processor, which only the reader's compiler can decide. Here conditions on names that
 begin with ``_`` or ``SCVI_`` remain, as do those on macros that are defined under such a condition.

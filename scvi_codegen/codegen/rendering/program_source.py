@@ -12,7 +12,7 @@ frameworks.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import accumulate, chain
 from typing import Any, ClassVar, Literal, TypeAlias, cast, get_args
 
@@ -517,8 +517,7 @@ def _contents_of_step(context: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _contents_of_lanes(context: Mapping[str, Any]) -> dict[str, Any]:
-    names = [attribute.name for attribute in fields(LaneContents)]
-    return {"lanes": LaneContents(**{name: context[name] for name in names})}
+    return {"lanes": LaneContents(observed=context["observed"])}
 
 
 CONTENTS: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {

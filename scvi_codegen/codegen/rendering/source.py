@@ -85,11 +85,9 @@ class Sizes:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LaneContents:
-    """Stored values of a coordinate, observed functions; whether blocks initially contain velocities."""
+    """Number of observed functions of the state."""
 
-    stored: int
     observed: int
-    needs_velocities: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

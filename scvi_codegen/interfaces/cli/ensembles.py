@@ -15,7 +15,6 @@ from scvi_codegen.interfaces.cli.reports import LARGE_ERROR, duration, momentum_
 from scvi_codegen.interfaces.cli.supervision import check_memory, interruptions, progress_bar
 from scvi_codegen.interfaces.models.model import Model
 from scvi_codegen.interfaces.models.model_files.ensemble_file import EnsembleStates
-from scvi_codegen.runs.ensembles.device import DeviceRuns
 from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings
 from scvi_codegen.runs.ensembles.individual import IndividualRuns, runs_of
 from scvi_codegen.runs.ensembles.lanes import CommonRuns
@@ -78,14 +77,10 @@ def integrate_states(states: EnsembleStates) -> EnsembleOutcome:
 def _runs(model: Model, stepper: Stepper, states: EnsembleStates) -> CommonRuns | IndividualRuns:
     """Return the compiled ensemble; Ctrl-C still ends the process here."""
     settings = EnsembleSettings(
-        options=model.solver_options,
-        device=model.device,
-        observe=model.observe,
-        parameters=states.parameters,
-        **model._run_arguments(),
+        options=model.solver_options, observe=model.observe, parameters=states.parameters, **model._run_arguments()
     )
     runs = runs_of(Ensemble.of(stepper, states.q, states.momenta(stepper), settings))
-    if isinstance(runs, CommonRuns) and not isinstance(runs, DeviceRuns):
+    if isinstance(runs, CommonRuns):
         runs.batch()
     return runs
 
@@ -93,14 +88,14 @@ def _runs(model: Model, stepper: Stepper, states: EnsembleStates) -> CommonRuns 
 def ensemble_summary(model: Model, outcome: EnsembleOutcome, balance: float | None) -> str:
     """Return a summary of an ensemble in a few lines."""
     result = outcome.result
-    steps, on_gpu = int(result.steps.sum()), "" if model.device is None else " on a GPU"
+    steps = int(result.steps.sum())
     counts = Counter(result.status.tolist())
     lines = [
         model.system.name,
         model.method.title,
         f"{counted(len(result), 'trajectory').replace('trajectorys', 'trajectories')} of "
         f"{_describe_steps(model, result)} saved of each",
-        f"{outcome.seconds:.3g} s{on_gpu}, {duration(outcome.seconds / max(steps, 1))} per step of a trajectory; "
+        f"{outcome.seconds:.3g} s, {duration(outcome.seconds / max(steps, 1))} per step of a trajectory; "
         f"prepared in {outcome.preparation:.2f} s",
         ", ".join(f"{number} {status}" for status, number in [("ok", counts.pop("ok", 0)), *sorted(counts.items())]),
     ]

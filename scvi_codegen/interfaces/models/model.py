@@ -66,7 +66,7 @@ class Model(TimeSpan):
             or axis and angle.
         p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
         velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
-        h, tolerance, error, span, steps, save_every, t, time_transformation, controller, precision, sums, device,
+        h, tolerance, error, span, steps, save_every, t, time_transformation, controller, precision, sums,
             observe, solver_tolerance, max_iterations, threads, action: as of
                 :class:`~scvi_codegen.interfaces.models.time_span.TimeSpan`.
         inputs: by name a table of values, ``(t, values)`` or ``(t, values, kind)`` as :meth:`Stepper.integrate` accepts

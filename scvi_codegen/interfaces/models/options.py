@@ -13,7 +13,6 @@ from itertools import combinations
 from numbers import Real
 from typing import Any, NamedTuple
 
-from scvi_codegen.codegen.native.cuda import DEVICES
 from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.codegen.variants import SUMS
 from scvi_codegen.common.errors import ModelFileError
@@ -193,11 +192,6 @@ class RunOptions:
     sums: str | None = run_option(
         *("run", CHOICE, "", "Sums of explicit steps of an array model [compensated]; plain: faster, rounded."),
         choices=SUMS,
-        common=False,
-    )
-    device: str | None = run_option(
-        *("run", CHOICE, "", "With --ensemble: run on an NVIDIA GPU (extra 'cuda'; experimental)."),
-        choices=DEVICES,
         common=False,
     )
     observe: str | None = run_option(

@@ -6,7 +6,6 @@ from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from typing import Any, Self
 
-from scvi_codegen.codegen.native.cuda import DEVICES
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.codegen.variants import SUMS
@@ -52,7 +51,6 @@ class TimeSpan(RunOptions):
             ``error`` that double does not confirm; ``None`` means ``"double"``.
         sums: ``"plain"`` for explicit steps of arrays without compensation, as of
             :func:`~scvi_codegen.compile_stepper`; ``None`` means ``"compensated"``.
-        device: ``"cuda"`` for ensembles on a GPU; single runs are not available with it.
         observe: ``"extremes"`` or ``"energy"`` of ensembles, as of :meth:`Stepper.integrate_ensemble`.
         solver_tolerance, max_iterations: of the iteration on the stage equations, as of
             :class:`~scvi_codegen.SolverOptions`.
@@ -66,12 +64,7 @@ class TimeSpan(RunOptions):
         for option in RUN_FIELDS:
             if (value := getattr(self, option.field)) is not None:
                 object.__setattr__(self, option.field, option.checked(value))
-        for name, choices in (
-            ("precision", PRECISIONS),
-            ("sums", SUMS),
-            ("device", DEVICES),
-            ("observe", OBSERVED[:2]),
-        ):
+        for name, choices in (("precision", PRECISIONS), ("sums", SUMS), ("observe", OBSERVED[:2])):
             if (value := getattr(self, name)) not in (None, *choices):
                 raise ModelFileError(f"unknown {name} {value!r}: use {' or '.join(map(repr, choices))}")
         if self.h is not None and (control := self._control):
@@ -113,14 +106,11 @@ class TimeSpan(RunOptions):
 
     def _check_alone(self) -> None:
         """Raise an error for a single run with an option of ensembles."""
-        for name in ("device", "observe"):
-            if (value := getattr(self, name)) is not None:
-                flag = next(option.flag for option in options_of("run") if option.field == name)
-                shown = str(value).lower() if isinstance(value, bool) else repr(value)
-                raise ModelFileError(
-                    f"{name} = {shown} ([run] {name}, run {flag}) is for ensembles only: give --ensemble FILE, "
-                    f"or omit {name}"
-                )
+        if self.observe is not None:
+            raise ModelFileError(
+                f"observe = {self.observe!r} ([run] observe, run --observe) is for ensembles only: give "
+                "--ensemble FILE, or omit observe"
+            )
 
     def _run_section(self) -> dict[str, Any]:
         defaults = {field.name: field.default for field in fields(self)}

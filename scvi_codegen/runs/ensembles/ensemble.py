@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.codegen.native.arguments import real_array
-from scvi_codegen.codegen.native.cuda import DEVICES, Device, has_device_memory
 from scvi_codegen.codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.codegen.variants import Lanes
 from scvi_codegen.common.errors import MethodError, StateError, of_trajectory
@@ -49,13 +48,6 @@ checked_steps = lru_cache(maxsize=64, typed=True)(partial(planned_steps, KindOfS
 """Check of the arguments of :func:`planned_steps`, which those of earlier ensembles have passed."""
 RANGE = np.finfo(np.float32)
 """Range of single precision."""
-
-
-def on_processor(value: Any) -> Any:
-    """Return a copy on the processor of an array of a GPU, alone or in a mapping; other values unchanged."""
-    if isinstance(value, Mapping):
-        return {name: on_processor(entry) for name, entry in value.items()}
-    return Device().copy_of(value) if has_device_memory(value) else value
 
 
 def checked_ensemble(stepper: Integrator, q: States, other: States, name: str) -> tuple[Array, Array]:
@@ -129,7 +121,6 @@ class EnsembleSettings:
     parameters: EnsembleParameters = None
     options: SolverOptions | None = None
     error: float | None = None
-    device: str | None = None
     observe: str | None = None
     seed: int = 0
     metropolis: bool = False
@@ -145,17 +136,11 @@ class EnsembleSettings:
         """Raise an error for arguments that exclude each other, or that the stepper excludes."""
         if self.precision != "double":
             self._check_precision(stepper)
-        if self.device not in (None, *DEVICES):
-            raise StateError(f"device is {self.device!r}: it must be {' or '.join(map(repr, DEVICES))}, or omitted")
-        adaptive = True if self.h is None else None
-        check_together(device=self.device, adaptive=adaptive, error=self.error, t_eval=self.t_eval)
         if self.observe is not None:
             check_together(observe=self.observe, inputs=self.inputs, error=self.error, t_eval=self.t_eval)
             require(stepper, "observe_ensemble")
-        if self.device is not None:
-            require(stepper, "device")
         if self.records_events(stepper):
-            check_together(events=stepper.events, device=self.device, observe_ensemble=self.observe)
+            check_together(events=stepper.events, observe_ensemble=self.observe)
             require(stepper, "ensemble_events")
 
     def _check_precision(self, stepper: Any) -> None:
@@ -168,7 +153,7 @@ class EnsembleSettings:
         require(stepper, "single")
         further = {"adaptive": True if self.h is None else None, "error": self.error, "t_eval": self.t_eval}
         further |= {"events": self.records_events(stepper) or None, "action": stepper.sums_action or None}
-        further |= {"device": self.device, "observe_ensemble": self.observe}
+        further["observe_ensemble"] = self.observe
         check_together(**{"precision='single'": True}, **further)
         if self.inputs is not None and stepper.interface.constraints:
             raise StateError("precision='single' is not available with inputs and constraints: omit precision")
@@ -264,8 +249,6 @@ class Ensemble:
         t0 = layout.time(settings.t)
         steps, ends = settings.steps_or_ends(t0, layout.words)
         require(stepper, "ensembles")
-        if settings.device is not None:
-            q, p, velocity, parameters = (on_processor(values) for values in (q, p, velocity, parameters))
         if settings.h is None:
             require(stepper, "adaptive")
         checked_options(settings.options)

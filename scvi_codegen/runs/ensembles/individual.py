@@ -24,7 +24,6 @@ from scvi_codegen.runs.accuracy.global_error import GlobalError
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runs.driver.segments import breakpoints_until, inputs_of_slice
 from scvi_codegen.runs.ensembles.batches import Rows, SuccessiveRuns
-from scvi_codegen.runs.ensembles.device import DeviceRuns
 from scvi_codegen.runs.ensembles.ensemble import Ensemble
 from scvi_codegen.runs.ensembles.lanes import CommonRuns
 from scvi_codegen.runs.ensembles.observation import EnsembleObservation
@@ -356,4 +355,4 @@ def runs_of(ensemble: Ensemble) -> CommonRuns | IndividualRuns:
             )
         return IndividualRuns(ensemble)
     observation = None if settings.observe is None else EnsembleObservation(stepper, settings.observe, len(ensemble))
-    return CommonRuns(ensemble, observation) if settings.device is None else DeviceRuns(ensemble, observation)
+    return CommonRuns(ensemble, observation)

@@ -55,11 +55,7 @@ class CommonRuns:
         self.done, self.fallback_steps = np.zeros((2, count), np.int64)
         self.times: Array | None = None
         self.actions: Array | None = None
-        self._allocate()
-
-    def _allocate(self) -> None:
-        """Create the arrays, with the initial states."""
-        ensemble, stepper = self.ensemble, self.ensemble.stepper
+        stepper = ensemble.stepper
         (count, m), words = ensemble.q.shape, stepper.interface.words
         shape = len(self.steps.numbers), count
         self.blocks = [empty_array((*shape, words * m)) for _ in "qp"]
@@ -143,37 +139,26 @@ class CommonRuns:
         if self.observation is not None:
             self.observation.keep(part, cast(Array, trajectories.observed))
 
-    def states(self) -> tuple[Array, Array]:
-        """Return the (n, k, m) saved positions and momenta."""
-        return self.q, self.p
-
-    def about(self) -> dict[str, Any]:
-        """Return the attributes of a result other than its states; unfinished trajectories are ``"interrupted"``."""
-        status, unfinished = self.status, self.done < self.steps.steps
+    def result(self) -> EnsembleTrajectory:
+        """Return the trajectories; unfinished ones are ``"interrupted"``."""
+        ensemble, status, unfinished = self.ensemble, self.status, self.done < self.steps.steps
         if unfinished.any():
             status = np.where(unfinished & (status == OK), INTERRUPTED, status)
-        return {
-            "t": self.steps.t.copy() if self.times is None else self.times,
-            "tau": None if self.times is None else self.steps.times(tau=True),
-            "status": status,
-            "steps": self.done,
-            "h": self.steps.h,
-            "parameters": self.ensemble.parameters,
-            "stepper": self.ensemble.stepper,
-            "observed": None if self.observation is None else self.observation.result(),
-        }
-
-    def result(self) -> EnsembleTrajectory:
-        """Return the trajectories."""
-        (q, p), ensemble = self.states(), self.ensemble
         spans = self.steps.spans() if ensemble.inputs else ()
         return EnsembleTrajectory(
-            q=q,
-            p=p,
+            t=self.steps.t.copy() if self.times is None else self.times,
+            q=self.q,
+            p=self.p,
+            tau=None if self.times is None else self.steps.times(tau=True),
+            status=status,
+            steps=self.done,
+            h=self.steps.h,
+            parameters=ensemble.parameters,
+            stepper=ensemble.stepper,
+            observed=None if self.observation is None else self.observation.result(),
             actions=self.actions,
             fallback_steps=self.fallback_steps,
             spans=tuple((rows, slice(None), partial(ensemble.values_at, segment.middle)) for rows, segment in spans),
-            **self.about(),
         )
 
 

@@ -1,18 +1,16 @@
 """Extremes of states and energies, and counts of events, over all steps of an ensemble, without saving its states.
 
 The source of the ensemble contains the observed functions (``templates/support/run/observation.h``), so they are
-evaluated in SIMD lanes, or by the threads of a GPU. States of a trajectory that has left its lane are included one by
+evaluated in SIMD lanes. States of a trajectory that has left its lane are included one by
 one, by the same C function.
 """
 
 from __future__ import annotations
 
-from copy import copy
 from functools import cached_property
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.native.binding import Binding
@@ -84,17 +82,6 @@ class EnsembleObservation:
     def binding(self) -> Binding:
         """Library of the source, compiled on first use."""
         return Binding(building.load(self.source, flags=self.stepper.flags), self.source.prefix)
-
-    @property
-    def rows(self) -> Array:
-        """View (5 functions, k) of the values, as in the memory of a device."""
-        return self.values.reshape(-1, self.values.shape[-1])
-
-    def part(self, which: NDArray[np.intp]) -> EnsembleObservation:
-        """Return a copy for some of the trajectories."""
-        other = copy(self)
-        other.values = self.values[:, :, which]
-        return other
 
     def include(self, j: int, t: Array, q: Array, p: Array, parameters: Array) -> None:
         """Include the states (n,), (n, m), (n, m) of trajectory j."""

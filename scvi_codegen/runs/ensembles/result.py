@@ -51,8 +51,8 @@ Span: TypeAlias = tuple[slice, slice, Callable[[slice], Array]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EnsembleRuns:
-    """Runs of k trajectories, wherever their states are.
+class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, Pictured, TwoWords):
+    """States of k trajectories, the initial state first.
 
     Attributes:
         t: times of the states: (n,) if all trajectories have the same, else (n, k), as with adaptive steps, terminal
@@ -67,9 +67,20 @@ class EnsembleRuns:
         plans: step plan of each trajectory for adaptive steps, else empty.
         observed: with ``observe=``, over the states after all steps: (2, k, 2m) smallest and largest values of (q, p)
             (``"extremes"``), (2, k) energies (``"energy"``), or (k, number of events) changes of sign (``"events"``).
+        q, p: (n, k, m) positions and momenta; NaN after a failure, and after the end of a shorter trajectory.
+        actions: (n, k) actions up to each state if the runs summed them (``action=True``), else ``None``.
+        fallback_steps: (k,) numbers of steps solved by Newton's method, as the iteration failed.
+        spans: with inputs, rows of states of a slice of trajectories and their parameters.
+        confirmations: with ``error=``, of each trajectory as of :class:`Trajectory`, ``None`` for one that fails; else
+            empty.
+        events: (k,) crossings of the events of each trajectory, parallel to ``stepper.events``; empty without events.
+        modes: (k,) values of ``stepper.modes`` along each trajectory, as of :class:`Trajectory`; empty without modes.
+        messages: of the errors of trajectories that were integrated one by one, by their numbers; see :attr:`failures`.
     """
 
     t: Array
+    q: Array
+    p: Array
     status: NDArray[np.str_]
     steps: NDArray[np.int64]
     h: float | None
@@ -78,6 +89,13 @@ class EnsembleRuns:
     tau: Array | None = None
     plans: Sequence[Adaptive] = ()
     observed: Array | None = field(default=None, repr=False)
+    actions: Array | None = field(default=None, repr=False)
+    fallback_steps: NDArray[np.int64] | None = field(default=None, repr=False)
+    spans: tuple[Span, ...] = field(default=(), repr=False)
+    confirmations: tuple[GlobalError | None, ...] = field(default=(), repr=False)
+    events: tuple[tuple[Crossings, ...], ...] = field(default=(), repr=False)
+    modes: tuple[ModeHistory | None, ...] = field(default=(), repr=False)
+    messages: Mapping[int, str] = field(default_factory=dict, repr=False)
 
     def __len__(self) -> int:
         return len(self.status)
@@ -91,33 +109,6 @@ class EnsembleRuns:
     def ok(self) -> NDArray[np.bool_]:
         """(k,) flags of the trajectories that reached the end."""
         return np.asarray(self.status == OK)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictured, TwoWords):
-    """States of k trajectories, the initial state first; further attributes as of :class:`EnsembleRuns`.
-
-    Attributes:
-        q, p: (n, k, m) positions and momenta; NaN after a failure, and after the end of a shorter trajectory.
-        actions: (n, k) actions up to each state if the runs summed them (``action=True``), else ``None``.
-        fallback_steps: (k,) numbers of steps solved by Newton's method, as the iteration failed.
-        spans: with inputs, rows of states of a slice of trajectories and their parameters.
-        confirmations: with ``error=``, of each trajectory as of :class:`Trajectory`, ``None`` for one that fails; else
-            empty.
-        events: (k,) crossings of the events of each trajectory, parallel to ``stepper.events``; empty without events.
-        modes: (k,) values of ``stepper.modes`` along each trajectory, as of :class:`Trajectory`; empty without modes.
-        messages: of the errors of trajectories that were integrated one by one, by their numbers; see :attr:`failures`.
-    """
-
-    q: Array
-    p: Array
-    actions: Array | None = field(default=None, repr=False)
-    fallback_steps: NDArray[np.int64] | None = field(default=None, repr=False)
-    spans: tuple[Span, ...] = field(default=(), repr=False)
-    confirmations: tuple[GlobalError | None, ...] = field(default=(), repr=False)
-    events: tuple[tuple[Crossings, ...], ...] = field(default=(), repr=False)
-    modes: tuple[ModeHistory | None, ...] = field(default=(), repr=False)
-    messages: Mapping[int, str] = field(default_factory=dict, repr=False)
 
     @overload
     def __getitem__(self, j: int) -> Trajectory: ...

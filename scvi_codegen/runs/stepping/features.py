@@ -22,7 +22,6 @@ OPERATIONS = {
     "with_sizes": "with_sizes",
     "ensembles": "integrate_ensemble",
     "ensemble_events": "integrate_ensemble of a stepper with events",
-    "device": "device=",
     "observe_ensemble": "integrate_ensemble(observe=)",
     "single": "integrate_ensemble(precision='single')",
     "checkpoint": "checkpoint",
@@ -109,7 +108,7 @@ _DERIVATIVES = f"{_FIRST} chaos chaos_ensemble periodic_orbit fit flow"
 _CURVE = "SVI, SCVI or a Gauss method"
 _ACTIONS = "action shadow_energy path"
 _IN_DOUBLE = (
-    "check_growth device observe_ensemble single work discrete_lagrangian "
+    "check_growth observe_ensemble single work discrete_lagrangian "
     f"chaos_ensemble periodic_orbit energy fit flow {_ACTIONS}"
 )
 _RUNS = "chaos chaos_ensemble periodic_orbit fit flow work check_growth"
@@ -119,13 +118,13 @@ FEATURES = {
     for property_, operations, remedy in (
         (
             "in a heat bath",
-            "adaptive error t_eval dense_output events advice device single tangent pullback sensitivity hessian "
+            "adaptive error t_eval dense_output events advice single tangent pullback sensitivity hessian "
             f"{_RUNS} {_ACTIONS}",
             "give h and steps, and use saved states and averages of them; steps alone have derivatives",
         ),
         (
             "with a time transformation",
-            "ensembles device observe_ensemble single chaos_ensemble periodic_orbit fit flow",
+            "ensembles observe_ensemble single chaos_ensemble periodic_orbit fit flow",
             "this requires fixed steps h; compile the stepper without time_transformation",
         ),
         ("with precision='double-double'", _IN_DOUBLE, "omit it, or use precision='double'"),
@@ -136,11 +135,7 @@ FEATURES = {
         ("in transformed time", "advice", "use --tolerance (local error)"),
         ("in transformed time", "adaptive", "give h (fixed step in tau)"),
         ("in transformed time", "inputs", "compile the original system"),
-        (
-            "in transformed time",
-            "device observe_ensemble single chaos chaos_ensemble periodic_orbit fit flow",
-            _ORIGINAL,
-        ),
+        ("in transformed time", "observe_ensemble single chaos chaos_ensemble periodic_orbit fit flow", _ORIGINAL),
         ("in transformed time", _ACTIONS, _ORIGINAL),
         ("in transformed time", "ensemble_events", "integrate each trajectory, or pass stepper.with_events(())"),
         ("with a time transformation", "shadow_energy path", "compile the stepper without time_transformation"),
@@ -160,22 +155,18 @@ FEATURES = {
         ("with events that set parameters", _DERIVATIVES, "make them terminal, and restart with the new parameters"),
         (
             "with events that change the state",
-            "error device observe_ensemble single check_growth hessian chaos_ensemble flow advice shadow_energy",
+            "error observe_ensemble single check_growth hessian chaos_ensemble flow advice shadow_energy",
             "make them terminal and restart",
         ),
-        (
-            "with kinks that runs locate",
-            "device observe_ensemble single hessian",
-            'compile it with kinks="as formulas"',
-        ),
+        ("with kinks that runs locate", "observe_ensemble single hessian", 'compile it with kinks="as formulas"'),
         ("where L or H jumps", "shadow_energy", "use energy()"),
         ("where L or H jumps", " ".join(BY_FORMULAS), "use runs, ensembles of runs and their first derivatives"),
         (
             "with contacts",
-            f"check_growth device observe_ensemble single hessian chaos_ensemble flow advice {_ACTIONS}",
+            f"check_growth observe_ensemble single hessian chaos_ensemble flow advice {_ACTIONS}",
             "use runs and ensembles with h, or with t_end and a tolerance, without it",
         ),
-        ("with constraints", "device observe_ensemble", "use coordinates without constraints, or omit it"),
+        ("with constraints", "observe_ensemble", "use coordinates without constraints, or omit it"),
         ("with constraints", "fit", "use coordinates without constraints, such as the angles of rods"),
         ("with nonholonomic constraints", "periodic_orbit", "use coordinates without constraints, or integrate"),
         ("with constraints of arrays", "threads", "omit threads; the step uses one"),
@@ -206,12 +197,12 @@ FEATURES = {
         ),
         (
             "with sizes known at run time",
-            "flow device observe_ensemble single",
+            "flow observe_ensemble single",
             f"pass stepper.with_sizes(..); {SIZES_REQUIRED}",
         ),
         (
             "without trajectories in SIMD lanes",
-            "device observe_ensemble single",
+            "observe_ensemble single",
             "it requires explicit steps or a fixed-point iteration, as of SVI and Gauss methods without constraints, "
             "without the moving frame of a symmetric top; omit it",
         ),
@@ -234,15 +225,12 @@ FEATURES = {
         ("with inputs", "t_eval", "omit t_eval"),
         ("with inputs", "observe", "omit observe"),
         ("with inputs", "sensitivity chaos", "use tangent or pullback, or run.pieces"),
-        ("with t_eval", "device", "give h, steps and save_every"),
-        ("with error", "device", "give h and steps (fixed step size)"),
-        ("with device", "adaptive", "give h and steps (fixed step size), or omit device"),
         (
             "with precision='single'",
-            "adaptive error t_eval events device observe_ensemble action",
+            "adaptive error t_eval events observe_ensemble action",
             "give h and steps (fixed step size), and save states; or omit precision",
         ),
-        ("with events", "device observe_ensemble", "count them by observe='events', or pass stepper.with_events(())"),
+        ("with events", "observe_ensemble", "count them by observe='events', or pass stepper.with_events(())"),
         ("with t_eval", "observe", "omit observe"),
         ("with observe", "error dense_output", "omit observe"),
     )

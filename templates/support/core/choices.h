@@ -1,5 +1,5 @@
 /* Choices between numbers of a trajectory or, if LANES is defined, in every SIMD lane by itself. */
-#if defined(LANES) && !defined(SCALAR_LANES)
+#ifdef LANES
 typedef real_bits condition __attribute__((vector_size(REAL_BYTES * LANES))); /* all bits of the lanes where it holds */
 
 /* x in the lanes where the condition holds, y in others. */

@@ -106,9 +106,6 @@ enum { SAVED = 5 * TANGENTS }; /* numbers that are saved of a trajectory after a
 #else
 enum { SAVED = WORDS * M };
 #endif
-#ifdef SCVI_DEVICE
-#include "thread_run.h"
-#else
 void NAME(start)(block_memory *block, double t, double h)
 {
   memset(block, 0, sizeof *block);
@@ -464,4 +461,3 @@ long long NAME(call_each)(NAME(each) * c, long long steps)
   }
   return taken;
 }
-#endif

@@ -18,9 +18,8 @@ import click
 
 from scvi_codegen.codegen.native.building import FLAGS_VARIABLE, TUNED_FLAGS
 from scvi_codegen.codegen.native.compilers import compiler_title, find_compiler, from_wheel, running
-from scvi_codegen.codegen.native.cuda import EXTRA_SIZE, NOT_YET_RUN, Device
 from scvi_codegen.common.cache import CACHE_VARIABLE, cache_folder, cache_info, exposed, remedy_of
-from scvi_codegen.common.errors import BuildError, MissingLibraryError
+from scvi_codegen.common.errors import BuildError
 from scvi_codegen.interfaces.cli.command_group import FAILURE, CommandFailure, reporting, tell
 
 OF_FIRST_RUNS, OF_DEVELOPERS = ("compiler", "data", "plot"), ("bench", "docs", "release", "test")
@@ -77,16 +76,6 @@ def run_checks() -> Iterator[CheckResult]:
     extras = {requirement["extra"] for requirement in _described(PACKAGE)} - {""}
     for extra in sorted(extras, key=lambda extra: (extra in OF_DEVELOPERS, extra not in OF_FIRST_RUNS, extra)):
         yield _packages(extra, f"extra {extra}")
-    yield _gpu()
-
-
-def _gpu() -> CheckResult:
-    """Look for a GPU; ``device="cuda"`` is experimental."""
-    try:
-        device = Device()
-    except (BuildError, MissingLibraryError) as error:
-        return CheckResult("gpu", MISSING, f"none ({NOT_YET_RUN})", f"{error} (extra cuda: {EXTRA_SIZE})")
-    return CheckResult("gpu", OK, f"{device.device.name}, {device.architecture} ({NOT_YET_RUN})")
 
 
 def _cores() -> str:

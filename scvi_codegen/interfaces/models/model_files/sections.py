@@ -222,7 +222,7 @@ def read_run(section: Section) -> dict[str, Any]:
         raise ModelFileError("[run] has steps but no step: give the step size")
     fields = [option for option in options_of("run") if option in FIELDS and option.key in section]
     numbers = {option.field: option.read(section[option.key], f"[run] {option.key}") for option in fields}
-    return {**numbers, **{name: section.get(name) for name in ("precision", "sums", "device", "observe")}}
+    return {**numbers, **{name: section.get(name) for name in ("precision", "sums", "observe")}}
 
 
 FORMULAS = ("lagrangian", "hamiltonian", "dissipation", "damping", "constraints")
