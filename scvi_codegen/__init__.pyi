@@ -63,9 +63,6 @@ from scvi_codegen.interfaces.frameworks.flow import JaxFlow as JaxFlow
 from scvi_codegen.interfaces.frameworks.flow import jax_flow as jax_flow
 from scvi_codegen.interfaces.frameworks.optimal_control import ControlledMotion as ControlledMotion
 from scvi_codegen.interfaces.frameworks.optimal_control import optimal_control as optimal_control
-from scvi_codegen.interfaces.frameworks.rebound import GravitatingBodies as GravitatingBodies
-from scvi_codegen.interfaces.frameworks.rebound import from_rebound as from_rebound
-from scvi_codegen.interfaces.frameworks.rebound import to_rebound as to_rebound
 from scvi_codegen.interfaces.frameworks.torch import TorchFlow as TorchFlow
 from scvi_codegen.interfaces.frameworks.torch import torch_flow as torch_flow
 from scvi_codegen.interfaces.models.model import Model as Model

@@ -29,7 +29,7 @@ SCRIPTS = (
     "eccentric_comet", "elements_on_processes", "field_on_two_processes", "halo_orbits", "hanging_chain",
     "henon_heiles_map", "custom_sympy_system", "import_generated_stepper", "inspect_derivation", "joints",
     "kepler_conservation", "lennard_jones_liquid", "logarithmic_hamiltonian", "mechanism_from_joints",
-    "poincare_section", "which_step",
+    "poincare_section", "rebound_bodies", "which_step",
 )  # fmt: skip
 ENERGY_ERRORS = {
     "outer_solar_system": 1e-13,
@@ -229,6 +229,14 @@ def test_mechanism_from_joints_agrees_with_sympy(output_of):
     output = output_of("mechanism_from_joints")
     assert float(re.search(r"unaccounted for: (\S+)", output)[1]) < 1e-12
     assert float(re.search(r"after 10 s: (\S+)", output)[1]) < 1e-11
+
+
+@pytest.mark.second
+def test_bodies_of_rebound_have_its_trajectory_here_and_there(output_of):
+    pytest.importorskip("rebound", reason="needs rebound")
+    apart = [float(number) for number in re.findall(r": (\S+) AU apart", output_of("rebound_bodies"))]
+    assert len(apart) == 2
+    assert max(apart) < 1e-10
 
 
 def test_inspect_derivation_runs_in_a_separate_process(tmp_path):

@@ -51,7 +51,6 @@ OWNERS = {
     "mpmath": "common methods runs",
     "pandas": "common runs",
     "platformdirs": "common",
-    "rebound": "interfaces",
     "scipy": "analysis codegen interfaces runs systems",
     "tomli_w": "interfaces",
     "xarray": "common runs",

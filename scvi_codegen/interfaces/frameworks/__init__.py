@@ -1,1 +1,1 @@
-"""Interfaces to other libraries: flows for JAX, PyTorch and CasADi, optimal control, bodies of REBOUND."""
+"""Interfaces to other libraries: flows for JAX, PyTorch and CasADi, optimal control."""

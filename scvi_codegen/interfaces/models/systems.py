@@ -1,6 +1,5 @@
 """Mechanical systems of the literature; every physical constant is a parameter."""
 
-from collections.abc import Mapping, Sequence
 from itertools import chain, combinations, pairwise
 
 from scvi_codegen.common.errors import SystemDefinitionError
@@ -42,23 +41,17 @@ def outer_solar_system() -> LagrangianSystem:
     Lengths in astronomical units, time in days, masses in solar masses: Hairer, Lubich and Wanner, Geometric Numerical
     Integration, section I.2.4.
     """
-    positions = {f"m_{body}": [f"{body}_{axis}" for axis in "xyz"] for body in _MASSES}
-    masses = {f"m_{body}": mass for body, mass in _MASSES.items()}
-    return gravitating_bodies("outer solar system", positions, {"G": 2.95912208286e-4} | masses)
-
-
-def gravitating_bodies(
-    name: str, positions: Mapping[str, Sequence[str]], parameters: Mapping[str, float]
-) -> LagrangianSystem:
-    """Return bodies with L = sum m v^2/2 + sum over pairs G m m'/r; ``positions``: Cartesian coordinates by mass."""
-    kinetic = " + ".join(f"{m}*({' + '.join(f'{x}_dot**2' for x in place)})/2" for m, place in positions.items())
+    place = {body: [f"{body}_{axis}" for axis in "xyz"] for body in _MASSES}
+    kinetic = " + ".join(f"m_{body}*({' + '.join(f'{x}_dot**2' for x in place[body])})/2" for body in _MASSES)
     attraction = ""
-    for (m, place), (m_other, other) in combinations(positions.items(), 2):
-        square = " + ".join(f"({x} - {y})**2" for x, y in zip(place, other, strict=True))
-        attraction += f" + G*{m}*{m_other}/sqrt({square})"
-    coordinates = list(chain.from_iterable(positions.values()))
+    for body, other in combinations(_MASSES, 2):
+        square = " + ".join(f"({x} - {y})**2" for x, y in zip(place[body], place[other], strict=True))
+        attraction += f" + G*m_{body}*m_{other}/sqrt({square})"
     return LagrangianSystem.from_text(
-        name=name, coordinates=coordinates, lagrangian=kinetic + attraction, parameters=parameters
+        name="outer solar system",
+        coordinates=list(chain.from_iterable(place.values())),
+        lagrangian=kinetic + attraction,
+        parameters={"G": 2.95912208286e-4} | {f"m_{body}": mass for body, mass in _MASSES.items()},
     )
 
 
