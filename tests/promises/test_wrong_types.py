@@ -148,7 +148,7 @@ def test_trajectories_refuse_wrong_types_by_name(run, tmp_path):
     refused(sc.fit, known | asked | {"inputs": None, "bounds": {"mu": (0.0, 2.0)}})
     refused(run.crossings, {"events": "q1"})
     refused(run.save, {"path": tmp_path / "run.npz", "units": None})
-    span = {"t_span": (0.0, 1.0), "y0": [*Q, *P], "method": None, "h": 0.1, "t_eval": None, "dense_output": False}
+    span = {"t_span": (0.0, 1.0), "y0": [*Q, *P], "method": None, "t_eval": None, "dense_output": False}
     refused(sc.solve_ivp, {"system": run.stepper} | span)
     fresh = {"run": run.stepper.start(Q, P, h=0.1), "folder": tmp_path / "a.run", "checkpoint_seconds": 1.0}
     refused(sc.record_run, fresh | {"steps": 3, "save_every": 1, "model": None, "progress": None})

@@ -13,14 +13,6 @@ E = 0.3
 START = {"q": [1 - E, 0.0], "p": [0.0, math.sqrt((1 + E) / (1 - E))]}
 
 
-def ellipse(t: np.ndarray) -> np.ndarray:
-    """(n, 2) exact positions on the orbit from START."""
-    anomaly = t.copy()
-    for _ in range(50):
-        anomaly -= (anomaly - E * np.sin(anomaly) - t) / (1 - E * np.cos(anomaly))
-    return np.stack([np.cos(anomaly) - E, math.sqrt(1 - E**2) * np.sin(anomaly)], axis=1)
-
-
 @pytest.fixture(scope="module")
 def kepler() -> sc.Stepper:
     return sc.compile_stepper(sc.problem("kepler").system, sc.SVI(4), flags=FLAGS)
@@ -35,11 +27,10 @@ def test_solve_ivp_agrees_with_scipy():
         system,
         (0, 10),
         [2.0, 0.0],
-        h=0.2,
         t_eval=asked,
         dense_output=True,
         events=["q", sc.Event("p_q", 1)],
-        parameters={"g": 1.0, "m": 1.0, "l": 1.0},
+        args={"g": 1.0, "m": 1.0, "l": 1.0},
     )
 
     def angle(t, y):
@@ -73,7 +64,7 @@ def test_solve_ivp_agrees_with_scipy():
 
 
 def test_solve_ivp_ends_at_a_terminal_event(kepler):
-    half = sc.solve_ivp(kepler, (0, 100), [*START["q"], *START["p"]], h=0.1, events=sc.Event("q2", -1, terminal=True))
+    half = sc.solve_ivp(kepler, (0, 100), [*START["q"], *START["p"]], events=sc.Event("q2", -1, terminal=True))
     assert (half.status, half.success) == (1, True)
     assert "'q2'" in half.message
     assert half.t[-1] == pytest.approx(math.pi, abs=1e-8)
@@ -83,7 +74,6 @@ def test_solve_ivp_ends_at_a_terminal_event(kepler):
         kepler,
         (0, 100),
         [*START["q"], *START["p"]],
-        h=0.1,
         events=sc.Event("q2", -1, terminal=True),
         t_eval=np.arange(0, 100, 0.5),
         dense_output=True,
@@ -95,17 +85,10 @@ def test_solve_ivp_ends_at_a_terminal_event(kepler):
 @pytest.mark.rotated
 def test_solve_ivp_reports_a_failed_step():
     runaway = sc.LagrangianSystem.from_text(name="runaway", coordinates=["q"], lagrangian="q_dot**2/2 + q**3/3")
-    failed = sc.solve_ivp(sc.compile_stepper(runaway, sc.SVI(3), flags=FLAGS), (0, 10), [1.0, 1.0], h=0.1)
+    failed = sc.solve_ivp(sc.compile_stepper(runaway, sc.SVI(3), flags=FLAGS), (0, 10), [1.0, 1.0])
     assert (failed.status, failed.success) == (-1, False)
     assert "smaller step" in failed.message
     assert failed.y.shape == (2, len(failed.t))
-
-
-def test_solve_ivp_uses_adaptive_steps_for_a_tolerance():
-    y0 = [*START["q"], *START["p"]]
-    motion = sc.solve_ivp(sc.problem("kepler").system, (0, 20), y0, tolerance=1e-7, method=sc.SVI(4))
-    error = np.abs(motion.y[:2, -1] - ellipse(motion.t[-1:])[0]).max()
-    assert 1e-11 < error < 1e-7
 
 
 def test_iterations_between_saved_states_are_those_of_the_steps(kepler):

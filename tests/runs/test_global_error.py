@@ -368,20 +368,6 @@ class TestOtherRuns:
         assert run.confirmed_until == 6.0
 
 
-class TestSolveMotion:
-    @pytest.mark.rotated
-    def test_unconfirmed_result_is_not_a_success(self, burrau_stepper):
-        with pytest.warns(sc.AccuracyWarning, match="confirmed until"):
-            motion = sc.solve_ivp(burrau_stepper, (0.0, 30.0), np.concatenate(PYTHAGOREAN), error=1e-9)
-        assert not motion.success
-        assert motion.status == -2
-        assert "is confirmed only until t = " in motion.message
-
-    def test_error_argument_excludes_other_step_arguments(self, kepler_stepper):
-        with pytest.raises(sc.StateError, match="error=1e-08 and rtol=1e-06 both determine the step size"):
-            sc.solve_ivp(kepler_stepper, (0.0, 1.0), [1.6, 0.0, 0.0, 0.5], error=1e-8, rtol=1e-6)
-
-
 def loaded(path):
     with np.load(path) as file:
         return dict(file)

@@ -95,8 +95,8 @@ def test_states_by_name_are_those_of_numbers_in_every_function_of_a_state():
     vertical = ATTITUDE.apply(INERTIA * OMEGA)[2]
     assert stepper.momentum_maps(*state)[0] == pytest.approx(vertical, rel=1e-14)
     np.testing.assert_allclose(stepper.step(*state, 0.1), stepper.step(start.q, start.p, 0.1), rtol=0, atol=1e-14)
-    mixed = stepper.integrate(start.q, velocity={"omega": OMEGA}, h=0.1, steps=2)
-    solution = sc.solve_ivp(stepper, (0, 0.2), {"R": ATTITUDE}, velocity={"omega": OMEGA}, h=0.1)
+    mixed = stepper.integrate(start.q, velocity={"omega": OMEGA}, t_end=0.2)
+    solution = sc.solve_ivp(stepper, (0, 0.2), {"R": ATTITUDE}, velocity={"omega": OMEGA})
     np.testing.assert_allclose(solution.y[:, -1], np.concatenate([mixed.q[-1], mixed.p[-1]]), rtol=0, atol=1e-14)
 
 

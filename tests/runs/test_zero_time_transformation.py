@@ -33,13 +33,6 @@ def test_reversible_controller_stops_where_the_time_transformation_is_zero(event
     assert failure.value.status == "time transformation singular"
 
 
-@pytest.mark.rotated
-def test_solve_ivp_reports_a_zero_time_transformation():
-    motion = sc.solve_ivp(OSCILLATOR, (0.0, 4.0), [1.0, 0.0], time_transformation="x**2", method="svi:4")
-    assert not motion.success
-    assert "reaches 0" in motion.message
-
-
 @pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize("time_transformation", ["frequency", "q1**2 + q2**2"])
 def test_close_encounters_do_not_stop_a_run(time_transformation):
