@@ -63,7 +63,6 @@ from scvi_codegen.codegen.variants import (
     Crossings,
     Derivatives,
     Energies,
-    Kinks,
     Lanes,
     NewtonFallback,
     Observing,
@@ -270,11 +269,12 @@ class Sources:
         g: str | Expr | None = None,
         controller: str | None = None,
         precision: str = "double",
-        kinks: Kinks = "as formulas",
+        *,
+        locates: bool = False,
     ) -> None:
         self.method, self.solver, self.g, self.precision = method, solver, g, precision
         self._arguments = system, method, solver, prefix, symmetries, g, controller
-        self._locates = kinks == "located" and g is None and system.bath is None
+        self._locates = locates and g is None and system.bath is None
         self.symmetries = symmetries
         self.controller = controller_named(controller, in_tau=g is not None)
         self.prefix = c_identifier(prefix or f"{system.name}_{method.name}")
@@ -624,7 +624,6 @@ def generate_source(
     controlled: bool = False,
     time_transformation: str | Expr | None = None,
     controller: str | None = None,
-    kinks: Kinks = "as formulas",
 ) -> tuple[Source, Interface]:
     """Return the C source of an integrator and its interface; other arguments as of :func:`compile_stepper`.
 
@@ -643,13 +642,14 @@ def generate_source(
             events are combined with ``embedded="single"``.
     """
     method = as_method(method, system)
-    if kinks == "located" and not embedded and time_transformation is None and controller is None:
+    locates = not embedded and time_transformation is None
+    if locates and controller is None:
         system = sliding(system, method)
     original, rows = system, cast("tuple[ContactRows, ...]", ())
     if system.has_contacts:
         system, rows = bound_contacts(system, system.contacts)
     form = discretised_form(system, method)
-    system, located = located_kinks(form) if kinks == "located" and original.bath is None else (form, ())
+    system, located = located_kinks(form) if locates and original.bath is None else (form, ())
     if embedded not in (None, *EMBEDDED):
         raise MethodError(f"embedded must be {' or '.join(EMBEDDED)}, not {embedded!r}")
     if embedded and solver == "fixed-point":

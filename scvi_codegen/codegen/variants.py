@@ -10,11 +10,6 @@ Sums: TypeAlias = Literal["compensated", "plain"]
 
 SUMS: tuple[Sums, ...] = get_args(Sums)
 
-Kinks: TypeAlias = Literal["located", "as formulas"]
-"""Zeros of the arguments of unit_step along runs: steps end there, or pass them with the formulas as they are."""
-
-KINKS: tuple[Kinks, ...] = get_args(Kinks)
-
 
 @dataclass(frozen=True, slots=True)
 class Variant:

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.codegen.native.building import TUNED_FLAGS
 from scvi_codegen.codegen.native.compilers import REORDERING_FLAGS
 from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE, PRECISIONS, Interface, Source
-from scvi_codegen.codegen.variants import KINKS, SUMS, Derivatives, Kinks, Sums, Variant
+from scvi_codegen.codegen.variants import SUMS, Derivatives, Sums, Variant
 from scvi_codegen.common.cache import cached_source, key_of
 from scvi_codegen.common.errors import MethodError, SizesRequiredError
 from scvi_codegen.common.validation import TEXTS, OfRunTimeSizes, check_kind, checks_arguments
@@ -63,7 +63,6 @@ def compile_stepper(
     tables: Mapping[str, ArrayLike] | None = None,
     precision: str = "double",
     sums: str = "compensated",
-    kinks: Kinks = "located",
     contacts: Sequence[ContactLike] = (),
 ) -> Stepper:
     """Derive, generate, compile and load the integrator of ``system`` by ``method``.
@@ -102,10 +101,6 @@ def compile_stepper(
         sums: of the increments of steps: ``"compensated"``, whose rounding errors are added to later steps (Kahan), or
             ``"plain"``, for explicit methods and arrays of run-time sizes: faster, with rounding errors that grow with
             the number of steps (docs/lattices.md).
-        kinks: zeros of the arguments of unit_step, abs, sign, min, max, where and positive_part along runs:
-            ``"located"``, so that steps end there and keep their order; or ``"as formulas"``, so that steps of equal
-            size stay equal and symplectic, and lose order there. Arrays of run-time sizes, time transformations and
-            double-double arithmetic have formulas alone (docs/events.md).
         contacts: contacts and dry friction of the system, made by :func:`~scvi_codegen.contact` and
             :func:`~scvi_codegen.friction`, in addition to its own. The method is an SVI of degree s with s + 1 Lobatto
             points, ``"svi:3"``, in double precision.
@@ -117,10 +112,8 @@ def compile_stepper(
     check_precision(precision, flags)
     if sums not in SUMS:
         raise MethodError(f"unknown sums {sums!r}: use {' or '.join(map(repr, SUMS))}")
-    if kinks not in KINKS:
-        raise MethodError(f"unknown kinks {kinks!r}: use {' or '.join(map(repr, KINKS))}")
     others = {"precision": precision, "sizes": sizes, "tables": tables, "controller": controller}
-    system, rows = _with_contacts(system, method, kinks, contacts, **others, time_transformation=time_transformation)
+    system, rows = _with_contacts(system, method, contacts, **others, time_transformation=time_transformation)
     precision = "double" if rows else precision  # contacts have no second precision for "auto"
     common: dict[str, Any] = {
         "solver": solver,
@@ -131,38 +124,36 @@ def compile_stepper(
     }
     _check_symmetries(symmetries)
     if isinstance(system, OfRunTimeSizes) and sizes is None and tables is None:
-        return _compile_arrays(system, method, symmetries, as_events(events), precision, common, sums, kinks)
+        return _compile_arrays(system, method, symmetries, as_events(events), precision, common, sums)
     if sums == "plain":
         raise MethodError(
             f"sums='plain' is not available for '{system.name}' with named coordinates or known sizes: leave out "
             "sums=, or declare arrays, q[N], whose sizes each run gives"
         )
-    compiled = partial(compile_stepper, system, method, symmetries=symmetries, sizes=sizes, tables=tables, **common)
-    located = kinks == "located"
-    if precision == DOUBLE_DOUBLE:
-        kinks = "as formulas"
-    compiled = partial(compiled, kinks=kinks)
     if precision == AUTO:
-        return _in_both_precisions(compiled, events)
+        further: Any = {"symmetries": symmetries, "sizes": sizes, "tables": tables, **common}
+        return _in_both_precisions(partial(compile_stepper, system, method, **further), events)
     shape: dict[str, Any] = {"mesh": system.mesh, "links": system.drawn_links}
     if sizes is not None or tables is not None:
         system, time_transformation = _at_sizes(system, time_transformation, sizes or {}, tables)
         others = {"precision": precision, "controller": controller, "time_transformation": time_transformation}
-        system, rows = _with_contacts(system, method, kinks, (), **others)
+        system, rows = _with_contacts(system, method, (), **others)
     method = as_method(method, system)
-    settings = solver, prefix, symmetries, time_transformation, controller, precision, kinks
-    sources = CachedSources(system, method, *settings)
-    source, interface = sources.integrator()
-    interface = replace(interface, layout=replace(interface.layout, **shape), contacts=rows)
-    if located and not interface.modes:
-        warn_of_formulas(interface, f"the stepper of '{interface.system}'")
-    system.store_key()
-    stepper = partial(Stepper, source, interface, variants=sources.variants, flags=flags)
+    settings = system, method, solver, prefix, symmetries, time_transformation, controller
+
+    def made(precision: str, events: tuple[Event, ...] = (), *, locates: bool = False) -> Stepper:
+        sources = CachedSources(*settings, precision, locates=locates)
+        source, interface = sources.integrator()
+        interface = replace(interface, layout=replace(interface.layout, **shape), contacts=rows)
+        return Stepper(source, interface, variants=sources.variants, flags=flags, events=events)
+
+    stepper = made(precision, as_events(events), locates=precision != DOUBLE_DOUBLE)
     if precision == DOUBLE_DOUBLE:
-        of_two_words = stepper()
-        of_two_words._doubles = cache(compiled)
-        return of_two_words.with_events(as_events(events))
-    return stepper(events=as_events(events))
+        stepper._doubles = cache(partial(made, "double"))
+    if not stepper.interface.modes:
+        warn_of_formulas(stepper.interface, f"the stepper of '{stepper.interface.system}'")
+    system.store_key()
+    return stepper
 
 
 def _check_symmetries(symmetries: Any) -> None:
@@ -174,11 +165,11 @@ def _check_symmetries(symmetries: Any) -> None:
 
 
 def _with_contacts(
-    system: MechanicalSystem, method: Method | str, kinks: Kinks, contacts: Sequence[ContactLike], **others: Any
+    system: MechanicalSystem, method: Method | str, contacts: Sequence[ContactLike], **others: Any
 ) -> tuple[MechanicalSystem, tuple[ContactRows, ...]]:
     """Return the system with the modes of its contacts as parameters, and their places; ``others`` exclude contacts."""
     passed = [name for name, value in others.items() if value not in (None, "auto", "double")]
-    if kinks == "located" and not passed:
+    if not passed:
         system = sliding(system, method)
     if not any((*contacts, system.has_contacts)):
         return system, ()
@@ -197,7 +188,6 @@ def _compile_arrays(
     precision: str,
     common: Mapping[str, Any],
     sums: Sums,
-    kinks: Kinks,
 ) -> Stepper:
     """Return the stepper of arrays whose sizes each run determines; ``common``: further arguments."""
     if precision == AUTO:
@@ -215,9 +205,8 @@ def _compile_arrays(
         raise MethodError(f"sums='plain' is not available for '{system.name}': {reason}")
     if system.constraints and isinstance(discretisation, StoermerVerlet):
         method = SVI(1, "gauss-lobatto:2")  # the name of RATTLE for known sizes
-    if kinks == "located":
-        warn_of_formulas(interface, f"the stepper of '{interface.system}' with sizes of each run")
-    of_sizes = partial(compile_stepper, system, method, **common, kinks=kinks)
+    warn_of_formulas(interface, f"the stepper of '{interface.system}' with sizes of each run")
+    of_sizes = partial(compile_stepper, system, method, **common)
     arguments: dict[str, Any] = {"variants": sources.variants, "flags": common["flags"], "events": events}
     return StepperOfRunTimeSizes(source, interface, **arguments, of_sizes=of_sizes, reason=reason)
 
@@ -233,7 +222,7 @@ def _in_both_precisions(compiled: Callable[..., Stepper], events: EventLike | Se
     @cache
     def in_double_double() -> Stepper | None:
         with suppress(MethodError):  # of this system or method
-            return compiled(precision=DOUBLE_DOUBLE, kinks="as formulas")
+            return compiled(precision=DOUBLE_DOUBLE)
         return None
 
     stepper = compiled(events=events)
@@ -283,13 +272,14 @@ class CachedSources:
         g: str | Expr | None,
         controller: str | None = None,
         precision: str = "double",
-        kinks: Kinks = "as formulas",
+        *,
+        locates: bool = False,
     ) -> None:
-        self.precision, self.kinks = precision, kinks
+        self.precision, self.locates = precision, locates
         self.system, self.method, self.solver, self.prefix = system, method, solver, prefix
         self.symmetries, self.g, self.controller = symmetries, g, controller
         choices = (solver, prefix, tuple(symmetries), g, controller, *([precision] if precision != "double" else []))
-        choices = (*choices, *([kinks] if kinks == "located" else []))
+        choices = (*choices, *(["located"] if locates else []))
         self.key = (*system.key(), *method.key(), key_of(choices))
 
     @cached_property
@@ -297,8 +287,8 @@ class CachedSources:
         """The sources that are not in the cache."""
         from scvi_codegen.codegen.pipeline import Sources
 
-        choices = self.solver, self.prefix, self.symmetries, self.g, self.controller, self.precision, self.kinks
-        return Sources(self.system, self.method, *choices)
+        choices = self.solver, self.prefix, self.symmetries, self.g, self.controller, self.precision
+        return Sources(self.system, self.method, *choices, locates=self.locates)
 
     @property
     def variants(self) -> Variants:

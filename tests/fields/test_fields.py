@@ -231,6 +231,6 @@ def test_densities_with_steps_and_positive_parts_have_a_highest_frequency():
     between = frequency("1 + 3*unit_step(x - 1/2)")
     assert between.highest_frequency() == pytest.approx(frequency("4").highest_frequency(), rel=1e-12)
     assert between.largest_step("svi:2") < frequency("1").largest_step("svi:2")
-    stepper = sc.compile_stepper(between.system, "svi:2", kinks="as formulas")
+    stepper = sc.compile_stepper(between.system, "svi:2")
     run = stepper.integrate({"u": np.ones(32)}, h=0.01, steps=2)
     assert run.t[-1] == 0.02

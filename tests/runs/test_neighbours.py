@@ -34,7 +34,7 @@ def liquid(skin: float | None = 0.3, pair: str = WELL) -> Any:
 
 @cache
 def stepper(method: str = "stoermer-verlet", skin: float | None = 0.3, pair: str = WELL) -> Any:
-    return sc.compile_stepper(liquid(skin, pair), method, kinks="located" if skin else "as formulas")
+    return sc.compile_stepper(liquid(skin, pair), method)
 
 
 def start(speed: float = 1.2, side: int = 4) -> tuple[Any, Any]:
@@ -171,7 +171,7 @@ def test_boxes_of_other_shapes_and_none(box: Any) -> None:
         generator = np.random.default_rng(5)
         state = {"x": 1.0, "r": generator.uniform(-6, 6, size=(70, 2))}
         velocity = {"x": 0.0, "r": generator.normal(size=(70, 2))}
-        run = sc.compile_stepper(system, "stoermer-verlet", kinks="as formulas").integrate(
+        run = sc.compile_stepper(system, "stoermer-verlet").integrate(
             state, velocity=velocity, h=0.01, steps=150, parameters={"m": np.linspace(0.5, 1.5, 70)}
         )
         runs.append((run.q["r"], run.energy()))

@@ -43,7 +43,7 @@ def test_jumps_are_refused_with_the_term(name: str) -> None:
     """Those of rint by the definition, others by steps that do not locate them."""
     error = sc.SystemDefinitionError if "rint" in JUMPS[name] or "wrap" in JUMPS[name] else sc.MethodError
     with pytest.raises(error, match=r" of 'line' jumps where .* = 0: its term .*forces"):
-        sc.compile_stepper(line(JUMPS[name]), "svi:1", kinks="as formulas")
+        sc.compile_stepper(line(JUMPS[name]), "svi:1", time_transformation="1/(1 + x**2)")
 
 
 @pytest.mark.parametrize("name", CONTINUOUS)

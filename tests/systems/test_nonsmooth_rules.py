@@ -88,16 +88,6 @@ def test_constraints_with_kinks_keep_the_order_or_that_of_their_power(power: str
         lagrange("bead", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["y - positive_part(x)**(7/4)"])
 
 
-@pytest.mark.rotated
-def test_only_formulas_as_they_are_are_symplectic_across_a_kink() -> None:
-    system = lagrange("wall", "x", "x_dot**2/2 - 50*positive_part(x - 0.13)**2")
-    defects = []
-    for kinks in ("as formulas", "located"):
-        run = sc.compile_stepper(system, "stoermer-verlet", kinks=kinks).integrate([0.0], [1.0], h=0.1, steps=2)
-        defects.append(abs(np.linalg.det(run.tangent()[-1]) - 1.0))
-    assert defects[0] < 1e-14 < 1e-4 < defects[1]
-
-
 @STEPS
 def test_velocities_are_continuous_where_a_mass_has_a_kink(steps: dict[str, float]) -> None:
     run = made("(1 + abs(x))*x_dot**2/2", method="svi:8").integrate([-1.0], [1.0], t_end=4.0, **steps)
@@ -194,7 +184,7 @@ def test_friction_of_arrays_is_one_contact_an_element_of_at_most_192(size: int |
         run = stepper.integrate([1.0, 0.5, 0.1], [0.0] * 3, h=0.1, t_end=13.0)
         assert run.q[-1] == pytest.approx([-0.1, -0.1, 0.1], abs=1e-6)
     smooth = lagrange("array", "x[N]", "sum(i in N, x_dot[i]**2/2 - x[i]**2/2)", forces={"x[i]": "-x_dot[i]*abs(x[i])"})
-    assert sc.compile_stepper(smooth, "svi:2", flags=QUICK_FLAGS, kinks="as formulas").run_time_sizes
+    assert sc.compile_stepper(smooth, "svi:2", flags=QUICK_FLAGS).run_time_sizes
 
 
 @pytest.mark.rotated
@@ -339,12 +329,11 @@ def test_a_rocking_block_loses_housners_part_of_its_rate() -> None:
     assert run.energy_error() < 1e-13
 
 
-@pytest.mark.parametrize("kinks", ["located", "as formulas"])
-def test_an_energy_that_is_0_has_the_size_of_its_parts(kinks: str) -> None:
+def test_an_energy_that_is_0_has_the_size_of_its_parts() -> None:
     """A mass that falls on a rope from rest: the error is a part of its kinetic energy, in any units."""
     rope = lagrange("rope", "y", "m*(y_dot**2/2 + 9.81*y - 500*positive_part(y - 1)**2)", m=1.0)
-    stepper = sc.compile_stepper(rope, "svi:2", kinks=kinks)
+    stepper = sc.compile_stepper(rope, "svi:2")
     errors = [
         stepper.integrate([0.0], [0.0], h=0.005, t_end=2.0, parameters={"m": m}).energy_error() for m in (1.0, 2.0**-30)
     ]
-    assert errors[0] == errors[1] < (1e-6 if kinks == "located" else 0.2)
+    assert errors[0] == errors[1] < 1e-6

@@ -55,11 +55,6 @@ LONGEST, HALVINGS, PART = 1.0, 40, 0.1
 """Largest step tried, number of halvings, and the largest change of the state per step relative to its size."""
 
 
-def _compiled(*arguments: Any, **keywords: Any) -> Stepper:
-    """Return a stepper whose kinks are formulas: measured are single steps."""
-    return compile_stepper(*arguments, kinks="as formulas", **keywords)
-
-
 @checks_arguments(system=SYSTEM_OR_ARRAYS, stepper=STEPPER)
 @without_accuracy_warnings()
 def verify(
@@ -112,15 +107,15 @@ def verify(
     t, h = checked_number(t, "the time t"), None if h is None else checked_step(h)
     began, method = time.perf_counter(), as_method(method, system)
     if isinstance(system, ArraySystem):
-        stepper = stepper or _compiled(system, method, solver=solver)
+        stepper = stepper or compile_stepper(system, method, solver=solver)
         of_known_sizes = partial(verify, solver=solver, tolerance=tolerance)
         of_run |= {"of_known_sizes": of_known_sizes, "tolerance": tolerance}
         return verify_arrays(system, method, stepper, (q, p, cast(float, h), t), began, **of_run)
     if stepper is None or stepper.interface.contacts:
         system = sliding(system, method)
     form = discretised_form(in_all_modes(system), method)
-    located, kinks = located_kinks(form)
-    stepper = stepper or compile_stepper(system, method, solver=solver, kinks="located" if kinks else "as formulas")
+    located, _ = located_kinks(form)
+    stepper = stepper or compile_stepper(system, method, solver=solver)
     if stepper.interface.masked != len(form.reactions):
         raise StateError(f"'{system.name}' has other contacts than {stepper!r}: pass a system with them, contacts=")
     system = located if stepper.interface.modes else form
@@ -161,7 +156,7 @@ def _certificate(
         system = system.with_parameters(**stepper.parameters_by_name(parameters_on_sides(run, start.t)))
     steps, single = stepper, at_fixed_energy(system, stepper.energy(start.q, start.p, start.t))
     if single is not system or stepper.interface.time_transformation is not None:
-        steps = _compiled(single, method, solver=solver, flags=flags)
+        steps = compile_stepper(single, method, solver=solver, flags=flags)
     tested = SystemUnderTest(single, method, steps, _newton(single, method, steps, solver, flags), start)
     variable = steps is not stepper or tolerance is not None
     in_time = system.clock.plain if system.clock and system.clock.plain else system
@@ -194,7 +189,7 @@ def _newton(
         return stepper
     if solver != "auto" or not method.implicit:
         return None
-    return _compiled(system, method, solver="newton", flags=flags)
+    return compile_stepper(system, method, solver="newton", flags=flags)
 
 
 def _initial_state(

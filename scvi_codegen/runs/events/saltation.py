@@ -153,7 +153,7 @@ def check_sides(stepper: Integrator, states: Array, t: Sequence[float], h: float
                 raise StateError(
                     f"the motion rests at a kink of its equations, {kink.title} = 0: "
                     "derivatives with respect to its state are undefined, as those of both sides differ. Give a state "
-                    'beside it, or a stepper with kinks="as formulas", which has those of one side'
+                    "beside it"
                 )
 
 

@@ -158,7 +158,8 @@ FEATURES = {
             "error observe_ensemble single check_growth hessian chaos_ensemble flow advice shadow_energy",
             "make them terminal and restart",
         ),
-        ("with kinks that runs locate", "observe_ensemble single hessian", 'compile it with kinks="as formulas"'),
+        ("with kinks that runs locate", "observe_ensemble single", "save states of runs in double precision"),
+        ("with kinks that runs locate", "hessian", "use first derivatives and differences of them"),
         ("where L or H jumps", "shadow_energy", "use energy()"),
         ("where L or H jumps", " ".join(BY_FORMULAS), "use runs, ensembles of runs and their first derivatives"),
         (
@@ -297,8 +298,7 @@ def warn_of_formulas(of: Any, subject: str) -> None:
             remedy = "Use short steps (h=) or, with named coordinates, metropolis=True: its averages have no error of h"
         warn(
             f"{subject} does not locate the kinks of this system, such as {clipped(u, 60)} = 0{loop}{indices}: steps "
-            f'across them use the formulas as they are and lose order. {remedy}; steppers with kinks="as formulas" do '
-            "not warn",
+            f"across them use the formulas as they are and lose order. {remedy}",
             MethodWarning,
         )
 

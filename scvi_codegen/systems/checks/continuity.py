@@ -223,8 +223,8 @@ def jump_message(subject: str, surface: Expr, term: Expr) -> str:
     """Return the message for a term of a Lagrangian or Hamiltonian that jumps."""
     return (
         f"{subject} jumps where {shortened(surface)} = 0: its term {shortened(term)} is not continuous there, so the "
-        "momentum jumps, too. This requires a surface of named coordinates that runs locate: compile_stepper(..) with "
-        'kinks="located" in double precision, without time transformation. Or write a continuous function, such as '
+        "momentum jumps, too. This requires a surface of named coordinates that runs locate: compile_stepper(..) "
+        "in double precision, without time transformation. Or write a continuous function, such as "
         "positive_part, put what jumps into forces, or use an event that changes the state (impact, then=)"
     )
 

@@ -229,7 +229,7 @@ def _texts(model: Model, prefix: str) -> tuple[Source, dict[str, bytes]]:
     """Return the source to compile, and the archive's text files by name."""
     events = model.events if any(event.changes_state for event in model.events) else ()
     source, interface = generate_source(
-        model.system, model.method, solver=model.solver, prefix=prefix, events=events or None, kinks="located"
+        model.system, model.method, solver=model.solver, prefix=prefix, events=events or None
     )
     searched = interface.searched(events)
     settings = [(event.direction, int(event.terminal), int(event.changes_state)) for event in searched]

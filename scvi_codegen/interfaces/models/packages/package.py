@@ -335,7 +335,6 @@ def integrator_of(model: Model, prefix: str, *, embedded: Embedded | None = None
             solver=model.solver,
             prefix=prefix,
             events=model.events,
-            kinks="as formulas" if embedded or model.time_transformation else "located",
             embedded=embedded,
             controlled=not embedded or model.h is None,
             time_transformation=model.time_transformation,
