@@ -394,5 +394,4 @@ def _figure(name: str, title: str, study: str, **changes: Any) -> Experiment:
 
 
 _TABLES = package_table("paper/refinement.toml")
-STUDIES = {name: _study(name) for name in _TABLES["studies"]}
 EXPERIMENTS = tuple(_figure(name, **table) for name, table in _TABLES.items() if name != "studies")

@@ -219,6 +219,7 @@ def test_derivatives_take_prescribed_ends(method):
     assert mesh.derivative(several, "x", ends=ends) == pytest.approx(np.array([2 * x, 2 * x + 3]), abs=1e-12)
 
 
+@pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.MethodWarning")
 @pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
 def test_densities_with_steps_and_positive_parts_have_a_highest_frequency():
     """A step in the stiffness from 1 to 4 lies between the frequencies of both."""

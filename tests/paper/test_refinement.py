@@ -10,11 +10,11 @@ from scvi_codegen.common.precision import mp
 from scvi_codegen.paper.experiment import Verdict
 from scvi_codegen.paper.refinement import (
     CASES,
-    STUDIES,
     ErrorCurve,
     Law,
     _kepler_errors,
     _point_checks,
+    _study,
     factors,
     fitted_line,
     fitted_power,
@@ -95,7 +95,7 @@ def test_compiled_errors_are_those_in_60_digits(case, scheme):
 @pytest.mark.parametrize(("scheme", "constant", "base"), [("SVI", 1e10, 0.03), ("SC", 1e7, 0.1)])
 def test_errors_on_the_circle_follow_the_lines_of_figure_16(scheme, constant, base):
     for points in (10, 14):
-        errors = step_errors(STUDIES["kepler-over-n"].cases[0], scheme, points, 5.0)
+        errors = step_errors(_study("kepler-over-n").cases[0], scheme, points, 5.0)
         assert 1 / 10 < errors["q1"] / (constant * base**points) < 1
         assert 1 / 20 < errors["q2"] / (constant * base**points) < 1
 
@@ -117,7 +117,7 @@ def test_verdicts_follow_from_the_lines_of_the_judged_cases():
     """Errors along c b^N and 50 times above it, of the case that is judged and of one that is only shown."""
     judged, shown = CASES["N points"], CASES["N the degree"]
     law, n = Law(1e3, 0.1), np.arange(6.0, 12.0)
-    study = replace(STUDIES["oscillator-over-n"], cases=(judged, shown), lines={("SVI", "q"): law})
+    study = replace(_study("oscillator-over-n"), cases=(judged, shown), lines={("SVI", "q"): law})
     for far, verdict in (((50, 1), Verdict.FAILS), ((1, 50), Verdict.HOLDS)):
         pairs = zip(study.cases, far, strict=True)
         curves = [ErrorCurve(case, "q", "SVI", 0, n, factor * 1e3 * 0.1**n, law) for case, factor in pairs]
@@ -138,9 +138,9 @@ def test_errors_of_a_step_are_differences_from_the_ellipse():
 
 
 COARSE = {
-    6: replace(STUDIES["oscillator-over-n"], degrees={"SVI": (16, 19, 22), "SC": (16, 22, 28)}),
-    7: replace(STUDIES["oscillator-over-h"], steps=STUDIES["oscillator-over-h"].steps[:13:3]),
-    18: replace(STUDIES["kepler-over-h"], steps=STUDIES["kepler-over-h"].steps[::7], quantities=("q1",)),
+    6: replace(_study("oscillator-over-n"), degrees={"SVI": (16, 19, 22), "SC": (16, 22, 28)}),
+    7: replace(_study("oscillator-over-h"), steps=_study("oscillator-over-h").steps[:13:3]),
+    18: replace(_study("kepler-over-h"), steps=_study("kepler-over-h").steps[::7], quantities=("q1",)),
 }
 """Whole, these take many compilations and solutions in 60 digits."""
 

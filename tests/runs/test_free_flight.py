@@ -28,6 +28,7 @@ def test_ball_on_a_stiff_floor_conserves_its_energy(lagrangian: str, solver: str
     assert max(errors) < allowed, errors
 
 
+@pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.MethodWarning")
 @pytest.mark.second
 def test_array_of_balls_on_a_stiff_floor_conserves_its_energy() -> None:
     system = lagrange("balls", "q[N]", "sum(i in N, q_dot[i]**2/2 - 9.8*q[i] - 1e5*positive_part(-q[i])**2)")

@@ -18,6 +18,8 @@ import scvi_codegen as sc
 from scvi_codegen.codegen.native.compilers import find_compiler
 from scvi_codegen.interfaces.models.packages.package import generate_package
 
+pytestmark = pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.MethodWarning")  # of all pairs
+
 SQUARE = "sum(a in 3, wrap(r[i, a] - r[j, a], box)**2)"
 WELL = f"4*(1/{SQUARE}**6 - 1/{SQUARE}**3)*positive_part(1 - {SQUARE}**2/cut**4)**4"
 KINETIC = "sum(i in N, sum(a in 3, r_dot[i, a]**2)/2)"

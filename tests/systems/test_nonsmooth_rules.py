@@ -171,6 +171,7 @@ def test_other_jumps_are_no_friction(force: str) -> None:
     assert not made("x_dot**2/2 - x**2/2", forces={"x": force}, d=0.15).interface.contacts
 
 
+@pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.MethodWarning")
 @pytest.mark.rotated
 @pytest.mark.parametrize("size", [3, 200, "N"])
 def test_friction_of_arrays_is_one_contact_an_element_of_at_most_192(size: int | str) -> None:
