@@ -1,6 +1,8 @@
 """Two generated integrators, of named coordinates and of arrays, in one translation unit."""
 
+import random
 import re
+import string
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,9 @@ from strict_c import STRICT, run
 
 from scvi_codegen import SVI, compile_stepper, generate_source
 from scvi_codegen.codegen.native.compilers import find_compiler
-from scvi_codegen.codegen.pipeline import ArraySources
+from scvi_codegen.codegen.pipeline import ArraySources, c_identifier
+from scvi_codegen.codegen.rendering.own_names import with_exported_names, with_own_names
+from scvi_codegen.codegen.rendering.reachable import readable
 from scvi_codegen.codegen.rendering.source import Source
 
 H, STEPS, N = 0.05, 40, 8
@@ -99,3 +103,39 @@ def test_single_file_defines_no_macro_that_it_does_not_use():
     assert "#undef" not in plain
     for name in re.findall(r"^#define (\w+)$", plain, re.MULTILINE):
         assert len(re.findall(rf"\b{name}\b", plain)) > 1, name
+
+
+OF_C = "pendulum max status int double run step dbl solver"
+"""Legal names that occur in the templates, in C or in its headers."""
+
+
+def words_of(code: str, name: str) -> list[str]:
+    """Return the words of a source without its comments, the integrator's name replaced by one of no meaning."""
+    text = re.sub(r"/\*.*?\*/", "", code, flags=re.DOTALL).replace("\\\n", "")
+    neutral = re.sub(rf"\b{name}(?=[_.])", "svi", text)
+    return re.findall(r"\w+|[^\w\s]", re.sub(rf"\b{name.upper()}(?=_)", "SVI", neutral))
+
+
+@pytest.mark.second
+def test_a_single_file_of_any_name_is_the_same_program(monkeypatch, tmp_path):
+    """Names of 2 to 64 characters, which break lines at all places, change nothing but names."""
+    with monkeypatch.context() as patched:  # the source for microcontrollers before it is a single file
+        patched.setattr(Source, "single_file", lambda source: source)
+        source, _ = generate_source(catalogue("kepler")(), "stoermer-verlet", prefix="r_0", embedded="double")
+    texts = "\f".join([*readable(source.amalgamated().code).values(), source.header])
+
+    def single_file(name: str) -> str:
+        code, header = texts.replace("r_0", name).replace("R_0", name.upper()).rsplit("\f", 1)
+        (tmp_path / f"{name}.h").write_text(header)
+        return with_own_names(with_exported_names(code).replace("\f", "\n"), name, header)
+
+    choose = random.Random(20)
+    letters, further = string.ascii_lowercase, string.ascii_lowercase + string.digits + "_"
+    expected = words_of(single_file("r_0"), "r_0")
+    for length in (*range(2, 65), *choose.choices(range(2, 65), k=120)):
+        name = c_identifier(choose.choice(letters) + "".join(choose.choices(further, k=length - 1)))
+        assert words_of(single_file(name), name) == expected, name
+    for name in OF_C.split():
+        (tmp_path / f"{name}.c").write_text(single_file(name))
+    files = [f"{name}.c" for name in OF_C.split()]
+    run([*find_compiler(), *STRICT, "-Wno-psabi", "-fsyntax-only", *files], tmp_path)

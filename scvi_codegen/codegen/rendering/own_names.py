@@ -19,6 +19,8 @@ FUNCTION = re.compile(r"[\w\s*]*?(\w+)\s*\(")
 DECLARED = re.compile(r"(\w+)\s*(?:\[[^=]*\])?\s*;?\s*$")
 EXPORTED = re.compile(r"\b(NAME|STATUS)\((\w+)\)")
 PREFIXING = re.compile(r"^#define (NAME|STATUS)\(word\) (\w+)##word.*\n", re.MULTILINE)
+SAME = re.compile(r"^typedef (\w+) \1;\n", re.MULTILINE)
+"""Type that already has its name, as ``solver_options`` of the integrator ``solver``."""
 TOKEN = re.compile(r'/\*(?:[^*]|\*(?!/))*\*/|"(?:\\.|[^"\\])*"|#include .*|##\w+|\bFMI\(\w+\)|\b[A-Za-z_]\w*')
 """Comments, strings, words, and words pasted to the end of others, which are no names by themselves."""
 HEAD = re.compile(r'^(?P<head>[A-Za-z_][^;{}#/"]*\))(?=\n\{)', re.MULTILINE)
@@ -31,6 +33,7 @@ def with_exported_names(code: str) -> str:
     """Return a source with exported names in place of the macros that make them."""
     prefixes = dict(PREFIXING.findall(code))
     code = EXPORTED.sub(lambda match: prefixes[match[1]] + match[2], PREFIXING.sub("", code))
+    code = SAME.sub("", code)
     return re.sub(r"\n{3,}", "\n\n", _wrapped(code))
 
 
@@ -109,7 +112,7 @@ class FileScope:
 
     def _declared(self, text: str) -> Iterator[str]:
         """Yield the names of one declaration, that of a function that is exported as ``NAME(word)``."""
-        head, _, rest = re.sub(r" = .*", "", text, flags=re.DOTALL).partition("{")
+        head, _, rest = re.sub(r"\s=\s.*", "", text, flags=re.DOTALL).partition("{")
         words = head.split()
         if (maker := self._makers.get(head.partition("(")[0])) is not None:
             yield from _made(*maker, head)

@@ -199,9 +199,8 @@ def _reached(parts: Sequence[Part]) -> list[Part]:
         if leaf not in reached:
             reached.add(leaf)
             pending += [other for word in leaf.words for other in by_name.get(word, ())]
-    kept = [left for part in parts if (left := _kept(part, reached))]
-    if any(part.branches for part in kept):  # what one branch uses is idle with another
-        kept = [left for part in parts if (left := part if part.branches and not part.names else _kept(part, reached))]
+    # conditionals without names, of pragmas, serve all functions
+    kept = [left for part in parts if (left := part if part.branches and not part.names else _kept(part, reached))]
     return kept
 
 

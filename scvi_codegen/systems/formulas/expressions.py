@@ -109,7 +109,7 @@ def parts_of_type(kind: type, *expressions: sympy.Basic) -> set[Any]:
     return {part for part in parts(*expressions) if isinstance(part, kind)}
 
 
-CONSTANT_VALUES = {sympy.S.Pi: mp.mpf(mp.pi), sympy.S.Exp1: mp.mpf(mp.e)}
+CONSTANT_VALUES = {sympy.S.Pi: mp.pi, sympy.S.Exp1: mp.e}
 
 
 class Tape:
@@ -148,7 +148,7 @@ class Tape:
             self._start.append(mp.zero)
         else:
             constant = CONSTANT_VALUES.get(expression)
-            self._start.append(mp.mpf(int(expression.p)) / int(expression.q) if constant is None else constant)
+            self._start.append(mp.mpf(int(expression.p)) / int(expression.q) if constant is None else mp.mpf(constant))
         self._places[expression] = len(self._start) - 1
         return self._places[expression]
 

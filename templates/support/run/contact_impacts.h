@@ -92,8 +92,8 @@ static int find_impulses(const event_step *step, const contact_terms *of, const 
     if (first < 0)
       return OK;
     for (int k = 0; k < EVENT_CONTACTS; k++) {
-      const int normal = CONTACTS[k].normal, law = CONTACTS[k].impacts;
-      const int together = law == CONTACT_SIMULTANEOUS && law == CONTACTS[first].impacts && approaches[k];
+      const int normal = CONTACTS[k].normal, impacts = CONTACTS[k].impacts;
+      const int together = impacts == CONTACT_SIMULTANEOUS && impacts == CONTACTS[first].impacts && approaches[k];
       meets[k] = k == first || (together && rate[normal] <= CONTACT_ROUNDING * of->speed[normal]);
       several |= k != first && meets[k];
       shut[k] = closed[k] || (approaches[k] && of->coefficient[3 * k + 2] == 0.0);

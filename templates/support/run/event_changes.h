@@ -805,7 +805,7 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
   const event_watch initial = *watch;
   const stored_states to = {states, number, t, q, p, length, iterations};
   int status = OK;
-#ifdef EVENT_CONTACTS
+#if defined(EVENT_CONTACTS) && EVENTS_CONTROLLED
   real opened = NAN; /* time at which a contact was opened that others nearly hold */
   real unsolved = INFINITY; /* largest size of an adaptive step after one whose parts were not solved */
 #endif
@@ -931,7 +931,9 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
     if (status != OK) {
       int again = 0;
 #ifdef EVENT_CONTACTS
+#if EVENTS_CONTROLLED
       unsolved = 0.5 * size;
+#endif
       again = control && may_be_halved(&step, status, size, watch->pace);
       if (watch->gain > 0.0 && !again)
         refuse(&step, CONTACT_CREATES_ENERGY, -1, watch->gain);
