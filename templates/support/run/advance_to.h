@@ -69,7 +69,7 @@ int NAME(advance_to)(run_memory *run, real t_end, const step_control *control, l
     accept_trial(run, &now);
     run->iterations += report->iterations - before;
     report->steps++;
-    if (run->step % every == 0 || has_arrived(now.at.t, now.at.t_low, t_end))
+    if ((every != 0 && run->step % every == 0) || has_arrived(now.at.t, now.at.t_low, t_end))
       store_row(run, &now.at, report->stored++, t, q, p, iterations);
   }
   memcpy(run, &now.at, sizeof now.at);

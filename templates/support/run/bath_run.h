@@ -167,7 +167,7 @@ int NAME(advance)(run_memory *run, long long steps, long long every, const real 
     }
     half_of_bath(run, &bath, second[k]);
     total.steps++;
-    if (run->step % every == 0) {
+    if (every != 0 && run->step % every == 0) {
       memcpy(&now, run, sizeof now);
       store_row(run, &now, stored++, t, q, p, iterations);
     }
