@@ -20,6 +20,10 @@ from scvi_codegen.systems.system import BATH_ENERGY
 NO_BATH = "requires a heat bath: give temperature= or noise= to the system"
 
 
+LARGEST_STRENGTH = np.sqrt(np.finfo(float).max)
+LARGEST_SEED = 2**64 - 1
+"""The key of the noise has 64 bits."""
+
 COLOURED_INPUT = 2
 """Purpose of the numbers of coloured noise, as in ``templates/support/run/normals.h``."""
 WORD = 2**32 - 1
@@ -101,7 +105,7 @@ def with_sequences(
                 )
             steps = np.arange(1 + int(steps_within(abs(float(end()) - float(t)) or abs(h), h)))
             normals = normal_numbers(
-                checked_count(seed, "seed", least=0), trajectory, steps, COLOURED_INPUT, names.index(name)
+                checked_count(seed, "seed", least=0, most=LARGEST_SEED), trajectory, steps, COLOURED_INPUT, names.index(name)
             ).real
             times, values = times_after(float(t), h, steps)[0], noise.values(h, normals.T).T
             if h < 0:  # the value of each step at the earlier end
@@ -133,7 +137,7 @@ class Noise(NamedTuple):
                 f"metropolis=True is not available for '{interface.title}' ({', '.join(interface.notes)}; "
                 f"{interface.changes_energy}): it requires a symmetric method and no forces, inputs and time; omit it"
             )
-        return cls(checked_count(seed, "seed", least=0), trajectory, metropolis)
+        return cls(checked_count(seed, "seed", least=0, most=LARGEST_SEED), trajectory, metropolis)
 
     def store(self, memory: Any) -> None:
         """Set the stream of a run that starts, in C."""
@@ -141,7 +145,9 @@ class Noise(NamedTuple):
 
 
 def negative_strength(stepper: Any, t: float, parameters: Array, q: Array | None = None) -> str:
-    """Return a sentence on kT or a coefficient of the friction that is negative, or ""; no friction matters at kT = 0.
+    """Return a sentence on kT or a friction that is negative or too large, or ""; no friction matters at kT = 0.
+
+    Too large are those whose squares, as of thermal momenta times frequencies, exceed the range of numbers.
 
     Formulas of inputs, of arrays and, without q, of positions are not checked.
     """
@@ -150,6 +156,12 @@ def negative_strength(stepper: Any, t: float, parameters: Array, q: Array | None
             return (
                 f"the {name} of the heat bath of '{stepper.interface.system}', {formula}, is {value:g} at t = {t:g}: "
                 "it must not be negative; change its parameters, or use forces= for what supplies energy"
+            )
+        if value is not None and not value < LARGEST_STRENGTH:
+            return (
+                f"the {name} of the heat bath of '{stepper.interface.system}', {formula}, is {value:g} at t = {t:g}: it "
+                f"must be below {LARGEST_STRENGTH:.2g}, whose square is the largest number; choose units in which it is "
+                "near 1"
             )
     return ""
 

@@ -30,9 +30,14 @@ def readme_text(
 ) -> str:
     """Return the text of ``README.md``."""
     template = template_environment().get_template(f"package/README{'_embedded' if embedded else ''}.md.jinja")
+    searched = interface.searched(events)
+    of_model = {"contacts": interface.contacts, "kinks": interface.modes, "events": events}
     text = template.render(
         interface=interface,
-        events=events,
+        searched=searched,
+        acting=any(event.changes_state for event in searched),
+        what=" and ".join(name for name, parts in of_model.items() if parts),
+        embedded=embedded,
         g=interface.time_transformation,
         real="float" if embedded == "single" else "double",
         with_model=with_model,
