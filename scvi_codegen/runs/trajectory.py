@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, cast, overload
@@ -40,6 +40,7 @@ from scvi_codegen.runs.results.joining import (
 )
 from scvi_codegen.runs.results.quantities import describe_states, describe_step_size, quantities_in_modes, quantities_of
 from scvi_codegen.runs.results.recomputation import work_and_impulses_until, work_until
+from scvi_codegen.runs.results.recorded import MISSING, changed, record_or_raise, stored
 from scvi_codegen.runs.results.saved_states import Array, ModeHistory, checked_row, in_modes
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.rotation_quantities import named_quantities
@@ -95,6 +96,9 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
             each is the last of the previous one. ``parameters`` are then those of the first.
         bath: seed of the noise, heat and acceptance up to the end in a heat bath, else ``None``.
 
+    Trajectories of ensembles have no ``iterations``, ``bath`` and numbers of rejected steps, and raise
+    :class:`StateError`.
+
     Positions and momenta of arrays are also indexed by name: ``q["u"]`` has the axes n and those of u.
     """
 
@@ -115,7 +119,8 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
     def __repr__(self) -> str:
         if self.pieces:
             return describe_states(self, f", breakpoints between: {len(self.pieces) - 1}")
-        seed = "" if self.bath is None else f", seed {self.bath.seed}"
+        bath = stored(self, "bath")
+        seed = "" if bath is None or bath.seed == MISSING else f", seed {bath.seed}"
         return describe_states(self, describe_step_size(self.h, self.plan, tau=self.tau is not None) + seed)
 
     @overload
@@ -153,9 +158,9 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         if stride > 1 and not isinstance(self.plan, FixedSteps):  # the next saved state is not the end of the step
             lengths = np.full_like(lengths, np.nan)
         low, high = sorted((self.t[first], self.t[range(first, last, stride)[-1]]))
-        return replace(
+        return changed(
             self,
-            **{name: getattr(self, name)[rows] for name in ("t", "q", "p", "iterations")},
+            **{name: stored(self, name)[rows] for name in ("t", "q", "p", "iterations")},
             tau=None if self.tau is None else self.tau[rows],
             actions=None if self.actions is None else self.actions[rows],
             step_sizes=lengths,
@@ -177,7 +182,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
             start += len(piece) - 1
             if high - low > 1 or (high - low == 1 == last - first and not slices):
                 slices.append(piece[low:high])
-        return replace(joined(slices), confirmation=self.confirmation)
+        return changed(joined(slices), confirmation=self.confirmation)
 
     def _joined(self, part: Callable[[Self], NDArray[Number]]) -> NDArray[Number]:
         """Return a quantity of the states, computed with the parameters of each piece."""
@@ -375,7 +380,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
 
     def states(self, units: Mapping[str, str] | None = None) -> States:
         """Return the states for :mod:`scvi_codegen.runs.results.export`."""
-        interface, columns = self.stepper.interface, (self.t, self.q, self.p, self.iterations)
+        interface, columns = self.stepper.interface, (self.t, self.q, self.p, stored(self, "iterations"))
         by_name = dict(zip(interface.own_parameters, map(float, self.parameters), strict=False))
         derived: Callable[..., Any] = partial(quantities_of, self)
         if self.pieces:
@@ -488,20 +493,21 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         with suppress(StateError):  # outside the domain of L
             energies = self.energy()[::save_every]
             rows.append((plain("energy"), sparkline(energies.tolist(), "energy"), _range(energies)))
-        names = zip(self.stepper.parameters, self.parameters, strict=False)
+        names, iterations = zip(self.stepper.parameters, self.parameters, strict=False), stored(self, "iterations")
         facts = (
             ("time", plain(f"{self.t[0]:g} to {self.t[-1]:g}, {self._steps()}")),
             ("states", plain(f"{len(self)}; q and p of shape {self.q.shape}")),
             ("coordinates", listed(self.stepper.coordinates)),
             ("parameters", listed([f"{name} = {value:g}" for name, value in names])),
-            ("iterations", plain(f"{self.iterations.sum()}")),
+            ("iterations", plain("not recorded" if iterations[0] == MISSING else f"{iterations.sum()}")),
             ("step error", plain(self._worst())),
         )
         return card(self.stepper.title, facts, grid(rows))
 
     def _steps(self) -> str:
         if not isinstance(self.plan, FixedSteps):
-            return f"{self.steps} adaptive steps, {self.rejected_steps} rejected"
+            rejected = stored(self, "rejected_steps")
+            return f"{self.steps} adaptive steps" + (f", {rejected} rejected" if rejected != MISSING else "")
         return f"h = {self.h:g}"
 
     def _worst(self) -> str:
@@ -551,6 +557,9 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         """
         check_keeps_words(self.stepper.interface.words, "a data frame")
         return to_dataframe(self.states())
+
+
+record_or_raise(Trajectory, ("iterations", "rejected_steps", "fallback_steps", "bath"))
 
 
 def _range(values: Array) -> Html:

@@ -56,7 +56,8 @@ def main_of(program: str, model: sc.Model, stepper: sc.Stepper, p: np.ndarray) -
     tables = ""
     if model.inputs and "inputs" in program:
         times, numbers = INPUT["u"]
-        rows = [(v, (w - v) / (b - a), 0.0, 0.0) for a, b, v, w in zip(times, times[1:], numbers, numbers[1:], strict=False)]
+        slopes = np.diff(numbers) / np.diff(times)
+        rows = [(float(x), float(slope), 0.0, 0.0) for x, slope in zip(numbers, slopes, strict=False)]
         coefficients = ", ".join(repr(x) for row in rows for x in row)
         tables = (
             f"static const double breakpoints[] = {{{', '.join(map(repr, times))}}}, rows[] = {{{coefficients}}};\n"

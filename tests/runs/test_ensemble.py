@@ -602,3 +602,27 @@ def test_lanes_converge_as_single_runs(h: float) -> None:
         single = stepper.integrate(q[j], p[j], h=h, steps=steps)
         np.testing.assert_allclose(runs.q[-1, j], single.q[-1], rtol=0, atol=1e-12)
         np.testing.assert_allclose(runs.p[-1, j], single.p[-1], rtol=0, atol=1e-11)
+
+
+@pytest.mark.second
+def test_what_an_ensemble_does_not_record_is_an_error():
+    """Neither 1.0 as the acceptance of a run that rejected steps, nor 0 as its iterations; slices and files remain."""
+    system = sc.LagrangianSystem.from_text(
+        "bath", ["x"], "x_dot**2/2 - x**4/4", parameters={"kT": 1.0}, temperature="kT", damping="0.5"
+    )
+    stepper = sc.compile_stepper(system, "svi:2")
+    plan = {"h": 1.5, "steps": 40, "seed": 2**64 - 1}
+    alone = stepper.integrate([1.0], velocity=[0.0], metropolis=True, **plan)
+    runs = stepper.integrate_ensemble([[1.0], [2.0]], velocity=[[0.0], [0.0]], metropolis=True, **plan)
+    assert alone.acceptance < 1.0
+    for of in (runs, runs[0], runs[0][3:]):
+        for name in ("acceptance", "bath", "iterations"):
+            with pytest.raises(sc.StateError, match=r"ensembles do not record .* stepper\.integrate"):
+                getattr(of, name)
+    assert "seed" not in repr(runs[0])
+    assert "not recorded" in runs[0]._repr_html_()
+    np.testing.assert_array_equal(runs[0].q, alone.q)
+    with pytest.raises(sc.StateError, match=r"kT, is 1e\+300 .* must be below"):
+        stepper.integrate([1.0], velocity=[0.0], **plan, parameters={"kT": 1e300})
+    with pytest.raises(sc.StateError, match="seed must be at most 18446744073709551615"):
+        stepper.integrate([1.0], velocity=[0.0], h=0.1, steps=1, seed=2**64)

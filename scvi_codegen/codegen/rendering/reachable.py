@@ -200,8 +200,7 @@ def _reached(parts: Sequence[Part]) -> list[Part]:
             reached.add(leaf)
             pending += [other for word in leaf.words for other in by_name.get(word, ())]
     # conditionals without names, of pragmas, serve all functions
-    kept = [left for part in parts if (left := part if part.branches and not part.names else _kept(part, reached))]
-    return kept
+    return [left for part in parts if (left := part if part.branches and not part.names else _kept(part, reached))]
 
 
 def _kept(part: Part, reached: set[Part]) -> Part | None:

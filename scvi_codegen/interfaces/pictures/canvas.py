@@ -6,7 +6,6 @@ import importlib.util
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, TypeAlias
 
@@ -17,6 +16,7 @@ from scvi_codegen.common.atomic import write_atomically
 from scvi_codegen.common.errors import PlotError, StateError, StepFailedError
 from scvi_codegen.common.validation import ArgumentType
 from scvi_codegen.runs.recording import RecordedRun
+from scvi_codegen.runs.results.recorded import changed
 from scvi_codegen.runs.stepping.step_plan import FixedSteps
 from scvi_codegen.runs.trajectory import Trajectory
 
@@ -177,7 +177,7 @@ def at_times(motion: Trajectory, times: Array) -> Trajectory:
         "step_sizes": np.full(len(q), np.nan),
         "tau": None,
     }
-    return replace(motion, t=times, q=q, p=p, **unknown, pieces=(), observed=None, conserved=None)
+    return changed(motion, t=times, q=q, p=p, **unknown, pieces=(), observed=None, conserved=None)
 
 
 def column(interface: Interface, states: Any, name: str) -> Array:

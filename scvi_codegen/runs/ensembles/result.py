@@ -6,7 +6,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, TypeAlias, cast, overload
 
@@ -25,12 +25,14 @@ from scvi_codegen.runs.forwarding import Pictured
 from scvi_codegen.runs.results.export import FORMATS, LABELLED, check_format, write_whole
 from scvi_codegen.runs.results.joining import joined, relative_changes
 from scvi_codegen.runs.results.quantities import quantities, short_title
+from scvi_codegen.runs.results.recorded import MISSING, changed, not_recorded
 from scvi_codegen.runs.results.saved_states import ModeHistory, checked_row
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.rotation_quantities import named_quantities
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.states.words import TwoWords, Words, check_keeps_words
 from scvi_codegen.runs.stepping.integrator import Integrator
+from scvi_codegen.runs.stepping.noise import BathReport
 from scvi_codegen.runs.stepping.step_plan import Adaptive, Fixed
 
 if TYPE_CHECKING:
@@ -100,6 +102,12 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, Pictured, TwoWords)
     def __len__(self) -> int:
         return len(self.status)
 
+    def __getattr__(self, name: str) -> Any:
+        """Raise an error that says whether a trajectory has what an ensemble lacks."""
+        if name in ("acceptance", "heat", "bath", "iterations", "rejected_steps", "step_error", "worst_step_time"):
+            raise not_recorded(name)
+        raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'")
+
     @property
     def times(self) -> Array:
         """(n, k) times of the states of each trajectory."""
@@ -136,7 +144,7 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, Pictured, TwoWords)
                     t=times[rows],
                     q=q,
                     p=p,
-                    iterations=np.zeros(len(rows), np.int32),
+                    iterations=np.full(len(rows), MISSING, np.int32),
                     step_sizes=np.full(len(rows), np.nan if divided else h),
                     h=h,
                     tau=None if tau is None else tau[rows],
@@ -146,11 +154,18 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, Pictured, TwoWords)
                     stepper=self.stepper,
                     plan=plan,
                     steps=int(self.steps[j]),
-                    fallback_steps=0 if self.fallback_steps is None else int(self.fallback_steps[j]),
+                    rejected_steps=MISSING if self.h is None else 0,
+                    bath=None if self.stepper.interface.temperature is None else BathReport(MISSING, np.nan, np.nan),
+                    fallback_steps=MISSING if self.fallback_steps is None else int(self.fallback_steps[j]),
                 )
             )
         whole = joined(pieces) if len(pieces) > 1 else pieces[0]
-        return replace(whole, events=self.events[j] if self.events else (), modes=modes)
+        return changed(
+            whole,
+            events=self.events[j] if self.events else (),
+            modes=modes,
+            confirmation=self.confirmations[j] if self.confirmations else None,
+        )
 
     @property
     def _pictured(self) -> list[Trajectory]:

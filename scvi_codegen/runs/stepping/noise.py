@@ -20,7 +20,8 @@ from scvi_codegen.systems.system import BATH_ENERGY
 NO_BATH = "requires a heat bath: give temperature= or noise= to the system"
 
 
-LARGEST_STRENGTH = np.sqrt(np.finfo(float).max)
+LARGEST_TEMPERATURE = float(np.sqrt(np.finfo(float).max))
+"""kT is the energy of thermal motions; squares of energies are those of its fluctuations."""
 LARGEST_SEED = 2**64 - 1
 """The key of the noise has 64 bits."""
 
@@ -104,9 +105,8 @@ def with_sequences(
                     f"the input '{name}' is {noise}, which requires fixed steps: give h and steps or t_end"
                 )
             steps = np.arange(1 + int(steps_within(abs(float(end()) - float(t)) or abs(h), h)))
-            normals = normal_numbers(
-                checked_count(seed, "seed", least=0, most=LARGEST_SEED), trajectory, steps, COLOURED_INPUT, names.index(name)
-            ).real
+            key = checked_count(seed, "seed", least=0, most=LARGEST_SEED)
+            normals = normal_numbers(key, trajectory, steps, COLOURED_INPUT, names.index(name)).real
             times, values = times_after(float(t), h, steps)[0], noise.values(h, normals.T).T
             if h < 0:  # the value of each step at the earlier end
                 times, values = times[::-1], np.roll(values[..., ::-1], -1, axis=-1)
@@ -145,9 +145,7 @@ class Noise(NamedTuple):
 
 
 def negative_strength(stepper: Any, t: float, parameters: Array, q: Array | None = None) -> str:
-    """Return a sentence on kT or a friction that is negative or too large, or ""; no friction matters at kT = 0.
-
-    Too large are those whose squares, as of thermal momenta times frequencies, exceed the range of numbers.
+    """Return a sentence on kT or a friction that is negative, or on kT too large, or ""; no friction matters at kT = 0.
 
     Formulas of inputs, of arrays and, without q, of positions are not checked.
     """
@@ -157,11 +155,11 @@ def negative_strength(stepper: Any, t: float, parameters: Array, q: Array | None
                 f"the {name} of the heat bath of '{stepper.interface.system}', {formula}, is {value:g} at t = {t:g}: "
                 "it must not be negative; change its parameters, or use forces= for what supplies energy"
             )
-        if value is not None and not value < LARGEST_STRENGTH:
+        if value is not None and formula == stepper.interface.temperature and not value < LARGEST_TEMPERATURE:
             return (
-                f"the {name} of the heat bath of '{stepper.interface.system}', {formula}, is {value:g} at t = {t:g}: it "
-                f"must be below {LARGEST_STRENGTH:.2g}, whose square is the largest number; choose units in which it is "
-                "near 1"
+                f"the {name} of the heat bath of '{stepper.interface.system}', {formula}, is {value:g} at t = {t:g}: "
+                f"it must be below {LARGEST_TEMPERATURE:.2g}, or squares of energies exceed the range of numbers; "
+                "choose units in which it is near 1"
             )
     return ""
 
