@@ -124,7 +124,7 @@ int fput_ring_stoermer_verlet_step(double t, double h, const double *q0, const d
 
 /* Runs with compensated sums and predictors: start a run, then advance it any number of times. Every `every` steps,
  * counted from its start, the state is stored: t (k), q (k, n), p (k, n), iterations since the last stored one (k);
- * options NULL: the defaults; every = 0: none, with NULLs. No workspace is needed: NULL. */
+ * every = 0: none, with NULLs; options NULL: the defaults; no workspace is needed: NULL. */
 void fput_ring_stoermer_verlet_start(fput_ring_stoermer_verlet_run *run, double t, double h, const double *q,
     const double *p);
 int fput_ring_stoermer_verlet_advance(fput_ring_stoermer_verlet_run *run, long long steps, long long every,

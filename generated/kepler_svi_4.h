@@ -98,7 +98,7 @@ int kepler_svi_4_step(double t, double h, const double *q0, const double *p0, co
 
 /* Runs with compensated sums and predictors: start a run, then advance it any number of times. Every `every` steps,
  * counted from its start, the state is stored: t (k), q (k, m), p (k, m), iterations since the last stored one (k);
- * options NULL: the defaults. */
+ * every = 0: none, with NULLs; options NULL: the defaults. */
 void kepler_svi_4_start(kepler_svi_4_run *run, double t, double h, const double *q, const double *p);
 int kepler_svi_4_advance(kepler_svi_4_run *run, long long steps, long long every, const double *parameters,
     const kepler_svi_4_options *options, double *t, double *q, double *p, int *iterations, kepler_svi_4_report *report,

@@ -93,7 +93,7 @@ int two_point_pendulum_step(double t, double h, const double *q0, const double *
 
 /* Runs with compensated sums and predictors: start a run, then advance it any number of times. Every `every` steps,
  * counted from its start, the state is stored: t (k), q (k, m), p (k, m), iterations since the last stored one (k);
- * options NULL: the defaults. */
+ * every = 0: none, with NULLs; options NULL: the defaults. */
 void two_point_pendulum_start(two_point_pendulum_run *run, double t, double h, const double *q, const double *p);
 int two_point_pendulum_advance(two_point_pendulum_run *run, long long steps, long long every, const double *parameters,
     const two_point_pendulum_options *options, double *t, double *q, double *p, int *iterations,
