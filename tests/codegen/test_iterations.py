@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from functools import cache
 
+import numpy as np
 import pytest
 from certified_cases import case
+from notation import lagrange
 from samples import QUICK_FLAGS, ensemble_runs
 
 from scvi_codegen import Stepper, compile_stepper, problem
@@ -72,6 +74,24 @@ def test_first_step_takes_few_trials(p, span):
     run.advance(1)
     assert run.t == pytest.approx(2.0**-1.5 if p[1] else 2.0**-2.25, rel=1e-9)  # on the grid
     assert run.iterations <= 17
+
+
+def test_search_for_the_first_step_on_constraints_takes_few_iterations():
+    """A pilot only has to say whether its iteration contracts: two rods at rest within rounding, or moving."""
+    distances = ["x**2 + y**2 - 1", "(u - x)**2 + (v - y)**2 - 1"]
+    kinetic = "(m*(x_dot**2 + y_dot**2) + u_dot**2 + v_dot**2)/2 - 9.81*(m*y + v)"
+    rods = compile_stepper(lagrange("rods", "x y u v", kinetic, constraints=distances, m=1.0), "svi:8")
+    generator = np.random.default_rng(7)
+    for k in range(30):
+        (a, b), rates = generator.uniform(-1.5, 1.5, 2), generator.normal(size=2) * (0.0, 1e-13, 1e-8, 1.0)[k % 4]
+        first = np.array([np.sin(a), -np.cos(a)]), rates[0] * np.array([np.cos(a), np.sin(a)])
+        second = np.array([np.sin(b), -np.cos(b)]), rates[1] * np.array([np.cos(b), np.sin(b)])
+        q, velocity = (np.concatenate([x, x + y]) for x, y in zip(first, second, strict=True))
+        plan = {"t_end": (1.0, 20.0)[k % 2], "tolerance": (1e-3, 1e-8, None)[k % 3]}
+        run = rods.start(q, velocity=velocity, parameters={"m": (1.0, 1e-4)[k % 5 == 0]}, **plan)
+        run.advance(1)
+        assert run.steps == 1
+        assert run.iterations <= 60
 
 
 @pytest.mark.second

@@ -63,13 +63,20 @@ static SELDOM int follow_branch(const step_data *step, newton_data *data, real *
   return status == OK ? STATUS(SPURIOUS_SOLUTION) : NOT_CONVERGED;
 }
 
-/* Newton's method from that guess, or by continuation if its solution may be a spurious one. */
-static int newton_from_line(const step_data *step, newton_data *data, real *dp, int *keep,
+/* Newton's method from that guess. */
+static int newton_on_line(const step_data *step, newton_data *data, real *dp, int *keep,
     const solver_options *options, solver_report *report)
 {
   TRY(line_from(step, data));
   *keep = 0;
-  const int status = newton(step, data, NULL, NULL, dp, keep, options, report);
+  return newton(step, data, NULL, NULL, dp, keep, options, report);
+}
+
+/* The same, or by continuation if its solution may be a spurious one. */
+static int newton_from_line(const step_data *step, newton_data *data, real *dp, int *keep,
+    const solver_options *options, solver_report *report)
+{
+  const int status = newton_on_line(step, data, dp, keep, options, report);
   return status == STATUS(SPURIOUS_SOLUTION) ? follow_branch(step, data, dp, keep, options, report) : status;
 }
 

@@ -6,6 +6,7 @@
  * previous step; for multipliers the rows from B on. */
 typedef struct {
   int rattle_alone; /* 1 if a step whose iteration of the multipliers fails is not solved by Newton's method */
+  int is_pilot; /* 1 in the search for the first step on constraints: of which only contraction is asked */
 #ifdef RATTLE
   rattle_data rattle;
 #endif
@@ -13,7 +14,7 @@ typedef struct {
 
 static void prepare(const step_data *step, solver_data *data)
 {
-  data->rattle_alone = 0;
+  data->rattle_alone = data->is_pilot = 0;
 #ifdef RATTLE
   prepare_rattle(step, &data->rattle);
 #ifdef RATTLE_IN_PAIRS
@@ -90,7 +91,7 @@ static int solve(const step_data *step, const solver_data *way, real *memory, lo
     status = rattle(step, &way->rattle, *guess ? memory : NULL, data, dp, options, report);
   keep = 0;
   falls_back = status != OK;
-  if (falls_back && status != LOST_DIGITS && way->rattle_alone)
+  if (falls_back && way->rattle_alone && (status != LOST_DIGITS || way->is_pilot))
     return status;
 #endif
   if (status != OK && *guess) {
@@ -98,7 +99,7 @@ static int solve(const step_data *step, const solver_data *way, real *memory, lo
     status = newton(step, data, NULL, NULL, dp, &keep, options, report);
   }
   if (status != OK)
-    TRY(newton_from_line(step, data, dp, &keep, options, report));
+    TRY((way->is_pilot ? newton_on_line : newton_from_line)(step, data, dp, &keep, options, report));
   gather(END_POSITION, 1, step->h, data->z, M, dq, 0, 1);
 #ifdef FIRST_ORDER_SYSTEM
   TRY(variables_of_momenta(step, data->z, dq, dp));

@@ -99,6 +99,9 @@ typedef struct {
 #ifdef NEWTON_IN_PLACE
   long long fallbacks; /* 1 if Newton's method solved it */
 #endif
+#ifdef CONSTRAINED
+  real pilots_above, pilot_error; /* longer trials than the former are pilots; estimate of the largest one solved */
+#endif
   int status; /* other than OK if no smaller step can succeed */
 #ifdef COSTLY_POINTS
   real half_length, half[2 * M]; /* largest pilot but one, or 0: increments */
@@ -301,6 +304,13 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
     now->step.h = h;
     prepare(&now->step, &now->data);
   }
+#ifdef CONSTRAINED
+  solver_options few = *options;
+  now->data.is_pilot = now->length > now->pilots_above;
+  if (now->data.is_pilot && few.max_iterations > MANY_ITERATIONS)
+    few.max_iterations = MANY_ITERATIONS;
+  options = &few;
+#endif
 #ifdef RATTLE
   now->data.rattle_alone = run->avoiding >= 0;
   now->fallbacks = report->fallback_steps;
@@ -413,6 +423,9 @@ static inline void try_pilot(run_memory *run, trial *now, const solver_options *
     try_step(run, now, 0, options, report);
   if (now->error < INFINITY && now->length > now->pilot) {
     now->pilot = now->length;
+#ifdef CONSTRAINED
+    now->pilot_error = now->error;
+#endif
     begin_motion(run);
     note_trial(run, now);
   }
@@ -594,6 +607,19 @@ static inline int try_by_newton(run_memory *run, trial *now, const solver_option
   return 0;
 }
 
+#ifdef CONSTRAINED
+/* Ends the search for the first step: trials up to the largest pilot that was solved are steps. Errors grow with the
+ * step size, so where that pilot's is inadmissible, shorter ones are tried at once, none between it and a failed one. */
+static SELDOM void end_pilots(run_memory *run, trial *now)
+{
+  now->pilots_above = now->pilot > 0 ? now->pilot : (real)INFINITY;
+  if (now->pilot > 0 && !(now->error < INFINITY) && now->pilot_error > now->limits.most * GROWTH) {
+    run->grid_level = level_below(now->pilot);
+    now->error = now->pilot_error;
+  }
+}
+#endif
+
 /* Tries the next step with smaller and smaller sizes until its error is admissible, or STEP_SIZE_UNDERFLOW. */
 HOT int find_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
@@ -603,10 +629,17 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
 #ifdef RATTLE
   now->failures = 0;
 #endif
+#ifdef CONSTRAINED
+  now->pilots_above = run->error_before > 0 ? (real)INFINITY : 0;
+#endif
   if (run->error_before > 0)
     try_step(run, now, least, options, report);
   else
     try_first_step(run, now, options, report);
+#ifdef CONSTRAINED
+  if (now->pilots_above == 0)
+    end_pilots(run, now);
+#endif
   while (now->status == OK && !(now->error <= now->limits.most * GROWTH)) {
     const int failed = run->error_before > 0 && !(now->error < INFINITY);
     if ((failed || run->avoiding == TRIED_AGAIN) && try_by_newton(run, now, options, report))
