@@ -1,6 +1,11 @@
 /* Runs whose arguments and results are one struct. Requires: NAME, STATUS, calls_declarations.h; HAS_ADVANCE_TO,
- * HAS_PROJECT, HAS_SET_FALLBACK, and HAS_ and the optional fields of a run where the source has these. Functions are
+ * HAS_PROJECT, HAS_SET_FALLBACK, and HAS_ and the optional fields of a run where the source has these; HAS_CONSTRAINTS
+ * of named coordinates, with DEPENDENT, INPUT_PRECISION and ROUNDING_OF_INPUT (projection.py). Functions are
  * called by volatile pointers: not inlined, so that the bits of steps do not depend on these callers. */
+
+enum { IN_DOUBT = -1, /* status of a call; how a run begins: */
+  BY_VELOCITY = 1,
+  ON_CONSTRAINTS = 2 };
 
 static int NAME(call_store)(const NAME(call) *c, long long row, long long steps, long long every)
 {
@@ -21,15 +26,109 @@ int NAME(call_advance)(const NAME(call) *call, long long steps, long long every)
   return NAME(call_store)(call, 0, steps, every);
 }
 
-/* Starts a run, takes steps and stores states, the initial one first. */
-int NAME(call_integrate)(NAME(call) *c, long long steps, long long every)
+#ifdef HAS_CONSTRAINTS
+#include <stdlib.h>
+
+/* Divides a row by its length, which is returned; NaN if that is 0 or not finite. */
+static double NAME(call_shorten)(double *row)
 {
+  double square = 0.0;
+  for (int i = 0; i < M; i++)
+    square += row[i] * row[i];
+  const double length = square > 0.0 && square < INFINITY ? sqrt(square) : NAN;
+  for (int i = 0; i < M; i++)
+    row[i] /= length;
+  return length;
+}
+
+/* Returns 1 if the rows of G are certainly independent. Of rows of length 1, with the distance r_k of each from the span
+ * of those before, the product of r_k^2 is det G G^T, that of the squared singular values, which add up to their number
+ * c: the least of them is at least prod r_k^2 ((c - 1) / c)^(c - 1) > prod r_k^2 / e. */
+static int NAME(call_independent)(const double *derivative)
+{
+  double(*row)[M] = calloc(CONSTRAINTS, sizeof *row), product = row ? exp(-0.5) : 0.0;
+  for (int e = 0; row && e < CONSTRAINT_ENTRIES; e++)
+    row[CONSTRAINT_ENTRY[e][0]][CONSTRAINT_ENTRY[e][1]] = derivative[e];
+  for (int k = 0; k < CONSTRAINTS && product > DEPENDENT; k++) {
+    NAME(call_shorten)(row[k]);
+    for (int j = 0; j < k; j++) {
+      double along = 0.0;
+      for (int i = 0; i < M; i++)
+        along += row[k][i] * row[j][i];
+      for (int i = 0; i < M; i++)
+        row[k][i] -= along * row[j][i];
+    }
+    product *= NAME(call_shorten)(row[k]);
+  }
+  free(row);
+  return product > DEPENDENT;
+}
+
+/* Nearest state on the constraints, or the state itself within rounding errors; returns 1 if it is in doubt whether it
+ * is right: far away, where constraints may be dependent, or where a velocity has no momentum. */
+int NAME(call_consistent)(double t, const double *q, const double *p, const double *parameters, double *q1, double *p1,
+    double *workspace)
+{
+  double apart[2], moved, u[2 * M] = {0}, momentum[M], mass[MASS_ENTRIES], g[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES];
+  int moves[M] = {0}, all = 1;
+  if (NAME(project)(t, q, p, parameters, q1, p1, workspace) ||
+      NAME(apart)(t, q, p, q1, p1, parameters, apart, workspace))
+    return 1;
+  moved = fmax(apart[0], apart[1]);
+  memcpy(u, q1, sizeof(double) * M);
+  legendre(u, t, parameters, momentum, mass);
+  constraints(u, t, parameters, g, derivative);
+  for (int e = 0; e < MASS_ENTRIES; e++)
+    moves[MASS_ENTRY[e][1]] |= mass[e] != 0.0;
+  for (int i = 0; i < M; i++)
+    all &= moves[i];
+  if (!(all && moved <= INPUT_PRECISION && NAME(call_independent)(derivative)))
+    return 1;
+  if (moved <= ROUNDING_OF_INPUT) {
+    memcpy(q1, q, sizeof(double) * M);
+    memcpy(p1, p, sizeof(double) * M);
+  }
+  return 0;
+}
+#endif
+
+/* Sets the first state of a run, (q, v) or (q, p) as `begins_by` says; returns 1 if it is in doubt whether a velocity has
+ * a momentum, or as call_consistent. */
+static int NAME(call_begin)(const NAME(call) *c)
+{
+  const double *q = c->start + 1, *given = q + c->coordinates;
+  const size_t size = sizeof(double) * (size_t)c->coordinates;
+  double *p = c->p;
   c->t[0] = c->start[0];
   c->iterations[0] = 0;
-  for (long long i = 0; i < c->coordinates; i++) {
-    c->q[i] = c->start[1 + i];
-    c->p[i] = c->start[1 + c->coordinates + i];
+  memcpy(c->q, q, size);
+#ifndef HAS_H_LOW
+  if (c->begins_by & BY_VELOCITY) {
+    if (NAME(momentum)(c->t[0], q, given, c->parameters, p, c->workspace))
+      return 1;
+    for (long long i = 0; i < c->coordinates; i++)
+      if (p[i] == 0.0 && given[i] != 0.0)
+        return 1;
+    given = p;
   }
+#endif
+#ifdef HAS_CONSTRAINTS
+  if (c->begins_by & ON_CONSTRAINTS) {
+    double momenta[M];
+    memcpy(momenta, given, size);
+    return NAME(call_consistent)(c->t[0], q, momenta, c->parameters, c->q, p, c->workspace);
+  }
+#endif
+  if (given != p)
+    memcpy(p, given, size);
+  return 0;
+}
+
+/* Starts a run, takes steps and stores states, the initial one first; returns IN_DOUBT where call_begin is. */
+int NAME(call_integrate)(NAME(call) *c, long long steps, long long every)
+{
+  if (NAME(call_begin)(c))
+    return IN_DOUBT;
   NAME(start)(c->run, c->t[0], c->h, c->q, c->p);
 #ifdef HAS_MEASURES_GROWTH
   c->run->measures_growth = c->measures_growth;
@@ -172,6 +271,17 @@ long long NAME(call_each)(NAME(each) *c, long long steps)
 }
 
 #ifndef HAS_H_LOW
+/* Momenta or velocities of states with parameters in common; returns the number of states before a failure. */
+long long NAME(call_transform)(int to_velocities, long long count, long long m, const double *t, const double *q,
+    const double *x, const double *parameters, double *y, double *workspace)
+{
+  __typeof__(NAME(momentum)) *function = to_velocities ? NAME(velocity) : NAME(momentum);
+  long long k = 0;
+  while (k < count && !function(t[k], q + k * m, x + k * m, parameters, y + k * m, workspace))
+    k++;
+  return k;
+}
+
 /* Momenta of states with velocities v and parameters of their own; returns the number of states before a failure. */
 long long NAME(call_momenta)(long long count, double t, long long m, long long parameters_each, const double *q,
     const double *v, const double *parameters, double *p, double *workspace)

@@ -7,13 +7,13 @@ typedef struct {
   const NAME(options) *options;
   double *t, *q, *p; /* memory for states: `words` numbers for t, `coordinates` numbers for q and for p */
   int *iterations;
-  const double *start; /* t, q and p at the start of a run */
+  const double *start; /* t, q and p, or velocities, at the start of a run */
   double *sizes; /* of the steps that follow the states, unless NULL */
   NAME(report) * report;
   double *workspace;
   const struct NAME(step_control) *control; /* adaptive steps to t_end; NULL: fixed steps of h */
   double h, t_end;
-  long long words, coordinates, measures_growth, has_energies;
+  long long words, coordinates, measures_growth, has_energies, begins_by; /* velocities: 1; on constraints: 2 more */
   double error, error_t, energies[2];
   long long stored, steps, rejected, fallback_steps;
 } NAME(call);
@@ -43,6 +43,8 @@ typedef struct {
   long long pauses, entered; /* with `pauses`, calls end where a segment begins: parameters may change */
 } NAME(each);
 long long NAME(call_each)(NAME(each) *call, long long steps);
+long long NAME(call_transform)(int to_velocities, long long count, long long m, const double *t, const double *q,
+    const double *x, const double *parameters, double *y, double *workspace);
 long long NAME(call_momenta)(long long count, double t, long long m, long long parameters_each, const double *q,
     const double *v, const double *parameters, double *p, double *workspace);
 void NAME(call_project)(long long count, double t, long long m, long long parameters_each, const double *q,

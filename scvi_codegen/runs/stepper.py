@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.native.arguments import checked_number
-from scvi_codegen.codegen.native.binding import with_calls
+from scvi_codegen.codegen.native.binding import BY_VELOCITY, ON_CONSTRAINTS, with_calls
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.codegen.variants import Variant
@@ -258,8 +258,14 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         noise: Noise,
     ) -> Trajectory:
         """Return a run of validated steps, ``None`` to the target time, with its warnings; ``segments``: of inputs."""
-        if initial.p is None or initial.velocity is not None or self.interface.constraints:
-            initial = self._validated(initial, converted=segments is not None)
+        by_velocity, begins_by = initial.velocity is not None, self._begins_by
+        if (initial.p is not None) == by_velocity:
+            raise neither_or_both(initial.p)
+        if begins_by is not None and segments is None:
+            begins_by |= BY_VELOCITY * by_velocity
+        else:
+            q, p = self._consistent_state(initial)
+            initial, begins_by = initial._replace(q=q, p=p, velocity=None), 0
         fixed = isinstance(plan, FixedSteps)
         growth = 0 if fixed and not check_growth else measured_growth(self, plan, check_growth)
         try:
@@ -269,9 +275,9 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         run._set_up(plan, initial)
         run._noise = noise
         if segments is None:
-            trajectory = run._integrated(initial, growth, steps, output)
+            trajectory = run._integrated(initial, begins_by, growth, steps, output)
         else:
-            run._start_from(initial, growth)
+            run._start_from(initial, begins_by, growth)
             trajectory = segments.record(run, output.save_every, output.progress)
         try:
             if segments is None:
@@ -358,14 +364,14 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             return q, p
         return consistent(self, q, p, t, parameters)
 
-    def _validated(self, initial: InitialData, *, converted: bool) -> InitialData:
-        """Return initial data with momenta, on the constraints; or with a velocity that the run itself converts."""
-        if (initial.p is None) == (initial.velocity is None):
-            raise neither_or_both(initial.p)
-        if converted or self.in_tau or self.interface.constraints or self.interface.layout.coordinates:
-            q, p = self._consistent_state(initial)
-            return initial._replace(q=q, p=p, velocity=None)
-        return initial
+    @cached_property
+    def _begins_by(self) -> int | None:
+        """How a C call begins a run by momenta; ``None`` if the state is always converted before."""
+        interface = self.interface
+        layout = interface.layout
+        if self.in_tau or (layout.coordinates and (layout.momenta or interface.constraints)):
+            return None
+        return ON_CONSTRAINTS if interface.constraints else 0
 
     def _run(self, q: Array, p: Array, **arguments: Any) -> Run:
         return Run.started(self, q, p, **arguments)

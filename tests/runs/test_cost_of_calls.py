@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import threading
+import warnings
 from functools import partial
 from itertools import chain
 
 import numpy as np
 import pytest
 from counting import TooMuchWorkError, at_most, visited
+from notation import lagrange
+from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 
@@ -27,17 +30,103 @@ def stepper():
     [
         *(("integrate", {"h": 0.05, "steps": steps}, 40) for steps in (1, 900)),
         *(("integrate", {"t_end": t_end, "tolerance": 1e-10}, 62) for t_end in (0.05, 200.0)),
-        ("integrate_ensemble", FIXED, 250),
+        ("integrate_ensemble", FIXED, 360),
     ],
 )
-def test_a_call_takes_few_function_calls(stepper, convert, integrate, plan, calls):
+@pytest.mark.parametrize("moving", ["p", "velocity"])
+def test_a_call_takes_few_function_calls(stepper, convert, integrate, plan, calls, moving):
     """The limit is a tenth above the present number, and does not depend on the machine."""
-    run = partial(getattr(stepper, integrate), convert(Q.tolist()), convert(P.tolist()), **plan)
+    run = partial(getattr(stepper, integrate), convert(Q.tolist()), **{moving: convert(P.tolist())}, **plan)
     run()
     with at_most(calls):
         run()
     with pytest.raises(TooMuchWorkError), at_most(calls // 2):
         run()
+
+
+def test_a_call_by_names_and_functions_of_a_state_take_few_function_calls(stepper):
+    q, velocity = (dict(zip(stepper.coordinates, x.tolist(), strict=True)) for x in (Q, P))
+    for run, calls in [
+        (partial(stepper.integrate, q, velocity=velocity, **FIXED), 74),
+        (partial(stepper.step, Q, P, 0.05), 84),
+        (partial(stepper.velocity, Q, P), 70),
+        (partial(stepper.energy, Q, P), 75),
+        (partial(stepper.velocity, np.tile(Q, (100, 1)), np.tile(P, (100, 1))), 70),
+    ]:
+        run()
+        with at_most(calls):
+            run()
+        with pytest.raises(TooMuchWorkError), at_most(calls // 2):
+            run()
+
+
+@pytest.fixture(scope="module")
+def rods():
+    distances = ["x**2 + y**2 - l**2", "(u - x)**2 + (v - y)**2 - a**2"]
+    system = lagrange(
+        "rods", "x y u v", "(x_dot**2 + y_dot**2 + u_dot**2 + v_dot**2)/2 - y - v", constraints=distances, l=1.0, a=0.7
+    )
+    return sc.compile_stepper(system, "svi:4", flags=QUICK_FLAGS)
+
+
+@pytest.mark.parametrize("moving", ["p", "velocity"])
+def test_runs_on_constraints_begin_by_one_call_of_c(rods, moving):
+    q, still = [0.6, -0.8, 1.3, -0.8], np.zeros(4)
+    for plan, calls in ((FIXED, 40), ({"t_end": 0.05, "check_growth": False}, 72)):
+        rods.integrate(q, **{moving: still}, **plan)
+        with at_most(calls):
+            rods.integrate(q, **{moving: still}, **plan)
+    rods.start(q, **{moving: still}, h=0.05)
+    with at_most(270):
+        rods.start(q, **{moving: still}, h=0.05)
+
+
+def beginning(rods, q, p):
+    """Initial state of a run, with the warning or error that it causes."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            run = rods.integrate(q, p, h=1e-3, steps=0)
+        except sc.StateError as error:
+            return str(error)
+    return run.q.tobytes(), run.p.tobytes(), [str(warning.message) for warning in caught]
+
+
+def test_c_begins_on_constraints_where_python_does(rods, monkeypatch):
+    """States from exact to far away, as they are, moved silently, moved with a warning, refused: the same bits."""
+    generator, kinds = np.random.default_rng(4), set()
+    states = []
+    for _ in range(200):
+        a, b = generator.uniform(-3.0, 3.0, 2)
+        q = np.cumsum([[np.sin(a), -np.cos(a)], [0.7 * np.sin(b), -0.7 * np.cos(b)]], axis=0).ravel()
+        p = np.cumsum([[np.cos(a), np.sin(a)], [0.7 * np.cos(b), 0.7 * np.sin(b)]], axis=0).ravel()
+        off = 10.0 ** generator.uniform(-17.0, -1.0) * generator.normal(size=(2, 4))
+        states.append((q + off[0], p + off[1]))
+    found = [beginning(rods, *state) for state in states]
+    monkeypatch.setitem(rods.binding._has, "call_consistent", False)
+    monkeypatch.setattr(rods, "_begins_by", None)
+    for state, begun in zip(states, found, strict=True):
+        assert begun == beginning(rods, *state)
+        kinds.add("error" if isinstance(begun, str) else (begun[0] == state[0].tobytes(), len(begun[2])))
+    assert kinds == {"error", (True, 0), (False, 0), (False, 1)}
+
+
+def test_dependent_constraints_are_refused_by_the_least_singular_value():
+    """Rows (1, 1, 0) and (1, 1 + d, 0) of length 1; C accepts what is certain, and leaves the rest to Python."""
+    system = lagrange(
+        "held", "x y z", "(x_dot**2 + y_dot**2 + z_dot**2)/2", constraints=["x + y", "x + (1 + d)*y"], d=1.0
+    )
+    stepper, accepted = sc.compile_stepper(system, "svi:2", flags=QUICK_FLAGS), list[sc.Trajectory]()
+    for d in np.logspace(-11.0, 0.0, 45):
+        rows = np.array([[1.0, 1.0, 0.0], [1.0, 1.0 + d, 0.0]])
+        least = np.linalg.svd(rows / np.linalg.norm(rows, axis=1, keepdims=True), compute_uv=False)[-1]
+        run = partial(stepper.integrate, np.zeros(3), [0.0, 0.0, 1.0], h=0.1, steps=1, parameters={"d": d})
+        if least > 1e-9:
+            accepted.append(run())
+        else:
+            with pytest.raises(sc.StateError, match="linearly dependent"):
+                run()
+    assert 30 < len(accepted) < 45
 
 
 @pytest.mark.parametrize("plan", [FIXED, ADAPTIVE, {"t_end": 0.05}])

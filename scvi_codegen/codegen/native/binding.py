@@ -5,6 +5,7 @@ first requests it (:mod:`scvi_codegen.codegen.rendering.kernels.simd`); that cal
 """
 
 import re
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cache, partial
@@ -18,11 +19,22 @@ from numpy.typing import NDArray
 from scvi_codegen.codegen.native.building import Library
 from scvi_codegen.codegen.native.options import FAILURES, FALLBACK_REQUIRED, SolverOptions, checked_options
 from scvi_codegen.codegen.rendering.source import Source
+from scvi_codegen.codegen.rendering.text import DEPENDENT, INPUT_PRECISION, ROUNDING_UNITS
 from scvi_codegen.common.cache import template_folder
 from scvi_codegen.common.errors import MethodError
 
 RESULTS, FIRST_RESULT = Struct("=4d4q"), "error"
 """Format of the last fields of the struct (``calls_declarations.h``), and the first of them."""
+LIMITS_ON_CONSTRAINTS = (
+    f"#define HAS_CONSTRAINTS\n#define DEPENDENT {DEPENDENT!r}\n#define INPUT_PRECISION {INPUT_PRECISION!r}\n"
+    f"#define ROUNDING_OF_INPUT {ROUNDING_UNITS * sys.float_info.epsilon!r}\n"
+)
+"""Constraints of named coordinates in ``calls.h``, with the limits of their initial states."""
+CONSISTENT = (
+    "int NAME(call_consistent)(double t, const double *q, const double *p, const double *parameters, double *q1, "
+    "double *p1, double *workspace);\n"
+)
+"""Declaration of the function of ``calls.h`` that only constraints of named coordinates have."""
 OPTIONAL_FUNCTIONS = frozenset(("advance_to", "set_fallback", "project"))
 """Functions that not all integrators have, HAS_.. in ``calls.h`` like the optional fields of a run."""
 
@@ -31,11 +43,16 @@ def with_calls(source: Source) -> Source:
     """Return a source of runs with the functions of calls; others unchanged."""
     if "advance" not in source.contents.functions:
         return source
+    sizes, constrained = source.contents.sizes, ""
+    if sizes and sizes.constraints and "h_low" not in source.contents.run_fields:
+        constrained = CONSISTENT
     declarations, functions = (
-        re.sub(r"NAME\((\w+)\)", rf"{source.prefix}_\1", _text(name)) for name in ("calls_declarations", "calls")
+        re.sub(r"NAME\((\w+)\)", rf"{source.prefix}_\1", text)
+        for text in (_text("calls_declarations") + constrained, _text("calls"))
     )
     present = [name for name in source.contents.functions if name in OPTIONAL_FUNCTIONS]
     switches = "".join(f"#define HAS_{name.upper()}\n" for name in (*present, *source.contents.run_fields))
+    switches += LIMITS_ON_CONSTRAINTS if constrained else ""
     return replace(
         source,
         code=f"{source.code}\n{switches}{declarations}\n{functions}",
@@ -49,8 +66,12 @@ def _text(name: str) -> str:
 
 
 DOUBLE_SIZE = np.dtype(np.float64).itemsize
-WITHOUT_STEPS = frozenset(("start", "step_error", "energies", "call_momenta", "call_project"))
+WITHOUT_STEPS = frozenset(
+    ("start", "step_error", "energies", "call_momenta", "call_project", "call_transform", "call_consistent")
+)
 """Functions that never request the fallback, frequent or of many states."""
+IN_DOUBT, BY_VELOCITY, ON_CONSTRAINTS = -1, 1, 2
+"""Status of an integration whose initial state Python has to examine; how the initial state is given (``calls.h``)."""
 
 
 class Binding:

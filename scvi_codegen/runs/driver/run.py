@@ -6,6 +6,7 @@ from typing import Any, Self, cast
 
 import numpy as np
 
+from scvi_codegen.codegen.native.binding import IN_DOUBT
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.validation import LARGEST_COUNT
 from scvi_codegen.runs.accuracy.local_error import warn_of_inaccuracy
@@ -96,10 +97,12 @@ class Run(Memory, AttitudeHistory):
             return Observation(self, saver_of(output)).advance(steps, output.progress, stop or (lambda: False))
         return record(self, steps, save_every=output.save_every, progress=output.progress, stop=stop)
 
-    def _integrated(self, initial: InitialData, growth: int, steps: int | None, output: Output) -> Trajectory:
+    def _integrated(
+        self, initial: InitialData, begins_by: int, growth: int, steps: int | None, output: Output
+    ) -> Trajectory:
         """Start a run that is set up and record it: by one C call if it ends within its number of states.
 
-        ``growth``: value of ``measures_growth`` in C.
+        ``begins_by``, ``growth``: values of ``begins_by`` and ``measures_growth`` in C.
         """
         plan, h, save_every, short = self._plan, self._h, output.save_every, self._rows
         most = self._first_steps(save_every)
@@ -107,16 +110,22 @@ class Run(Memory, AttitudeHistory):
         special = self._takes_noise or short is None or self._has_tau or self._unset_inputs or self.stepper.searched
         is_plain = output is ALL_STATES or output.has_states_alone
         if special or not (fits and is_plain and (isinstance(plan, Fixed) or initial.t != plan.t_end)):
-            self._start_from(initial, growth)
+            self._start_from(initial, begins_by, growth)
             return self._recorded(steps, output)
         q, p, velocity, t, _, _ = initial
         if velocity is None:
             short.begin(t, q, p)
         else:
-            short.begin_by_velocity(t, q, velocity)
-        short.call.measures_growth = growth
+            short.begin(t, q, velocity, "velocity")
+        if (growth, begins_by) != short.way:
+            short.way = short.call.measures_growth, short.call.begins_by = growth, begins_by
         size = most if steps is None else steps
         status = short.integrate(size, save_every)
+        if status == IN_DOUBT:
+            short.begin(t, *cast(Any, self.stepper)._consistent_state(initial))
+            short.way = growth, 0
+            short.call.begins_by = 0
+            status = short.integrate(size, save_every)
         error, error_t, first, last, stored, done, rejected, fallbacks = short.results()
         if status or (steps is None and done == size):
             return record(self, steps, save_every=save_every, filled=1 + stored, status=status)
@@ -125,12 +134,10 @@ class Run(Memory, AttitudeHistory):
         states, sizes = short.recorded(1 + stored, h, save_every)
         return plain_trajectory(self, states, sizes, done, error, error_t, rejected, fallbacks)
 
-    def _start_from(self, initial: InitialData, growth: int) -> None:
-        """Start a run that is set up, at the momenta of the velocity if that is passed."""
-        q, p, velocity, t, *_ = initial
-        if velocity is not None:
-            p = self.stepper.initial_momentum(q, velocity, t, self._parameters)
-        self._begin(q, cast(States, p), t, growth)
+    def _start_from(self, initial: InitialData, begins_by: int, growth: int) -> None:
+        """Start a run that is set up, as the initial state is given."""
+        q, p = cast(Any, self.stepper)._consistent_state(initial) if begins_by else initial[:2]
+        self._begin(q, cast(States, p), initial.t, growth)
 
     @property
     def bath(self) -> BathReport | None:

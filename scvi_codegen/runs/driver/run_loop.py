@@ -179,42 +179,29 @@ class ShortRuns(StateRows):
         self.shape = (m,) if m <= FEW else None  # of vectors that are checked as lists, faster than as arrays
         self._start, self._sizes = np.empty(1 + 2 * m), np.full(rows, math.nan)
         self._pack = partial(struct.Struct(f"{1 + 2 * m}d").pack_into, cast(Any, self._start), 0)
-        self.call = memory._new_call(*self.starts)
+        self.call, self._count = memory._new_call(*self.starts), 2 * m
+        self.way = 0, 0  # measures_growth and begins_by of the call
         self.call.start, self.call.sizes = stepper.binding.pointers(self._start, self._sizes)
         self.call.has_energies = stepper.interface.conserves_energy and not stepper.changes_states
         self.integrate = stepper.binding.call("integrate", self.call)
         self.results = stepper.binding.results(self.call)
-        self._stepper, self._parameters = stepper, memory._parameters
-        self._state, self._momenta = (self._start[1 : 1 + m], self._start[1 + m :]), np.empty(m)
-        q, velocity, p = stepper.binding.pointers(*self._state, self._momenta)
-        self._pointers = q, velocity, memory._arguments[0], p, memory._workspace
-        self._momentum = stepper.binding.function("momentum")
 
     def begin(self, t: float, q: Any, p: Any, name: str = "p") -> None:
         """Set the initial state; raise :class:`StateError` unless q and p, or what it is, are (m,) finite numbers."""
-        numbers, kind = None, type(q)
-        if kind is type(p) and self.shape is not None:
-            if kind is np.ndarray:
-                if q.shape == p.shape == self.shape and q.dtype is p.dtype is BINARY64:
-                    numbers = q.tolist() + p.tolist()
-            elif kind in SEQUENCES and (len(q),) == (len(p),) == self.shape and NUMBERS.issuperset(map(type, q + p)):
-                numbers = q + p
+        numbers: list[Any] = []
+        for vector in (q, p):
+            if type(vector) is np.ndarray:
+                if vector.shape == self.shape and vector.dtype is BINARY64:
+                    numbers += vector.tolist()
+            elif type(vector) in SEQUENCES and NUMBERS.issuperset(map(type, vector)):
+                numbers += vector if (len(vector),) == self.shape else ()
         try:
-            if numbers is not None and isfinite(sum(numbers)):
+            if len(numbers) == self._count and isfinite(sum(numbers)):
                 self._pack(t, *numbers)
                 return
         except (OverflowError, struct.error):  # of an integer above all floats
             pass
         self._start[0], self._start[1:] = t, np.concatenate(self._states.pair(q, p, name))
-
-    def begin_by_velocity(self, t: float, q: Any, velocity: Any) -> None:
-        """Set the initial state (q, dL/dv); raises as :meth:`begin` and :meth:`Integrator.initial_momentum`."""
-        self.begin(t, q, velocity, "velocity")
-        (positions, values), momenta = self._state, self._momenta
-        status = self._momentum(t, *self._pointers)
-        if status or {*values[momenta == 0.0].tolist()} - {0.0}:  # perhaps the velocity has no momentum
-            momenta = self._stepper.initial_momentum(positions, values, t, self._parameters)
-        values[:] = momenta
 
     def recorded(self, count: int, h: float | None, save_every: int) -> tuple[States, Array]:
         """Return copies of the first states and of the steps that follow them."""

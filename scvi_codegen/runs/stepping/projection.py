@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.codegen.native.options import REASONS, STATUS
-from scvi_codegen.codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
+from scvi_codegen.codegen.rendering.text import DEPENDENT, INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
 from scvi_codegen.common.errors import AccuracyWarning, StateError, of_trajectory, warn
 from scvi_codegen.runs.states.validation import Array, Parameters, States, inputs_not_given, missing_input
 from scvi_codegen.runs.states.words import quotient_of
@@ -83,6 +83,11 @@ def consistent(
         if any(re.search(rf"\b{name}\b", formula) for formula in stepper.constraints):
             raise missing_input(name)
     q0, p0 = stepper._states.pair(q, p)
+    binding, states = stepper.binding, (q0, p0, stepper._parameters(parameters), np.empty_like(q0), np.empty_like(p0))
+    if binding.has("call_consistent") and not binding.function("call_consistent")(
+        stepper._states.time(t), *map(binding.pointer, states), binding.workspace()
+    ):
+        return states[3], states[4]
     q1, p1, apart = projected(stepper, q0, p0, t, parameters)
     if check_rank and (wrong := _dependent(stepper, q1, t, parameters)):
         raise StateError(f"{wrong} (q = {_shown(q1)})")
@@ -296,8 +301,6 @@ def _refuse(stepper: Integrator, status: int, q: Array) -> None:
     raise StateError(f"the constraints {shown} cannot be satisfied near q = {_shown(q)}: {REASONS[status]}{hint}")
 
 
-DEPENDENT = 1e-9
-"""Smallest singular value of G, with rows of length 1, below which rows count as linearly dependent."""
 NEARLY_DEPENDENT = 0.15
 """The same for constraints at a state from which a step fails."""
 NAMED_SHARE = 1e-6
