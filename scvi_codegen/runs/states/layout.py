@@ -14,6 +14,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cached_property
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -33,6 +34,7 @@ from scvi_codegen.runs.states.validation import (
     check_lengths,
     coordinate_shapes,
     flat_state,
+    is_vector,
     parameter_values,
     parameters_of_each,
     shapes_of,
@@ -135,7 +137,7 @@ class StateLayout:
             raise StateError(
                 f"the time t must be one number or {count}, one for each state, not of shape {times.shape}"
             )
-        times = np.ascontiguousarray(np.broadcast_to(times, (count,)))
+        times = np.ascontiguousarray(times) if times.ndim else np.full(count, times)
         return times, np.ascontiguousarray(positions), np.ascontiguousarray(moving)
 
     def members(self, values: States, name: str) -> Array:
@@ -153,6 +155,8 @@ class StateLayout:
 
     def axes(self, q: States) -> int:
         """Return the number of axes of positions: 1 of one state, 2 of several."""
+        if is_vector(q):
+            return 1
         if not isinstance(q, Mapping) and (axes := real_array(q, "q").ndim) == 1:
             return axes
         return real_array(self.positions(q, "q"), "q").ndim
@@ -163,7 +167,16 @@ class StateLayout:
 
     def parameters(self, values: Parameters, base: Array | None = None) -> Array:
         """Return the (k,) parameter values in order; by default those of ``base``, or the defaults."""
+        if values is None and base is None:
+            return self.defaults.copy()
         numbers = parameter_values(self.interface, values, base)
+        check_lengths(self.interface, numbers)
+        return numbers
+
+    @cached_property
+    def defaults(self) -> Array:
+        """(k,) default values of the parameters, checked once."""
+        numbers = parameter_values(self.interface, None)
         check_lengths(self.interface, numbers)
         return numbers
 

@@ -65,6 +65,10 @@ def flat_state(interface: Interface, value: Any, name: str) -> Any:
     """
     if not interface.arrays and (type(value) is np.ndarray or not isinstance(value, Mapping)):
         return value
+    if not interface.arrays and len(value) == interface.dimension:
+        numbers = [*map(value.get, interface.coordinates)]
+        if NUMBERS.issuperset(map(type, numbers)):
+            return np.array(numbers, BINARY64)
     arrays = coordinate_shapes(interface)
     if isinstance(value, Mapping):
         coordinates = dict(zip((momentum.name for momentum in interface.layout.momenta), arrays, strict=False))
@@ -105,6 +109,10 @@ def _different_states(shapes: Mapping[str, tuple[int, ...]], first: str, second:
 
 
 def _joined(arrays: Sequence[tuple[str, tuple[int, ...]]], by_name: Mapping[str, Any], label: str) -> Array:
+    if len(by_name) == len(arrays):
+        values: list[tuple[Any, tuple[int, ...]]] = [(by_name.get(name), shape) for name, shape in arrays]
+        if all(type(x) is np.ndarray and x.dtype is BINARY64 and x.shape == shape for x, shape in values):
+            return np.concatenate([x.reshape(-1) for x, _ in values])
     check_named(by_name, [name for name, _ in arrays], label)
     parts = []
     for name, shape in arrays:
@@ -133,9 +141,14 @@ def check_named(values: Mapping[str, object], names: Sequence[str], label: str, 
 
 def coordinate_shapes(interface: Interface) -> list[tuple[str, tuple[int, ...]]]:
     """Return the name and shape of each array of coordinates; without arrays, each coordinate is one."""
+    return [*_first_declared(interface.arrays or interface.coordinates, interface.dimension)]
+
+
+@lru_cache(maxsize=256)
+def _first_declared(declarations: Sequence[str], dimension: int) -> Shapes:
     coordinates, total = [], 0
-    for name, shape in declared(interface.arrays or interface.coordinates):
-        if total < interface.dimension:
+    for name, shape in declared(declarations):
+        if total < dimension:
             coordinates.append((name, shape))
             total += math.prod(shape)
     return coordinates
@@ -160,6 +173,13 @@ Parameters = Mapping[str, Any] | Sequence[float] | Array | None
 """Parameters, also arrays of known sizes, by name (others have their defaults), or all in order."""
 EnsembleParameters = Mapping[str, ArrayLike] | Sequence[Any] | Array | None
 """Parameters of trajectories: values by name, of all or of each; or rows."""
+
+
+def is_vector(value: Any) -> bool:
+    """Return whether a value is certainly a vector of real numbers, as most are: as quickly as possible."""
+    if type(value) is np.ndarray:
+        return value.ndim == 1 and value.dtype is BINARY64
+    return type(value) in SEQUENCES and NUMBERS.issuperset(map(type, value))
 
 
 def short_vector(value: Any, count: int) -> Array | None:

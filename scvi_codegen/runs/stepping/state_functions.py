@@ -203,9 +203,13 @@ class StateFunctions(CompiledMethod):
             at, values = self._states.time(t), self._parameters(parameters)
             return self._transformed(name, at, *self._states.pair(q, other, label), values)
         times, positions, others = self._states.rows(q, other, t, name=label)
-        values, result = self._parameters(parameters), others.copy()
-        for k, (at, position, row) in enumerate(zip(times, positions, others, strict=True)):
-            result[k] = self._transformed(name, at, position, row, values)
+        values, result, done = self._parameters(parameters), others.copy(), 0
+        if not (self.in_tau or self.interface.words > 1 or self.interface.layout.momenta):
+            arrays = map(self.binding.pointer, (times, positions, others, values, result))
+            call, sizes = self.binding.function("call_transform"), positions.shape
+            done = call(name == "velocity", *sizes, *arrays, self.binding.workspace())
+        for k in range(done, len(times)):  # the first one fails, unless none was transformed
+            result[k] = self._transformed(name, times[k], positions[k], others[k], values)
         return result
 
     def _transformed(self, name: str, t: float, q: Array, other: Array, values: Array) -> Array:
