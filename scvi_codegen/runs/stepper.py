@@ -26,7 +26,7 @@ from scvi_codegen.codegen.variants import Variant
 from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.common.validation import checked_count, checks_arguments, of
 from scvi_codegen.runs.accuracy.global_error import Runs, checked_error, warn_of_unconfirmed, warn_of_unconfirmed_run
-from scvi_codegen.runs.accuracy.growth import measured_growth, warn_of_error_growth
+from scvi_codegen.runs.accuracy.growth import measures_growth, warn_of_error_growth
 from scvi_codegen.runs.accuracy.local_error import warn_of_energy_errors, warn_of_inaccuracy
 from scvi_codegen.runs.accuracy.resolution import warn_of_unresolved_members
 from scvi_codegen.runs.accuracy.warning_switch import warn_of_failed_check
@@ -175,11 +175,11 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
                 the bound: ``global_error``, ``confirmed_digits`` and ``confirmed_until`` of the trajectory. If double
                 precision does not suffice (chaotic motion), an :class:`~scvi_codegen.AccuracyWarning` reports the
                 time until which the bound is confirmed.
-            check_growth: by default adaptive runs warn of exponential growth of errors: of most conservative
-                Lagrangian systems by a tangent vector along the run, of others by repeating up to 2048 steps from an
-                initial state perturbed in its last place, unless a coarse run shows that errors grow slowly.
-                ``True``: repeat all steps, and warn if the states differ by more than 1e-7 (relative); ``False``: no
-                check.
+            check_growth: by default adaptive runs with a tolerance below 1e-4 warn if the motion amplifies the errors
+                of the steps, by a tangent vector that C carries along the run (of most Lagrangian systems without
+                constraints and rotations): above 10,000 tolerances, 1e-10 or 1e-2 of the range of a position.
+                ``True``: with every tolerance and with fixed steps, or :class:`MethodError` where there is no such
+                vector; ``False``: no check.
             tables, threads: of arrays of run-time sizes: (rows, columns) whole numbers by name, (rows,) for a single
                 column; and the number of threads per step, by default one, with bitwise equal results. Threads pay off
                 if a step takes longer than some tens of microseconds; they are started by each call of C. The shapes
@@ -267,7 +267,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             q, p = self._consistent_state(initial)
             initial, begins_by = initial._replace(q=q, p=p, velocity=None), 0
         fixed = isinstance(plan, FixedSteps)
-        growth = 0 if fixed and not check_growth else measured_growth(self, plan, check_growth)
+        growth = not (fixed and not check_growth) and measures_growth(self, plan, check_growth)
         try:
             run: Run = self._released_runs.pop()
         except IndexError:  # all are in use
@@ -282,9 +282,8 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         try:
             if segments is None:
                 warn_of_inaccuracy(trajectory, run)
-            if not fixed:
-                repeat = None if segments is None else partial(segments.advance, run)
-                warn_of_error_growth(run, trajectory, check_growth, repeat)
+            if growth:
+                warn_of_error_growth(run, float(trajectory.t[-1]), requested=check_growth is True)
         except Exception as failure:  # noqa: BLE001  (the run is complete)
             warn_of_failed_check(failure)
         if run._rows is not None:  # large memory is freed instead

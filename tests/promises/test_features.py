@@ -109,6 +109,7 @@ SITUATIONS = {
     "without second derivatives": lambda: stepper_of(damping=0.1),
     "without an error estimate": lambda: stepper_of("stoermer-verlet"),
     "without trajectories in SIMD lanes": lambda: stepper_of("scvi:2"),
+    "without a tangent vector along runs": lambda: stepper_of("scvi:2"),
     "with sizes known at run time": lambda: stepper_of(**ARRAY),
     "with precision='double-double'": lambda: stepper_of(precision="double-double"),
     "with forces": lambda: stepper_of(forces={"q": "-q_dot"}),

@@ -2,7 +2,6 @@
 
 import math
 import re
-import warnings
 from contextlib import nullcontext
 from types import SimpleNamespace
 
@@ -231,42 +230,6 @@ class TestMotions:
             check_claims(name, run, error)
             again = transformed.integrate(**start, **run.confirmation.steps)
             assert np.array_equal(again.q, run.q)
-
-
-class TestChaos:
-    """Burrau's problem loses thirteen digits until t = 70, a double pendulum all of them until t = 50."""
-
-    @pytest.mark.rotated
-    @pytest.mark.parametrize("more", [{}, {"save_every": 7}, {"t_eval": np.linspace(0.0, 70.0, 50)}])
-    def test_default_run_warns_of_chaos(self, burrau_stepper, more):
-        with pytest.warns(sc.AccuracyWarning, match="errors: small perturbations of the initial state grew"):
-            burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, **more)
-        with pytest.warns(sc.AccuracyWarning, match="a run with the initial state perturbed by 8.9e-16"):
-            burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, **more, check_growth=True)
-
-    @pytest.mark.rotated
-    @pytest.mark.filterwarnings("error")
-    def test_short_or_unchecked_runs_do_not_warn(self, burrau_stepper):
-        burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, check_growth=False)
-        burrau_stepper.integrate(*PYTHAGOREAN, t_end=3.0)
-
-    @pytest.mark.filterwarnings("error")
-    def test_regular_motions_do_not_warn(self, kepler_stepper):
-        kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=600.0, check_growth=True)
-        kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=600.0, tolerance=1e-9)
-
-    @pytest.mark.rotated
-    def test_long_runs_are_checked_up_to_a_limit_or_completely(self):
-        """Duffing's oscillator with two wells, chaotic after t = 1000 alone; damping excludes tangent vectors."""
-        late = "(1 + tanh(t - 1000))/2"
-        wells = f"{late}*(x**2 - x**4/4 + x*cos(t)/2)"
-        system = made("late", ["x"], f"x_dot**2/2 - x**2/2 + x*cos(7*t)/100 + {wells}", damping=1e-9)
-        stepper = sc.compile_stepper(system, "svi:4")
-        with warnings.catch_warnings(action="error"):
-            run = stepper.integrate([0.1], [0.3], t_end=1300.0)
-        assert run.steps > 2048
-        with pytest.warns(sc.AccuracyWarning, match="amplifies errors"):
-            stepper.integrate([0.1], [0.3], t_end=1300.0, check_growth=True)
 
 
 @pytest.fixture(scope="module")

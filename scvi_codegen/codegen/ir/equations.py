@@ -462,15 +462,13 @@ class Control:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorGrowth:
-    """Propagation of a tangent vector along adaptive runs (``codegen/lowering/control.py``).
+    """Propagation of a tangent vector along runs (``codegen/lowering/control.py``).
 
     Attributes:
         partials: distinct derivatives at the points, on lanes: F_q, or -E_q and -E_v with the terms of the mass matrix.
         product: at u = (x, these) their product with x = dq, or (dq, dq'), on lanes.
-        energy: gradient of the energy at (q, v), on lanes; ``None`` of separable systems, and if it is not conserved.
-        conserves_energy: false if forces act or the system depends on time.
         of_velocities: true if accelerations depend on velocities.
-        end: extrapolation from the points to the end of a step.
+        part_of_tolerance: error of an adaptive step in units of its tolerance.
         tables: by the number of knots, times at which the tangent vector is evaluated; the last for vectors of eight
             lanes. With eight columns, from values at the points to those at the knots, from accelerations there to
             tangent vectors, and to Taylor's coefficients at the end of a step.
@@ -478,16 +476,9 @@ class ErrorGrowth:
 
     partials: Kernel
     product: Kernel
-    energy: Kernel | None
-    conserves_energy: bool
     of_velocities: bool
-    end: tuple[Number, ...]
+    part_of_tolerance: float
     tables: Mapping[int, tuple[IterationTable, ...]]
-
-    @property
-    def kernels(self) -> tuple[Kernel, ...]:
-        """Kernels of the growth, all on lanes."""
-        return (self.partials, self.product, *((self.energy,) if self.energy else ()))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

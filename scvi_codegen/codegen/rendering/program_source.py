@@ -31,7 +31,6 @@ from scvi_codegen.codegen.rendering.kernels.simd import (
     Fallback,
     constrained_source,
     iteration_source,
-    lane_table,
     loop_functions,
     predictor_text,
     splitting_source,
@@ -42,7 +41,6 @@ from scvi_codegen.codegen.rendering.text import (
     INPUT_PRECISION,
     LARGEST_VIOLATION,
     MAX_ITERATIONS,
-    OF_SMALL_STEPS,
     ROUNDING_UNITS,
     HeaderRecord,
     wrapped_functions,
@@ -463,7 +461,7 @@ def render_embedded(program: Program, precision: Embedded, control: Control | No
 def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") -> Source:
     """Return the source of entry templates from their context, with defaults for all of them."""
     common = {"prefix": prefix, "target": DOUBLE, "real": DOUBLE.scalar}
-    numbers = {"max_iterations": MAX_ITERATIONS, "of_small_steps": OF_SMALL_STEPS}
+    numbers = {"max_iterations": MAX_ITERATIONS}
     absent = {"two_words": None, "rattle_in_pairs": False, "derivatives": None, "fallback": "none", "embedded": False}
     environment, context = template_environment(), {"diagonal_masses": None, **common, **numbers, **absent, **context}
     context["diagonal_masses"] = None if context["two_words"] else context["diagonal_masses"]
@@ -538,8 +536,7 @@ def _control_context(program: Program, control: Control | None) -> dict[str, obj
     name = f"support/{program.prefix}_predictor.h"
     if not (control and control.predictor and program.fixed_point):
         return {"control": control, "own_headers": {}}
-    end = lane_table("AT_END", control.growth.end) if control.growth else ""
-    return {"control": control, "own_headers": {name: predictor_text(control.predictor)}, "growth_end": end}
+    return {"control": control, "own_headers": {name: predictor_text(control.predictor)}}
 
 
 def render_ensemble(
@@ -677,7 +674,7 @@ def _context(
     kernels = program.kernels if kernels is None else kernels
     fallback, scalars = fallback or ("own" if program.newton else "none"), _scalar_kernels(program, control, kernels)
     growth = control.growth if control else None
-    of_growth = growth.kernels if growth else ()
+    of_growth = (growth.partials, growth.product) if growth else ()
     lanes = beside.lane_kernels if beside else of_growth
     return {
         "program": program,

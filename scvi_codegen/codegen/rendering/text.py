@@ -12,9 +12,6 @@ MAX_ITERATIONS = 50
 """Default number of iterations after which a step fails: Newton's method takes 3 to 6, fixed-point iterations 5 to 20.
 """
 
-OF_SMALL_STEPS = 8
-"""Small adaptive steps of which one measures the growth of errors, a power of 2."""
-
 ROUNDING_UNITS, INPUT_PRECISION, LARGEST_VIOLATION = 64.0, 1e-6, 1e-2
 """Limits of the constraint violation of an initial state, relative to its size.
 

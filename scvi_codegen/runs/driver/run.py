@@ -98,11 +98,11 @@ class Run(Memory, AttitudeHistory):
         return record(self, steps, save_every=output.save_every, progress=output.progress, stop=stop)
 
     def _integrated(
-        self, initial: InitialData, begins_by: int, growth: int, steps: int | None, output: Output
+        self, initial: InitialData, begins_by: int, growth: bool, steps: int | None, output: Output
     ) -> Trajectory:
         """Start a run that is set up and record it: by one C call if it ends within its number of states.
 
-        ``begins_by``, ``growth``: values of ``begins_by`` and ``measures_growth`` in C.
+        ``begins_by``: its value in C; ``growth``: whether the run carries its error.
         """
         plan, h, save_every, short = self._plan, self._h, output.save_every, self._rows
         most = self._first_steps(save_every)
@@ -134,10 +134,10 @@ class Run(Memory, AttitudeHistory):
         states, sizes = short.recorded(1 + stored, h, save_every)
         return plain_trajectory(self, states, sizes, done, error, error_t, rejected, fallbacks)
 
-    def _start_from(self, initial: InitialData, begins_by: int, growth: int) -> None:
+    def _start_from(self, initial: InitialData, begins_by: int, growth: bool) -> None:
         """Start a run that is set up, as the initial state is given."""
         q, p = cast(Any, self.stepper)._consistent_state(initial) if begins_by else initial[:2]
-        self._begin(q, cast(States, p), initial.t, growth)
+        self._begin(q, cast(States, p), initial.t, growth=growth)
 
     @property
     def bath(self) -> BathReport | None:

@@ -325,11 +325,6 @@ class InputSegments:
 
         return record_segments(run, prepared_segments(run, self.inputs, self.t_end, self.values), recorded)
 
-    def advance(self, run: Memory, t_end: float) -> None:
-        """Advance a run with adaptive steps to a time without saving intermediate states."""
-        for _ in prepared_segments(run, self.inputs, t_end, self.values):
-            run._run_to_target()
-
 
 def prepared_segments(
     run: Memory, inputs: Mapping[str, Input], t_end: float, values: Callable[[float], Array]

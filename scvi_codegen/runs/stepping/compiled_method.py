@@ -423,6 +423,11 @@ class CompiledMethod:
         return self._variants.lacks(variant)
 
     @property
+    def _carries_errors(self) -> bool:
+        """True if runs have a tangent vector to which the errors of their steps are added."""
+        return not (self.run_time_sizes or self.changes_states) and "measures_growth" in self.source.contents.run_fields
+
+    @property
     def _has_error_estimate(self) -> bool:
         """True if the method has adaptive steps for this system; also if that follows from sizes at run time."""
         return self.binding.has("advance_to")

@@ -88,6 +88,7 @@ PROPERTIES: dict[str, Callable[[Any], bool]] = {
     "without trajectories in SIMD lanes": lambda stepper: not stepper.run_time_sizes and stepper.ensemble is None,
     "without derivatives": lambda stepper: stepper._lacks(Derivatives()),
     "without second derivatives": lambda stepper: stepper._lacks(Derivatives(order=2)),
+    "without a tangent vector along runs": lambda stepper: not stepper._carries_errors,
     "without an error estimate": lambda stepper: not (stepper._has_error_estimate or stepper._has_tau),
 }
 """Whether a stepper has a property."""
@@ -108,10 +109,9 @@ _DERIVATIVES = f"{_FIRST} chaos chaos_ensemble periodic_orbit fit flow"
 _CURVE = "SVI, SCVI or a Gauss method"
 _ACTIONS = "action shadow_energy path"
 _IN_DOUBLE = (
-    "check_growth observe_ensemble single work discrete_lagrangian "
-    f"chaos_ensemble periodic_orbit energy fit flow {_ACTIONS}"
+    f"observe_ensemble single work discrete_lagrangian chaos_ensemble periodic_orbit energy fit flow {_ACTIONS}"
 )
-_RUNS = "chaos chaos_ensemble periodic_orbit fit flow work check_growth"
+_RUNS = "chaos chaos_ensemble periodic_orbit fit flow work"
 _ORIGINAL = "compile the original system, with fixed steps h, or with time_transformation=... or t_end=..."
 FEATURES = {
     (operation, property_): remedy
@@ -128,8 +128,6 @@ FEATURES = {
             "this requires fixed steps h; compile the stepper without time_transformation",
         ),
         ("with precision='double-double'", _IN_DOUBLE, "omit it, or use precision='double'"),
-        ("with a time transformation", "check_growth", "it requires adaptive steps; omit it"),
-        ("in transformed time", "check_growth", "it requires adaptive steps; omit it"),
         ("with a time transformation", "adaptive", "give h (constant step in tau) and t_end, and no tolerance"),
         ("with a time transformation", "advice", "use --tolerance (local error)"),
         ("in transformed time", "advice", "use --tolerance (local error)"),
@@ -155,7 +153,7 @@ FEATURES = {
         ("with events that set parameters", _DERIVATIVES, "make them terminal, and restart with the new parameters"),
         (
             "with events that change the state",
-            "error observe_ensemble single check_growth hessian chaos_ensemble flow advice shadow_energy",
+            "error observe_ensemble single hessian chaos_ensemble flow advice shadow_energy",
             "make them terminal and restart",
         ),
         ("with kinks that runs locate", "observe_ensemble single", "save states of runs in double precision"),
@@ -164,7 +162,7 @@ FEATURES = {
         ("where L or H jumps", " ".join(BY_FORMULAS), "use runs, ensembles of runs and their first derivatives"),
         (
             "with contacts",
-            f"check_growth observe_ensemble single hessian chaos_ensemble flow advice {_ACTIONS}",
+            f"observe_ensemble single hessian chaos_ensemble flow advice {_ACTIONS}",
             "use runs and ensembles with h, or with t_end and a tolerance, without it",
         ),
         ("with constraints", "observe_ensemble", "use coordinates without constraints, or omit it"),
@@ -192,9 +190,16 @@ FEATURES = {
         ("without an action", "discrete_lagrangian", f"it requires {_CURVE}, no forces, and a second-order system"),
         (
             "without an error estimate",
-            "adaptive error check_growth",
+            "adaptive error",
             "it requires forces at two or more stages, or velocities that vary along a step; give h and steps (fixed "
             "step size)",
+        ),
+        (
+            "without a tangent vector along runs",
+            "check_growth",
+            "it requires forces or accelerations of at most 1000 operations, by the fixed-point iteration of SVI or a "
+            "Gauss method in double precision, without constraints, rotations, contacts, damping=, inputs, arrays of "
+            "run-time sizes, a time transformation and events that change the state; omit it, or use error=",
         ),
         (
             "with sizes known at run time",

@@ -199,8 +199,8 @@ class Memory:
         self._set_up(plan, initial)
         self._begin(q, p, initial.t)
 
-    def _begin(self, q: States, p: States, t: float, growth: int = 0) -> None:
-        """Start at (q, p) and t after :meth:`_set_up`; ``growth``: value of ``measures_growth`` in C."""
+    def _begin(self, q: States, p: States, t: float, *, growth: bool = False) -> None:
+        """Start at (q, p) and t after :meth:`_set_up`; ``growth``: whether the run carries its error."""
         check_max_step(self._plan, t, self.stepper.interface.words)
         states = self.stepper._states
         q, p = map(states.block, states.pair(q, p))
@@ -645,10 +645,15 @@ class Memory:
         return values[0], values[1]
 
     @property
-    def _growth(self) -> tuple[float, float] | None:
-        """Largest logarithm g of the growth of the tangent vector, and the largest g - mean g."""
-        samples = self._can_measure_growth and self._memory.growth_samples
-        return (self._memory.growth, self._memory.growth_excess) if samples else None
+    def _growth(self) -> tuple[float, float, float, float] | None:
+        """Largest error relative to the motion, the one that is reported, and the times until which it and 1e-2 hold.
+
+        ``None`` if the run does not carry its error, or if its steps were too large for that.
+        """
+        memory = self._memory
+        if not (self._can_measure_growth and memory.tangent_steps):
+            return None
+        return memory.growth, memory.growth_limit, memory.accurate_until, memory.meaningful_until
 
     @property
     def _leaving(self) -> bool:

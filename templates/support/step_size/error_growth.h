@@ -1,46 +1,43 @@
 #include "../run/run.h"
 
-/* Growth of errors along an adaptive run: the size of one tangent vector (dq, dv) relative to the motion, the largest
- * distance from the start and the largest velocity, which depend neither on the origin nor on a gauge. It solves the
- * variational equations along each accepted step,
+/* Error of the positions along a run: a tangent vector rho = (dq, dv) that starts at zero and is carried by each step
+ * phi, while the errors that the step makes are added,
+ *   rho' = D phi(x) (rho + d) - d + r,      d_i = +-.42 u |q_i|,      r_i = +-max(u, c tolerance) |dq_i|,
+ * d the rounding of the positions at which forces are evaluated, r the error of the step (of positions alone), with
+ * random signs. The largest |rho_i| relative to the range of q_i in the run estimates the error of the run, also where
+ * a motion amplifies errors; it depends neither on the origin nor on a gauge.
+ *
+ * D phi is that of the variational equations along each accepted step,
  *   dq'' = F_q dq / m,      or      L_vv dq'' = -E_q dq - E_v dv   (VARIABLE_ACCELERATIONS),
  * with E(q, v, a) the Euler-Lagrange residual at knots c_n h, which are Gauss points, as many as those of the step in
  * vectors of eight lanes, or half as many; derivatives there are evaluated in SIMD lanes. The collocation equations
  *   dq_n = dq + c_n h dv + h^2 sum_j P_nj dq''_j,      dv_n = dv + h sum_j Q_nj dq''_j
  * are solved by Picard iterations (Hairer, Norsett & Wanner, Solving ODEs I, sec. I.8) from Taylor's polynomial at the
- * end of the step before; with four knots in two halves of a large step. In one of `measures_growth` steps, which
- * are OF_SMALL_STEPS unless steps are large, the vector is projected on the energy surface (in the metric of the
- * sizes of the motion): its part along the gradient of the energy, which is conserved, grows by the error of the
- * iterations only. Requires: the iteration, tables, the number GROWTH_DERIVATIVES of distinct derivatives at a
- * point, OF_SMALL_STEPS, the kernels point_derivatives and derivative_product; with VARIABLE_ACCELERATIONS
- * energy_gradient. */
+ * end of the step before; with four knots in two halves of a large step. Requires: the iteration, tables, the numbers
+ * GROWTH_DERIVATIVES of distinct derivatives at a point and PART_OF_TOLERANCE, c, the kernels point_derivatives and
+ * derivative_product. */
 
-#define LEAST_GROWTH 9.9 /* logarithm: of less, the difference to the mean is not measured */
-#define LARGEST_GROWTH 100.0 /* logarithm: beyond it the growth is known; below the reciprocal numbers underflow */
 #define LARGEST_SQUARE 1e140 /* of sizes: the products of two are numbers */
 #define MOST_ITERATIONS 30
-#define LOG_2 0.6931471805599453
 
-#ifdef ENERGY_CONSERVED
-#define LESS 1.0
-#define KNOWN(growth) ((growth) >= LARGEST_GROWTH)
-#define INITIAL(x, change) (x)
-#else
-#define LESS 0.0016 /* no projection reduces the error */
-#define KNOWN(growth) (fabs(growth) >= LARGEST_GROWTH) /* damping reduces errors */
-#define INITIAL(x, change) ((x) + (change)) /* motions often start at rest at the origin */
-#endif
+/* One in so many steps adds the errors of all, times the root of their number, since signs are random. */
+#define STEPS_OF_ERRORS 8
+#define LARGE_STEPS_OF_ERRORS 2 /* where the tolerance exceeds LARGE_TOLERANCE */
+#define LARGE_TOLERANCE 1e-7
+#define ROUNDING (0.42 * (REAL_EPSILON / 2)) /* relative, in the mean: u / sqrt(3) for 1, half of it below 2 */
+#define TEN_DIGITS 1e-10 /* ten digits are left: no warning, nor.. */
+#define FAR_ABOVE 1e4 /* .. where the tolerance is exceeded by less, */
+#define MEANINGLESS 1e-2 /* but always beyond this error */
+#define MOVES 512.0 /* in units of rounding: coordinates that move by less have the size of the largest one */
 
-/* Iteration k ends if its change of h^2 dq'' leaves errors that are small beside the vector, by squares of both: where
- * accelerations depend on the positions alone, the next one changes the step by about |h^2 dq''| / (2 k)^4 of it. By
- * larger limits regular orbits of large steps show exponential growth. */
+/* An iteration ends if its change of h^2 dq'' leaves errors that are small beside the vector, by squares: where limits
+ * are larger, regular orbits of large steps show exponential growth, and encounters too much of it. */
 #ifdef VARIABLE_ACCELERATIONS
 enum { TANGENT = 2 * M }; /* numbers of a tangent vector on which accelerations depend */
-#define IS_SMALL(change, k, size, rate) ((void)(rate), (change) <= (0.0003 * LESS) * (size))
+#define SMALL 4.8e-7
 #else
 enum { TANGENT = M };
-#define IS_SMALL(change, k, size, rate) \
-  ((change) * ((rate) + (change)) <= (0.004 * LESS) * ((double)((k) * (k) * (k) * (k)) * ((size) * (size))))
+#define SMALL 1e-8
 #endif
 
 /* Taylor's coefficients h^k dq^(k) / k!, k < 5, or the knots are columns of the tables: whole vectors of any length. */
@@ -209,12 +206,23 @@ static inline void rescale_tangent(run_memory *run, double h)
   run->tangent_h = h;
 }
 
+/* Ends the measurement by numbers that are too large to be squared: of errors beyond the motion, or of the motion. */
+static inline void end_measurement(run_memory *run)
+{
+  int beyond = 0;
+  for (int i = 0; i < M; i++)
+    beyond |= !(fabs(run->tangent[i][0]) <= run->highest[i] - run->lowest[i]);
+  run->growth = INFINITY;
+  run->tangent_steps = beyond ? run->tangent_steps : 0;
+  run->measures_growth = 0;
+}
+
 /* Advances the tangent vector by a step, of size h, or by one of its halves (part 1 or 2); ends the measurement if the
  * iterations diverge. */
 static inline void advance_tangent(
     run_memory *run, const step_data *step, const iteration_data *data, coordinates *X, int part, double h)
 {
-  double size = 0.0, rate = 0.0, change, stored[M][KNOTS_STORED];
+  double size = 0.0, change, stored[M][KNOTS_STORED];
   int k = 0, is_resolved = 0;
   tangent_knots at;
   lanes a[KNOT_GROUPS][M], before[KNOT_GROUPS][M];
@@ -222,7 +230,6 @@ static inline void advance_tangent(
   for (int i = 0; i < M; i++) {
     const double *of = run->tangent[i];
     size += of[0] * of[0] + 0.25 * (of[1] * of[1]);
-    rate += 4.0 * (of[2] * of[2]) + 36.0 * (of[3] * of[3]);
   }
   linearise_accelerations(run, step, data, X, part, h, &at);
   begin_tangents(run->tangent, a, &at);
@@ -240,138 +247,94 @@ static inline void advance_tangent(
     }
     IN_MEMORY(stored);
     change = lanes_total(sum) * (1.0 / KNOTS_STORED);
-    is_resolved = IS_SMALL(change, k, size, rate);
+    is_resolved = change <= SMALL * size;
   }
   if (!is_resolved)
-    run->measures_growth = run->growth_samples = 0;
+    run->measures_growth = run->tangent_steps = 0;
   end_tangents(run->tangent, stored);
+  if (!(size < LARGEST_SQUARE))
+    end_measurement(run);
 }
 
-/* Logarithm to base 2, linear between powers of two: less than .09 too small; 0 below normal numbers. */
-static inline double logarithm(double x)
+/* x with the sign of the lowest bit. */
+static inline double with_sign(double x, unsigned long long bits)
 {
-  long long bits;
-  memcpy(&bits, &x, sizeof bits);
-  return (double)bits * 0x1p-52 - 1023.0;
+  unsigned long long of;
+  memcpy(&of, &x, sizeof of);
+  of ^= bits << 63;
+  memcpy(&x, &of, sizeof of);
+  return x;
 }
 
-/* Velocities v and the gradient of the energy with respect to (q, v) at the end q of the step. */
-static inline void end_gradient(const run_memory *run, const step_data *step, const iteration_data *data,
-    const double *q, const double *dp, double *v, double *by_q, double *by_v)
+/* Adds the rounding d of the positions at the start of the step, for a number of steps whose root is `weight`. */
+static inline void add_rounding(run_memory *run, const step_data *step, double weight, double *rounding)
 {
-  lanes F[GROUPS][M]; /* forces, or velocities */
-  lanes_load(run->memory, F);
-#ifdef VARIABLE_ACCELERATIONS
-  (void)data, (void)dp;
+  unsigned long long bits = (unsigned long long)run->signs;
+  bits ^= bits << 13, bits ^= bits >> 7, bits ^= bits << 17; /* xorshift (Marsaglia 2003) */
+  run->signs = (long long)bits;
+  for (int i = 0; i < M; i++) {
+    rounding[i] = with_sign(ROUNDING * weight * step->q0[i], bits >> i % 24);
+    run->tangent[i][0] += rounding[i];
+  }
+}
+
+/* Replaces that rounding by the error r of the step, and compares rho with the ranges of the motion so far. */
+static inline void add_error(run_memory *run, const step_data *step, const double *dq, double error,
+    const double *rounding, double tolerance)
+{
+  double size[M], largest = 0.0, ratio = 0.0;
+  for (int i = 0; i < M; i++) {
+    const double q = step->q0[i] + dq[i];
+    run->tangent[i][0] += with_sign(error * dq[i], (unsigned long long)run->signs >> (24 + i % 24)) - rounding[i];
+    run->largest_error[i] = larger(run->largest_error[i], fabs(run->tangent[i][0]));
+    run->lowest[i] = q < run->lowest[i] ? q : run->lowest[i];
+    run->highest[i] = larger(run->highest[i], q);
+    size[i] = run->highest[i] - run->lowest[i];
+  }
+  enlarge_to_arrays(size);
   for (int i = 0; i < M; i++)
-    v[i] = weigh(AT_END, F, i);
-#ifdef ENERGY_CONSERVED
-  lanes u[2 * M], value[2 * M];
+    largest = larger(largest, size[i]);
   for (int i = 0; i < M; i++) {
-    u[i] = lanes_of(q[i]);
-    u[M + i] = lanes_of(v[i]);
+    const double value = larger(largest, larger(fabs(run->highest[i]), fabs(run->lowest[i])));
+    size[i] = size[i] > MOVES * (REAL_EPSILON / 2) * value ? size[i] : largest + DBL_MIN;
+    ratio = larger(ratio, run->largest_error[i] / size[i]);
   }
-  energy_gradient(u, lanes_of(step->t), step->parameters, value);
-  for (int i = 0; i < M; i++) {
-    by_q[i] = value[i][0];
-    by_v[i] = value[M + i][0];
-  }
-#else
-  (void)q, (void)step, (void)by_q, (void)by_v;
-#endif
-#else
-  (void)q;
-  for (int i = 0; i < M; i++) {
-    by_q[i] = -weigh(AT_END, F, i);
-    by_v[i] = step->p0[i] + dp[i];
-    v[i] = data->inverse_mass[i] * by_v[i];
-  }
-#endif
+  run->growth = ratio;
+  run->growth_limit = smaller(larger(TEN_DIGITS, FAR_ABOVE * tolerance), MEANINGLESS);
+  if (ratio <= run->growth_limit)
+    run->accurate_until = step->t + step->h;
+  if (ratio <= MEANINGLESS)
+    run->meaningful_until = step->t + step->h;
 }
 
-/* Projects the tangent vector on the energy surface at the end of the step and measures it, if there is a motion.
- * Exponential growth is that of its size max(dq, dv Q / V) with the sizes Q, V of the motion: relative to a motion that
- * is itself amplified rounding, as one from rest at an unstable equilibrium, it would be constant. */
-static inline void sample_growth(run_memory *run, const step_data *step, const iteration_data *data, const double *dq,
-    const double *dp)
+/* Advances the error rho by an accepted step with increments dq; the first steps and the last one add errors. */
+static __attribute__((noinline)) void measure_growth(run_memory *run, const step_data *step, const solver_data *data,
+    coordinates *X, const double *dq, double tolerance, int last)
 {
-  const double inverse = 1.0 / run->tangent_h;
-  double q[M], v[M], tangent_v[M], by_q[M], by_v[M], q2 = 0.0, v2 = 0.0, dq2 = 0.0, dv2 = 0.0;
-  double size, growth, logarithm_q;
-#ifdef ENERGY_CONSERVED
-  double along = 0.0, square = 0.0;
-#endif
-  for (int i = 0; i < M; i++) {
-    q[i] = step->q0[i] + dq[i];
-    tangent_v[i] = inverse * run->tangent[i][1];
-  }
-  end_gradient(run, step, data, q, dp, v, by_q, by_v);
-  for (int i = 0; i < M; i++) {
-    const double away = (step->q0[i] - run->growth_start[i]) + dq[i];
-    q2 += away * away;
-    v2 += v[i] * v[i];
-  }
-  q2 = run->largest_q2 = larger(run->largest_q2, q2);
-  v2 = run->largest_v2 = larger(run->largest_v2, v2);
-  if (q2 == 0 || v2 == 0)
-    return;
-#ifdef ENERGY_CONSERVED
-  for (int i = 0; i < M; i++)
-    square += by_q[i] * by_q[i] * q2 + by_v[i] * by_v[i] * v2;
-  square = 1.0 / square; /* before the tangent vector is known, for which the next step waits */
-  for (int i = 0; i < M; i++)
-    along += by_v[i] * tangent_v[i] + by_q[i] * run->tangent[i][0];
-  along *= square;
-  for (int i = 0; i < M; i++) {
-    run->tangent[i][0] -= along * q2 * by_q[i];
-    tangent_v[i] -= along * v2 * by_v[i];
-    run->tangent[i][1] = run->tangent_h * tangent_v[i];
-  }
-#endif
-  for (int i = 0; i < M; i++) {
-    dq2 += run->tangent[i][0] * run->tangent[i][0];
-    dv2 += tangent_v[i] * tangent_v[i];
-  }
-  logarithm_q = logarithm(q2);
-  size = larger(logarithm(dq2), logarithm(dv2) + logarithm_q - logarithm(v2));
-  growth = 0.5 * LOG_2 * (size - logarithm_q);
-  size *= 0.5 * LOG_2;
-  run->growth = run->growth_samples > 0 ? larger(run->growth, growth) : growth;
-  run->growth_sum += size;
-  run->growth_samples++;
-  if (growth >= LEAST_GROWTH)
-    run->growth_excess = larger(run->growth_excess, size - run->growth_sum / (double)run->growth_samples);
-  if (!(fabs(growth) < LARGEST_GROWTH && larger(q2, v2) < LARGEST_SQUARE)) {
-    run->measures_growth = 0;
-    run->growth_samples = KNOWN(growth) ? run->growth_samples : 0;
-  }
-}
-
-/* Advances the tangent vector, which starts as a relative perturbation of the state, by an accepted step. */
-static __attribute__((noinline)) void measure_growth(run_memory *run, const step_data *step,
-    const iteration_data *data, coordinates *X, const double *dq, const double *dp)
-{
+  const long long since = run->tangent_steps - run->added;
+  const int most = tolerance > LARGE_TOLERANCE ? LARGE_STEPS_OF_ERRORS : STEPS_OF_ERRORS;
+  const int adds = since >= most || run->tangent_steps < STEPS_OF_ERRORS || last;
+  const double weight = adds ? sqrt((double)(since > 0 ? since : 1)) : 0.0;
+  double rounding[M];
   if (run->tangent_steps == 0) {
     run->tangent_h = step->h;
-#ifdef VARIABLE_ACCELERATIONS
-    lanes V[GROUPS][M];
-    lanes_load(run->memory, V);
-#endif
-    for (int i = 0; i < M; i++) {
-      run->growth_start[i] = step->q0[i];
-      run->tangent[i][0] = INITIAL(step->q0[i], dq[i]) * cos(i);
-#ifdef VARIABLE_ACCELERATIONS
-      run->tangent[i][1] = INITIAL(step->h * at_first(&V[0][i]), dq[i]) * cos(i + 1);
-#else
-      run->tangent[i][1] = INITIAL(step->h * data->inverse_mass[i] * step->p0[i], dq[i]) * cos(i + 1);
-#endif
-    }
+    run->signs = 0x1E3779B97F4A7C15LL;
+    run->accurate_until = run->meaningful_until = step->t;
+    for (int i = 0; i < M; i++)
+      run->lowest[i] = run->highest[i] = step->q0[i];
   }
-  if (run->measures_growth < OF_SMALL_STEPS && KNOTS <= 4) {
+  if (adds)
+    add_rounding(run, step, weight, rounding);
+  if (tolerance > LARGE_TOLERANCE && KNOTS <= 4) {
     advance_tangent(run, step, data, X, 1, 0.5 * step->h);
     advance_tangent(run, step, data, X, 2, 0.5 * step->h);
   } else
     advance_tangent(run, step, data, X, 0, step->h);
-  if (run->measures_growth && (run->tangent_steps++ & (run->measures_growth - 1)) == 0)
-    sample_growth(run, step, data, dq, dp);
+  if (!run->measures_growth)
+    return;
+  if (adds) {
+    add_error(run, step, dq, larger(REAL_EPSILON / 2, PART_OF_TOLERANCE * tolerance) * weight, rounding, tolerance);
+    run->added = run->tangent_steps;
+  }
+  run->tangent_steps++;
 }

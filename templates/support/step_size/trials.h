@@ -959,9 +959,9 @@ static inline void accept_trial(run_memory *run, trial *now)
 #else
 #ifdef ERROR_GROWTH
   if (by_newton(now))
-    run->measures_growth = run->growth_samples = 0; /* it has no points for the tangent vector */
+    run->measures_growth = run->tangent_steps = 0; /* it has no points for the tangent vector */
   if (run->measures_growth)
-    measure_growth(run, &now->step, &now->data, now->points, now->dq, now->dp);
+    measure_growth(run, &now->step, &now->data, now->points, now->dq, now->control->tolerance, now->last);
 #endif
 #ifdef RUN_ACTION
   add_action(run, &now->step, &now->data, now->guess);
