@@ -70,6 +70,19 @@ class StageCurve:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class MassGrowth:
+    """Growth of masses with time and by damping, for the error estimates of curves of velocities.
+
+    Attributes:
+        kernel: rates damping + d log M_ii/dt, m values, at u = (q, v), or (q, p) of a Hamiltonian.
+        abscissae: of the velocities that a step stores, in units of the step.
+    """
+
+    kernel: Kernel
+    abscissae: tuple[Number, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Layout(ArrayDeclarations):
     """Arrays and parameters of a system; a named coordinate is an array without axes.
 
@@ -260,6 +273,7 @@ class Program:
         constraints: their kernels, or ``None``.
         rattle: the iteration for the multipliers, which is tried before Newton's method if applicable.
         damping: the rate of a uniform damping, if there is one.
+        mass_growth: of masses relative to velocities; ``None`` if they are constant in time and not damped.
         summed: whether the action is summed also where it is no function of both ends of a step.
         acts_along: whether runs sum the action of their steps.
         bath: heat bath before and after each step of a run, or ``None``.
@@ -279,6 +293,7 @@ class Program:
     constraints: Constraints | None = None
     rattle: Rattle | None = None
     damping: Kernel | None = None
+    mass_growth: MassGrowth | None = None
     summed: bool = False
     acts_along: bool = False
     bath: HeatBath | None = None

@@ -19,6 +19,7 @@ from scvi_codegen.codegen.ir.program import (
     ArrayProgram,
     Integrals,
     Layout,
+    MassGrowth,
     MomentumMap,
     Program,
     Quantities,
@@ -214,6 +215,7 @@ def lower(
         constraints=lowered_constraints(system) if system.constraints else None,
         rattle=rattle_of(system, stages, equations.extrapolation) if system.constraints and solver == "auto" else None,
         damping=damping_kernel(system),
+        mass_growth=_mass_growth(system, stages),
     )
 
 
@@ -411,6 +413,31 @@ def _stage_curve(stages: StageSystem) -> StageCurve | None:
     highest, below = (lower_vector((*before, *top, *behind)) for top in tops)
     return StageCurve(
         highest=highest, next=below, curvatures=(lower_vector(rows[0]), lower_vector(rows[1])), power=power
+    )
+
+
+def _mass_growth(system: MechanicalSystem, stages: StageSystem) -> MassGrowth | None:
+    """Return the rates at which masses grow in steps whose unknowns are velocities; ``None`` if all are 0.
+
+    Rates gamma + d log M_ii/dt of a Lagrangian, gamma - d log H_pp,ii/dt of a Hamiltonian; of an entry M_ii = 0 gamma.
+    """
+    shape, forms = stages.shape, forms_of(system)
+    if not (isinstance(shape, Velocities) and _moves(stages, shape)) or forms.one_form:
+        return None
+    masses = forms.legendre_jacobian or forms.mass
+    diagonal = {i: entry for (i, j), entry in masses.items() if i == j} if system.depends_on_time else {}
+    sign = -1 if system.auxiliaries else 1
+    rates = [system.damping] * system.dimension
+    for i, entry in diagonal.items():
+        for derivative in gradient_tuple(entry, (system.time,)):
+            rates[i] += sign * derivative / entry
+    if not any(rates):
+        return None
+    has_end_velocity = any((block.letter, block.index) == END_VELOCITY for block in stages.blocks)
+    u, purpose = forms.legendre_arguments, "Rates of masses and damping, gamma + d log M_ii/dt."
+    return MassGrowth(
+        kernel=system_kernel(system, "mass_growth", rates, u=u, purpose=purpose),
+        abscissae=lower_vector((*shape.blocks, *((mp.one,) if has_end_velocity else ()))),
     )
 
 

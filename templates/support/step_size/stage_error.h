@@ -45,22 +45,23 @@ static real error_beyond(const step_data *step, const real *z, const stage_sizes
   return least;
 }
 
-/* The same. Constraints hold to the rounding of positions and of their own terms, however short the step is, and to
- * that of reactions. The latter two are determined where the error exceeds `doubtful` without them, `least` or more. */
-static real stage_error(const step_data *step, const real *z, const real *dq, real share, real decay, real least,
-    real doubtful)
+/* The same of one of the curves of a step with unknowns v. Constraints hold to the rounding of positions and of their
+ * own terms, however short the step is, and to that of reactions. The latter two are determined where the error exceeds
+ * `doubtful` without them, `least` or more. */
+static real error_of_stages(const step_data *step, const real *z, const real *v, const real *dq, real share,
+    real decay, real least, real doubtful)
 {
   real fastest = 0, farthest = 0, error;
   const section all = {0, M};
   stage_sizes of = {.largest = 0};
   for (int i = 0; i < M; i++) {
-    const real curvature = curvature_of_stages(step, z, i);
+    const real curvature = curvature_of_stages(step, v, i);
     const real motion = motion_of_step(step, step->h, MATH(fabs)(dq[i]), curvature, i);
-    of.curvature[i] = curvature;
+    of.curvature[i] = z == v ? curvature : curvature_of_stages(step, z, i);
     of.size[i] = motion;
     of.rounding[i] = rounding_of_force(step->q0[i], curvature_size(step->motion_of, step->h, curvature, i), motion);
 #ifdef FEW_STAGE_COEFFICIENTS
-    of.size[i] = size_for_few(step->motion_of, step->h, motion, curvature, i);
+    of.size[i] = size_for_few(step->motion_of, step->h, motion, of.curvature[i], i);
 #endif
     fastest = larger(fastest, MATH(fabs)(dq[i]));
     farthest = larger(farthest, MATH(fabs)(step->q0[i]) + MATH(fabs)(dq[i]));
@@ -80,10 +81,22 @@ static real stage_error(const step_data *step, const real *z, const real *dq, re
   return error;
 }
 
+/* The larger error of the velocities and, where masses grow, of the momenta. */
+static real stage_error(const step_data *step, const real *z, const real *dq, real share, real decay, real least,
+    real doubtful)
+{
+#ifdef MASSES_GROW
+  real grown[M * B] = {0};
+  grow_velocities(step, z, B, grown);
+  least = error_of_stages(step, grown, z, dq, share, 0, least, larger(least, doubtful));
+#endif
+  return error_of_stages(step, z, z, dq, share, decay, least, larger(least, doubtful));
+}
+
 /* The same test without the sizes: returns 0 if no coefficient exceeds `least` relative to `motion`, the size of the
  * largest coordinate or less, to which that of every coordinate is added, or the rounding error of constrained
  * positions. */
-static inline int stages_may_exceed(const step_data *step, const real *z, real motion, real decay, real least)
+static inline int curve_of_stages_may_exceed(const step_data *step, const real *z, real motion, real decay, real least)
 {
   const real unit = 1 / (motion + REAL_MIN);
   real farthest = 0;
@@ -102,6 +115,17 @@ static inline int stages_may_exceed(const step_data *step, const real *z, real m
     exceeded |= !(top * top <= least * (2 * unit * curvature_of_stages(step, z, i) + NEGLIGIBLE));
   }
   return exceeded;
+}
+
+static inline int stages_may_exceed(const step_data *step, const real *z, real motion, real decay, real least)
+{
+#ifdef MASSES_GROW
+  real grown[M * B] = {0};
+  grow_velocities(step, z, B, grown);
+  if (curve_of_stages_may_exceed(step, grown, motion, 0, least))
+    return 1;
+#endif
+  return curve_of_stages_may_exceed(step, z, motion, decay, least);
 }
 
 /* Lets V and A contain a solved step. */
