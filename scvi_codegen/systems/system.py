@@ -384,6 +384,14 @@ class MechanicalSystem(Deferred, ABC):
         return any(parts_of_type(kind, *formulas) for kind in (exp, HyperbolicFunction))
 
     @property
+    def resists_motion(self) -> bool:
+        """True if forces depend, or by intermediate quantities may depend, on velocities or momenta."""
+        from scvi_codegen.systems.formulas.intermediates import intermediates
+
+        rates = {*self.velocities, *self.auxiliaries}
+        return any(rates & force.free_symbols or intermediates(force) for force in self.forces)
+
+    @property
     def balances_energy(self) -> bool:
         """True if the energy changes by the work of forces, damping and contacts only."""
         works = self._constraints_work()

@@ -447,6 +447,7 @@ class Control:
         arrays: first and end of the named coordinates of each array of known size, rotation or direction, which are to
             be accurate as a whole.
         localised: whether forces may be confined to a short time or a small region.
+        friction: whether forces depend on velocities, so that transients may be short.
     """
 
     code: str
@@ -458,6 +459,7 @@ class Control:
     growth: ErrorGrowth | None = None
     arrays: tuple[tuple[int, int], ...] = ()
     localised: bool = False
+    friction: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -92,6 +92,7 @@ def control_of(
         stage_growth=2.0 ** (stage_curve.power / LEVELS_PER_BINADE) if stage_curve else 0.0,
         arrays=program.layout.whole,
         localised=system is not None and system.has_localised_forces,
+        friction=program.newton and system is not None and system.resists_motion,
     )
 
 

@@ -842,12 +842,51 @@ static SELDOM int passes_over_force(const trial *now, real allowed, const solver
 #endif
 }
 
+#if defined(FRICTION) && defined(NEWTON_ALONE)
+#define PART_OF_TRANSIENT 16 /* ratio of the parts of a step in which its transient is sought */
+#define UNSEEN_PARTS 2 /* successive ones whose differences are rounding: then there is none */
+
+/* Error by the transient at the start of a step: of positions relative to the motion of the step, of momenta relative to
+ * their size. Friction at a rate c ends
+ * the transient of a start at another velocity, by d, than the slow motion has, within 1/c, and displaces by d/c. Gauss
+ * stages of h >> 1/c are those of the slow motion, and a step and its halves differ by only about 12 d/(c^2 h), but
+ * parts of about 1/c differ by d/c (Hairer & Wanner, Solving ODEs II, sec. IV.15). So parts of h/16, h/256, .. are
+ * compared with their halves, as long as the difference, relative to the whole step, increases. */
+static SELDOM real transient_error(const trial *now, const solver_options *options)
+{
+  const step_data *step = &now->step;
+  real h = step->h, largest = 0, of_momenta = 0;
+  real whole[M], halves[M], impulse[M], changes[M], first[M];
+  for (int unseen = 0; unseen < UNSEEN_PARTS;) {
+    real apart, far = 0;
+    h /= PART_OF_TRANSIENT;
+    step_data part = part_of_step(step, h);
+    set_zero(step, whole), set_zero(step, impulse);
+    if (add_part(&part, options, whole, impulse) != OK ||
+        solve_halves(step, h, NULL, NULL, options, halves, changes, first) != OK)
+      break;
+    apart = difference(step, h, step->q0, whole, halves, &far) * (h / step->h);
+    if (largest > 0 && apart <= largest)
+      break;
+    unseen += !(apart > 0);
+    largest = larger(largest, apart);
+    of_momenta = larger(of_momenta, difference(step, h, step->p0, impulse, changes, &far));
+  }
+  return larger(largest, of_momenta);
+}
+#else
+#define transient_error(now, options) 0
+#endif
+
 /* Compares a step with its half steps and shortens it while the difference is far above its error estimate, or, a
- * limited number of times, a force sets in at its end or is passed over. */
+ * limited number of times, a force sets in at its end or is passed over. A first step is shortened, too, while the
+ * transient at its start is above the tolerance. */
 static SELDOM int compare_step(run_memory *run, trial *now, int steps_to_compare, const solver_options *options,
     solver_report *report)
 {
   int examined = steps_to_compare || is_leap(run, now) ? MOST_EXAMINED : 0;
+  const int begins = run->error_before == 0;
+  const real tolerance = larger(MATH(pow)(now->limits.most, ERROR_POWER), ROUNDOFF_LEVEL);
   const real allowed = larger(
       ALLOWED_TO_HALVES * MATH(pow)(now->limits.most, ERROR_POWER),
       ONE_COEFFICIENT || steps_to_compare ? ROUNDOFF_LEVEL : SPURIOUS);
@@ -856,6 +895,8 @@ static SELDOM int compare_step(run_memory *run, trial *now, int steps_to_compare
     const int status = compare_trial(run, now, steps_to_compare, options, &apart);
     if (status > STATUS(SPURIOUS_SOLUTION))
       return status;
+    if (begins)
+      apart = larger(apart, transient_error(now, options) * (allowed / tolerance));
     if (status == OK && apart <= allowed &&
         !(examined-- > 0 &&
             (force_sets_in(now, options) || passes_over_force(now, allowed, options)))) {
