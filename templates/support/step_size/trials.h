@@ -592,10 +592,12 @@ static SELDOM void avoid_size(run_memory *run, trial *now)
 
 #ifdef NEWTON_ADMITTED
 /* Returns 1 if a step that is larger by so many levels than the one before may have an admissible error: that of its
- * curve, which is still stored, grows to no more, or is rounding. Displacements are the largest so far. */
+ * curve, which is still stored, grows to no more, or is rounding, or what the iteration leaves of its last update: its
+ * tolerance, relative to the motion. Displacements are the largest so far. */
 static SELDOM int may_grow(const run_memory *run, const trial *now, int levels)
 {
-  const real rounding = limits_of(ROUNDOFF_ERROR).least, most = error_at(now->limits.most, -levels);
+  const real iterated = RESOLVED * ITERATION_PART * MATH(pow)(now->limits.most, ERROR_POWER);
+  const real rounding = larger(limits_of(ROUNDOFF_ERROR).least, iterated), most = error_at(now->limits.most, -levels);
   step_data before = now->step;
   solver_data data = now->data;
   real moved[M];
@@ -963,6 +965,24 @@ static inline int even_out(const run_memory *run, const trial *now, int change)
 }
 #endif
 
+/* Lets Newton's method solve the next steps where the number of iterations limits their size but never so much that one
+ * fails, as with friction that becomes stiff: if the error admits steps so much larger that they take less time. Asked
+ * in one of AVOIDED steps, when the next one was chosen. */
+static inline void change_to_newton(run_memory *run, const trial *now, int is_limited, real error)
+{
+#ifdef NEWTON_ADMITTED
+  const int change = (int)run->change + GAIN_OF_NEWTON;
+  if (!is_limited || by_newton(now) || run->avoiding != 0 || run->step % AVOIDED != 0)
+    return;
+  if (levels_within(run, now, GAIN_OF_NEWTON) < GAIN_OF_NEWTON || !may_grow(run, now, change))
+    return;
+  run->avoiding = -AVOIDED;
+  run->change = change;
+  run->grid_level += GAIN_OF_NEWTON;
+  run->error_before = error_at(error, change);
+#endif
+}
+
 /* Chooses the size of the next step. The error of a loose tolerance may allow steps at which the iteration fails: the
  * size of such a step is not tried again for some steps (cf. Hairer & Wanner, Solving ODEs II, IV.8). */
 static inline void choose_size(run_memory *run, const trial *now)
@@ -970,7 +990,8 @@ static inline void choose_size(run_memory *run, const trial *now)
   const real error = larger(now->error, TRUSTED_DECREASE * run->error_before);
   int change = next_change(run, error, run->error_before, &now->limits);
   const int most = limit_by_iterations(run, now);
-  change = change < most ? change : most;
+  const int is_limited = change > most;
+  change = is_limited ? most : change;
 #ifdef NEWTON_IN_PLACE
   run->avoiding += run->avoiding < 0;
 #endif
@@ -985,6 +1006,7 @@ static inline void choose_size(run_memory *run, const trial *now)
   run->change = change;
   run->grid_level += change;
   run->error_before = error_at(error, change);
+  change_to_newton(run, now, is_limited, error);
 }
 
 /* Reduces the size of the next step of a continued run to the largest one. */
