@@ -8,7 +8,7 @@ bandwidth 1, a closed one 2, and if all coordinates are coupled the band is the 
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 import sympy
@@ -21,12 +21,12 @@ from scvi_codegen.common.errors import MethodError
 from scvi_codegen.common.precision import DIGITS, mp
 from scvi_codegen.methods.stage_system import Gather, Scatter, StageGroup, StageSystem, Table
 from scvi_codegen.systems.arrays.system import ArraySystem
-from scvi_codegen.systems.derived_expressions import auxiliary_multipliers, curve_rates, multipliers
+from scvi_codegen.systems.derived_expressions import auxiliary_multipliers, curve_rates, forms_of, multipliers
 from scvi_codegen.systems.formulas.array_statements import ArrayForce
 from scvi_codegen.systems.formulas.arrays import ArrayTerm
 from scvi_codegen.systems.formulas.expressions import Tape, jacobian, tangents
 from scvi_codegen.systems.formulas.indices import Access
-from scvi_codegen.systems.formulas.intermediates import inner_of, separated, symbols_of
+from scvi_codegen.systems.formulas.intermediates import inner_of, parts, separated, symbols_of
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
 from scvi_codegen.systems.symmetry.symmetry import work_rates
 from scvi_codegen.systems.system import MechanicalSystem
@@ -68,17 +68,53 @@ def system_kernel(
         paired: whether its sums have short chains of operations instead of few operations.
         of_rounding: whether it computes bounds of the rounding errors of the values instead.
     """
+    values, partials = regular_at_roots(system, tuple(values)), regular_at_roots(system, tuple(partials))
     kernel = lower_kernel(
         name,
         arguments=tuple(u),
         time=system.time,
         parameters=system.parameters,
-        values=tuple(values),
-        partials=tuple(partials),
+        values=values,
+        partials=partials,
         paired=paired,
         of_rounding=of_rounding,
     )
     return replace(kernel, purpose=purpose)
+
+
+LEAST_BASE = sympy.Rational(1, 2**126)
+"""Least number that a regularised base adds: the smallest normal one in single precision."""
+
+
+def regular_at_roots(system: MechanicalSystem, expressions: tuple[Expr, ...]) -> tuple[Expr, ...]:
+    """Return derivatives of forces such that they are evaluated where these are defined, also at zeros of roots.
+
+    Let momenta and forces contain powers u^r of a base u with 0 < r, no integer, but no negative ones, as sqrt(x^2 +
+    y^2) x: they are defined at u = 0. Then powers u^(r - k), r < k, come from their derivatives alone. Those of first
+    order are u^(r - 1) u_x g, g the other factors of u^r. If u >= 0 is smooth, |u_x| <= C sqrt(u) (Glaeser's
+    inequality), so that this is at most C u^(r - 1/2) |g|: where g = 0 or r > 1/2 its limit is 0, but the factors are
+    infinity and 0. The base u + 2^-126 in negative powers gives finite factors, whose product is 0 at u_x g = 0, and
+    the same bits as u for all u > 2^-72. Where the limit is none (u_x u^(-1/2), the slope of a kink) the result is one
+    of the generalised derivatives of Clarke. Powers that forces themselves contain, as of a collision, remain.
+    """
+    powers = {part for part in parts(*expressions) if _is_root(part) and part.exp < 0}
+    regular = _regular_bases(system) if powers else frozenset()
+    bases = {part: sympy.Pow(part.base + LEAST_BASE, part.exp) for part in powers if part.base in regular}
+    return tuple(expression.xreplace(bases) for expression in expressions) if bases else expressions
+
+
+def _is_root(part: Expr) -> bool:
+    return bool(part.is_Pow and part.exp.is_Rational and not part.exp.is_Integer and part.base.free_symbols)
+
+
+@lru_cache(maxsize=8)
+def _regular_bases(system: MechanicalSystem) -> frozenset[Expr]:
+    """Return the bases of roots in momenta and forces that these contain with positive exponents alone."""
+    forms = forms_of(system)
+    values = (*(forms.legendre if system.auxiliaries else forms.momentum), *forms.force)
+    found = [part for part in parts(*values) if part.is_Pow and part.base.free_symbols]
+    undefined = {part.base for part in found if not part.exp.is_positive}
+    return frozenset(part.base for part in found if _is_root(part)) - undefined
 
 
 def rolled_kernel(
