@@ -162,6 +162,20 @@ def test_double_precision_equals_the_compiled_stepper_and_single_is_close(case, 
     assert np.abs(single - expected).max() < 1e-4 * size
 
 
+def test_powers_in_single_precision_do_not_underflow_before_their_result(tmp_path):
+    """x^(-3/2) of squared distances in metres: (1/x)^2 is 0 from 1e23 on, and bodies in SI units moved straight on."""
+    source, _ = sc.generate_source(sc.problem("kepler").system, sc.SVI(1), prefix="body", embedded="single")
+    body = source.code[source.code.index("inverse_root_3(") :].partition("{")[2].partition("}")[0]
+    (tmp_path / "root.c").write_text(
+        "#include <math.h>\n#include <stdio.h>\n#define BODY_MATH(f) sqrtf\ntypedef float body_real;\n"
+        f"static float power(float x) {{{body}}}\n"
+        'int main(void) { for (float x = 1e-20f; x < 1e24f; x *= 10.f) printf("%.9g %.9g\\n", x, power(x)); }\n'
+    )
+    run(["cc", "root.c", "-lm", "-o", "root"], tmp_path)
+    x, found = np.array([line.split() for line in run(["./root"], tmp_path).splitlines()], float).T
+    np.testing.assert_allclose(found, x**-1.5, rtol=3e-7)
+
+
 # A bound for the time of a step.
 
 
