@@ -85,7 +85,11 @@ static inline void forget_motion(run_memory *run, real h)
 {
   for (int k = 0; k < MOTIONS; k++) {
     const real turn = TENTHS * MATH(fabs)(h) * run->largest_a[k], v = run->largest_v[k];
+#ifdef MASSES_GROW /* steps may be longer than the time in which velocities decrease */
+    const real kept = v > 0 ? MATH(exp)(-FORGETTING * (turn / v)) : 1;
+#else
     const real kept = 1 - FORGETTING * (turn < v ? turn / v : 1);
+#endif
     run->largest_v[k] *= kept, run->largest_a[k] *= kept;
     run->largest_dq[k] *= kept, run->largest_bend[k] *= kept;
   }

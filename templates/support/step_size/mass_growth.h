@@ -29,3 +29,15 @@ static void grow_velocities(const step_data *step, const real *v, int apart, rea
       grown[i * apart + n] = v[i * apart + n] * MATH(exp)(smaller(rate * (GROWTH_ABSCISSA[n] - first), MOST_GROWN));
   }
 }
+
+/* Largest |r_i h| of a step of displacements dq. */
+static real growth_of_step(const step_data *step, const real *dq)
+{
+  real u[2 * M], growth[M], largest = 0;
+  for (int i = 0; i < M; i++)
+    u[i] = step->q0[i], u[M + i] = MASS_ARGUMENT(step, dq[i] / step->h, i);
+  mass_growth(u, step->t, step->parameters, growth);
+  for (int i = 0; i < M; i++)
+    largest = larger(largest, is_finite(growth[i]) ? MATH(fabs)(growth[i] * step->h) : 0);
+  return largest;
+}

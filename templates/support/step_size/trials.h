@@ -408,7 +408,9 @@ static SELDOM int levels_of_first(const trial *now, real h, real span)
 
 /* A trial of the search for the first step size. V and A are those of the largest one that is solved: from rest a
  * displacement t^k with k above what the curve represents has a large error relative to itself at any step size, and
- * relative to V and A of a trial a little larger, so that each smaller one would be rejected, too. */
+ * relative to V and A of a trial a little larger, so that each smaller one would be rejected, too. Where masses grow by
+ * e^x in a step the weights of forces, relative to the momentum of an early point, do so, too: a trial of x >> 1 ends far
+ * from any motion, and V of it would admit every error. */
 static inline void try_pilot(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const int inside = now->inside;
@@ -421,7 +423,7 @@ static inline void try_pilot(run_memory *run, trial *now, const solver_options *
   now->inside = 0;
   if (!(now->error < INFINITY) && (inside == AT_START || (inside < 0 && inside >= -LEVELS_OUTSIDE)))
     try_step(run, now, 0, options, report);
-  if (now->error < INFINITY && now->length > now->pilot) {
+  if (now->error < INFINITY && now->length > now->pilot && growth_of_step(&now->step, now->dq) <= 1) {
     now->pilot = now->length;
 #ifdef CONSTRAINED
     now->pilot_error = now->error;
@@ -510,35 +512,6 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
   }
 #endif
 }
-
-#ifdef MASSES_GROW
-/* Lets V and A be those of the largest trial, in the search for the first step, that differs from its halves by no more
- * than their motion. Forces displace a step by at most a multiple of h^2 times the largest one, but where masses grow
- * by e^x in it the weights of forces, relative to the momentum of an early point, do so, too: a step of x >> 1 ends far
- * from any motion, and V of it would admit every error. */
-static SELDOM void confirm_motion(run_memory *run, trial *now, const solver_options *options, solver_report *report)
-{
-  const long long former = run->grid_level;
-  int confirmed = now->pilot == 0;
-  if (!confirmed && now->length != now->pilot) {
-    run->grid_level = level_below(now->pilot);
-    try_pilot(run, now, options, report);
-  }
-  while (!confirmed) {
-    real apart = INFINITY;
-    const run_memory *sizes = now->step.motion_of;
-    now->step.motion_of = NULL;
-    confirmed = now->error < INFINITY && compare_trial(run, now, 0, options, &apart) == OK && apart <= 1;
-    now->step.motion_of = sizes;
-    confirmed |= run->grid_level <= former - MOST_HALVINGS * LEVELS_PER_BINADE;
-    if (!confirmed) {
-      run->grid_level -= LEVELS_PER_BINADE;
-      now->pilot = 0;
-      try_pilot(run, now, options, report);
-    }
-  }
-}
-#endif
 
 /* Levels from the step whose curve is stored down to the next trial, 0 without a predictor. A solved trial stored its
  * own; a failed one left that of the trial before. */
@@ -670,10 +643,6 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
 #ifdef CONSTRAINED
   if (now->pilots_above == 0)
     end_pilots(run, now);
-#endif
-#ifdef MASSES_GROW
-  if (!(run->error_before > 0))
-    confirm_motion(run, now, options, report);
 #endif
   while (now->status == OK && !(now->error <= now->limits.most * GROWTH)) {
     const int failed = run->error_before > 0 && !(now->error < INFINITY);
