@@ -42,7 +42,8 @@ FAILURES = {
     "step size underflow": (
         "the step size is below machine precision",
         "The motion ends there (a collision, a singularity, a mass of 0), or its forces are not smooth. Set t_end "
-        "before that time, or give h (fixed step size)",
+        "before that time, or give h (fixed step size). At the start of a run: the mass matrix is singular or a force "
+        "undefined there (a pole of the coordinates, a spring of length 0): start elsewhere, or use other coordinates",
     ),
     "spurious solution": (
         "the iteration converged to a spurious solution of the stage equations",
