@@ -15,6 +15,7 @@ from pathlib import Path
 
 import samples
 from golden_drivers import arrays_driver, ensemble_driver, run_driver, tangent_driver
+from golden_scenes import SCENES
 from notation import hamilton, lagrange
 
 from scvi_codegen import HamiltonianSystem, LagrangianSystem, as_method, problem, reparametrise
@@ -32,23 +33,28 @@ FLAGS = ("-std=gnu99", *samples.UNOPTIMISED, "-ffp-contract=off", "-w", "-DSCVI_
 
 @dataclass(frozen=True)
 class Program:
-    """C source of an integrator in one file, its header, and a main program."""
+    """C source of an integrator in one file, its header, and a main program; those of a search for events, if any."""
 
     prefix: str
     header: str
     code: str
     main: str
+    search_header: str = ""
+    search: str = ""
 
     @property
     def files(self) -> dict[str, str]:
-        return {f"{self.prefix}.h": self.header, f"{self.prefix}.c": self.code, "main.c": self.main}
+        files = {f"{self.prefix}.h": self.header, f"{self.prefix}.c": self.code, "main.c": self.main}
+        searches = {f"{self.prefix}_events.h": self.search_header, f"{self.prefix}_events.c": self.search}
+        return files | (searches if self.search else {})
 
 
 def of_source(source: Source | None, main: str) -> Program:
     """Return the program in one file."""
     assert source is not None
     whole = source.amalgamated()
-    return Program(whole.prefix, *map(plain, (whole.header, whole.code, main)))
+    texts = (whole.header, whole.code, main, *((whole.beside.header, whole.beside.code) if whole.beside else ()))
+    return Program(whole.prefix, *map(plain, texts))
 
 
 def sources_of(
@@ -327,9 +333,12 @@ TIMED: dict[str, Callable[..., Made]] = {
 """Longer runs, of which times are compared (``golden_speed.py``)."""
 
 
+RECORDED_CELLS = CELLS | TIMED | {name: scene.made for name, scene in SCENES.items()}
+
+
 def program(name: str) -> Program:
     """Generate the program of a cell."""
-    return of_source(*(CELLS | TIMED)[name](name))
+    return of_source(*RECORDED_CELLS[name](name))
 
 
 def plain(text: str) -> str:
@@ -349,7 +358,7 @@ def build(program: Program, folder: Path, flags: Sequence[str] = FLAGS) -> Path:
     for name, text in program.files.items():
         (folder / name).write_text(text)
     target = folder / "program"
-    sources = ["main.c", f"{program.prefix}.c"]
+    sources = [name for name in program.files if name.endswith(".c")]
     command = [*find_compiler(), *flags, *sources, "-lm", "-o", str(target)]
     subprocess.run(command, check=True, cwd=folder)
     return target

@@ -259,3 +259,99 @@ def arrays_driver(
 }}
 """
     )
+
+
+def scene_driver(
+    prefix: str,
+    q: Sequence[float],
+    p: Sequence[float],
+    parameters: Sequence[float],
+    t_end: float,
+    steps: int,
+    *,
+    outputs: int,
+    events: Sequence[int] = (),
+    inputs: Sequence[tuple[Sequence[float], Sequence[Sequence[float]]]] = (),
+    in_tau: bool = False,
+    seed: int | None = None,
+) -> str:
+    """States at equal intervals of a run by adaptive steps, or by ``steps`` fixed ones, with the changes of events.
+
+    Arguments of the program: a change of the initial state, relative to its size, of signs that alternate; and a factor
+    of the number of fixed steps.
+    """
+    m, adaptive = len(q), in_tau or not steps
+    tables = "".join(
+        f"static const double t_{k}[] = {{{numbers(times)}}};\n"
+        f"static const double c_{k}[] = {{{numbers([value for row in rows for value in row])}}};\n"
+        for k, (times, rows) in enumerate(inputs)
+    )
+    if inputs:
+        sets = (f"{{t_{k}, c_{k}, {len(rows)}, 0}}" for k, (_, rows) in enumerate(inputs))
+        tables += f"static CALL(input) inputs[] = {{{', '.join(sets)}}};\n"
+    control = f"{{{t_end!r} / {steps} / more}}" if in_tau else "{0.0, INFINITY, NULL, NULL}"
+    until = "CALL(next_breakpoint)(&run, end, 0, inputs, parameters)" if inputs else "end"
+    size = "CALL(next_steps)(&run, end, h, inputs, parameters)" if inputs else "last - run.step"
+    if events:
+        target, how = (until, "control") if adaptive else ("run.t + 2 * run.h", "NULL")
+        call = (
+            f"CALL(advance_with_changes)(&run, &watch, {target}, {how}, 1, parameters, NULL,"
+            " ROOM, t, q, p, length, iterations, number, ROOM, found, &filled, &report, work)"
+        )
+    elif adaptive:
+        call = (
+            f"CALL(advance_to)(&run, {until}, control, 1 << 20, 1 << 20, parameters, NULL, t, q, p, iterations,"
+            " &report, work)"
+        )
+    else:
+        call = "CALL(advance)(&run, size, run.step + size + 1, parameters, NULL, t, q, p, iterations, &report, work)"
+    directions, acts = ", ".join(map(str, events)), ", ".join("1" for _ in events)
+    watch = f"""#include "{prefix}_events.h"
+static CALL(crossing) found[ROOM];
+static CALL(watch) watch = {{.direction = {{{directions}}}, .acts = {{{acts}}}}};
+"""
+    return (
+        HEAD.format(prefix=prefix)
+        + f"""
+enum {{ M = {m}, ROOM = 256 }};
+static double work[{prefix.upper()}_WORKSPACE], parameters[] = {{{numbers(parameters)}}};
+static double t[ROOM], q[ROOM * M], p[ROOM * M];
+static int iterations[ROOM];
+static CALL(run) run;
+{tables}{watch if events else ""}
+int main(int count, char **arguments)
+{{
+  const double change = count > 1 ? atof(arguments[1]) : 0.0;
+  const int more = count > 2 ? atoi(arguments[2]) : 1;
+  const double h = {t_end / steps if steps and not in_tau else 0.0!r} / more;
+  double q0[] = {{{numbers(q)}}}, p0[] = {{{numbers(p)}}};
+  {f"const CALL(step_control) own = {control}, *control = &own;" if adaptive else ""}
+  CALL(report) report;
+  int status = 0;
+  for (int i = 0; i < M; i++) {{
+    q0[i] += (i % 2 ? -1 : 1) * change * {max(map(abs, q)) or 1.0!r};
+    p0[i] += (i % 2 ? 1 : -1) * change * {max(map(abs, p))!r};
+  }}
+  CALL(start)(&run, 0.0, h, q0, p0);
+  {f"run.seed = {seed};" if seed else ""}
+  for (int k = 1; k <= {outputs} && !status; k++) {{
+    const double end = {t_end!r} * k / {outputs};
+    const long long last = {steps // outputs}LL * more * k;
+    while (!status && ({"run.t != end || run.t_low != 0" if adaptive else f"({size}) > 0"})) {{
+      {"" if adaptive else f"const long long size = {size};"}
+      {"static double length[ROOM]; static long long number[ROOM]; long long filled = 0;" if events else ""}
+      status = {call};
+    }}
+    printf("state %a", run.t);
+    for (int i = 0; i < M; i++)
+      printf(" %a", run.q[i]);
+    for (int i = 0; i < M; i++)
+      printf(" %a", run.p[i]);
+    puts("");
+  }}
+  printf("run %d %lld %lld %a\\n", status, run.step, run.iterations, (double)report.t);
+  show("carry", run.carry_q, M), show("carry", run.carry_p, M);
+  return status;
+}}
+"""
+    )

@@ -7,7 +7,7 @@ from scvi_codegen import HamiltonianSystem, LagrangianSystem
 
 OPTIONS = {
     *("rotations", "directions", "spins", "momenta", "parameters", "forces", "torques", "torques_space", "tables"),
-    *("point_forces", "dissipation", "damping", "constraints", "inputs", "neighbours", "functions"),
+    *("point_forces", "dissipation", "damping", "temperature", "constraints", "inputs", "neighbours", "functions"),
 }
 """Keywords of ``from_text``; all others are parameters."""
 

@@ -43,7 +43,9 @@ int NAME(advance_to)(run_memory *run, real t_end, const step_control *control, l
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
   now.step = step_from(run->t, 0, now.at.q, now.at.p, now.at.carry_q, now.at.carry_p, parameters, workspace);
+#ifndef EXPLICIT_RUN
   now.step.motion_of = run;
+#endif
   memcpy(&now.at, run, sizeof now.at);
 #ifdef MIXED_POINTS
   now.step.points = (double *)&now.points;

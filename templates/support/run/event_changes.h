@@ -396,7 +396,7 @@ static int confirm_part(const event_step *step, const event_sample *left, const 
     return OK;
   TRY(terms_at(step, left, &first));
   TRY(terms_at(step, at, &of));
-  if (memcmp(first.coefficient, of.coefficient, sizeof of.coefficient) == 0)
+  if (memcmp(first.coefficient, of.coefficient, BYTES(3 * EVENT_CONTACTS)) == 0)
     return OK;
   TRY(step_from_left(step, left, 0.5 * part, &middle));
   TRY(step_from_left(step, &middle, 0.5 * part, &end));

@@ -86,7 +86,11 @@ static int find_step(run_memory *run, trial *now, const solver_options *options,
 
 static int confirm_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
+#ifdef EXPLICIT_RUN
+  return OK; /* nothing is solved: no error is left */
+#else
   return examine_error(run, &now->step, &now->data, now->dq, options, now->step.scratch + SCRATCH);
+#endif
 }
 
 /* Adds the increments to the state. */
