@@ -646,6 +646,8 @@ def generate_source(
     if locates and controller is None:
         system = sliding(system, method)
     original, rows = system, cast("tuple[ContactRows, ...]", ())
+    if system.has_contacts and time_transformation is not None:
+        raise MethodError(f"time_transformation={str(time_transformation)!r} is not available with contacts: omit it")
     if system.has_contacts:
         system, rows = bound_contacts(system, system.contacts)
     form = discretised_form(system, method)
