@@ -127,14 +127,16 @@ def warned_run(stepper, arguments, tolerance, **more):
 
 
 def true_error(system, run, arguments):
-    """Return the largest error of a position relative to its range, by a run in double-double from the same state."""
+    """Return the largest error of a position relative to its range, at 100 states, by a run in double-double."""
     exact = stepper_of(system, "svi:12", "double-double")
     given = {name: arguments[name] for name in ("parameters", "inputs") if name in arguments}
     rows = slice(-1, None)
     if "inputs" not in given:
-        rows, given["t_eval"] = slice(None), run.t
+        rows = np.unique(np.linspace(0, len(run.t) - 1, 100).astype(int))
+        given["t_eval"] = run.t[rows]
     known = exact.integrate(run.q[0], run.p[0], t_end=float(run.t[-1]), tolerance=1e-22, check_growth=False, **given)
-    errors = np.abs(np.asarray(run.q)[rows] - np.asarray(known.q)[rows] - np.asarray(known.q_low)[rows])
+    q = np.asarray(run.q)[rows]
+    errors = np.abs(q - np.asarray(known.q)[-len(q) :] - np.asarray(known.q_low)[-len(q) :])
     return float((errors / np.ptp(run.q, axis=0)).max())
 
 
@@ -201,8 +203,9 @@ def test_the_vector_is_the_sum_of_the_errors_that_the_steps_transport(system, st
     run = first.record()
     carried = np.array([row[0] for row in first._memory.tangent])
     expected, size = transported(stepper, run, 0.03, tolerance or 0.0)
-    is_large = system is PENDULUM and tolerance in (1e-6, 1e-3)
-    assert np.abs(carried - expected).max() < (1.0 if is_large else 1e-2) * size.max()
+    part = {None: 1e-2, 1e-9: 1e-2, 1e-6: 1e-2, 1e-3: 3e-2}[tolerance]
+    part = 1.0 if system is PENDULUM and (tolerance or 0.0) > 1e-7 else part
+    assert np.abs(carried - expected).max() < part * size.max()
 
 
 @pytest.mark.tiers(1, 2)
@@ -307,7 +310,7 @@ def test_growth_that_leaves_ten_digits_is_not_reported(velocity):
 def test_no_regular_run_is_falsely_reported(method):
     """300 runs in random units, about random origins, from rest by tables, over up to 60 revolutions.
 
-    SVI(2) has step errors of any part of the tolerance, so that one of its runs may have a fifth of the estimate.
+    Errors of steps of SVI(2) are any part of their tolerance: one of its runs may have a fifth of the estimate.
     """
     random, false = np.random.default_rng(1), []
     tolerances = TOLERANCES if method != "svi:2" else TOLERANCES[2:]
