@@ -40,7 +40,7 @@ from scvi_codegen.runs.results.joining import (
 )
 from scvi_codegen.runs.results.quantities import describe_states, describe_step_size, quantities_in_modes, quantities_of
 from scvi_codegen.runs.results.recomputation import work_and_impulses_until, work_until
-from scvi_codegen.runs.results.recorded import MISSING, changed, record_or_raise, stored
+from scvi_codegen.runs.results.recorded import WithUnsetAttributes, changed
 from scvi_codegen.runs.results.saved_states import Array, ModeHistory, checked_row, in_modes
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.rotation_quantities import named_quantities
@@ -63,7 +63,9 @@ MOST_DRAWN, MOST_CURVES = 400, 6
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
-class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, Pictured, TwoWords):
+class Trajectory(
+    WithUnsetAttributes, TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, Pictured, TwoWords
+):
     """States along a run, the initial state first.
 
     Attributes:
@@ -119,8 +121,8 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
     def __repr__(self) -> str:
         if self.pieces:
             return describe_states(self, f", breakpoints between: {len(self.pieces) - 1}")
-        bath = stored(self, "bath")
-        seed = "" if bath is None or bath.seed == MISSING else f", seed {bath.seed}"
+        bath = getattr(self, "bath", None)
+        seed = "" if bath is None else f", seed {bath.seed}"
         return describe_states(self, describe_step_size(self.h, self.plan, tau=self.tau is not None) + seed)
 
     @overload
@@ -160,7 +162,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         low, high = sorted((self.t[first], self.t[range(first, last, stride)[-1]]))
         return changed(
             self,
-            **{name: stored(self, name)[rows] for name in ("t", "q", "p", "iterations")},
+            **{name: getattr(self, name)[rows] for name in ("t", "q", "p", "iterations") if hasattr(self, name)},
             tau=None if self.tau is None else self.tau[rows],
             actions=None if self.actions is None else self.actions[rows],
             step_sizes=lengths,
@@ -380,7 +382,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
 
     def states(self, units: Mapping[str, str] | None = None) -> States:
         """Return the states for :mod:`scvi_codegen.runs.results.export`."""
-        interface, columns = self.stepper.interface, (self.t, self.q, self.p, stored(self, "iterations"))
+        interface, columns = self.stepper.interface, (self.t, self.q, self.p, self._known_iterations)
         by_name = dict(zip(interface.own_parameters, map(float, self.parameters), strict=False))
         derived: Callable[..., Any] = partial(quantities_of, self)
         if self.pieces:
@@ -493,21 +495,26 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         with suppress(StateError):  # outside the domain of L
             energies = self.energy()[::save_every]
             rows.append((plain("energy"), sparkline(energies.tolist(), "energy"), _range(energies)))
-        names, iterations = zip(self.stepper.parameters, self.parameters, strict=False), stored(self, "iterations")
+        names, iterations = zip(self.stepper.parameters, self.parameters, strict=False), self._known_iterations
         facts = (
             ("time", plain(f"{self.t[0]:g} to {self.t[-1]:g}, {self._steps()}")),
             ("states", plain(f"{len(self)}; q and p of shape {self.q.shape}")),
             ("coordinates", listed(self.stepper.coordinates)),
             ("parameters", listed([f"{name} = {value:g}" for name, value in names])),
-            ("iterations", plain("not recorded" if iterations[0] == MISSING else f"{iterations.sum()}")),
+            ("iterations", plain(f"{iterations.sum()}" if hasattr(self, "iterations") else "not recorded")),
             ("step error", plain(self._worst())),
         )
         return card(self.stepper.title, facts, grid(rows))
 
+    @property
+    def _known_iterations(self) -> NDArray[np.int32]:
+        """Iterations of the states, -1 in files and tables where they were not recorded."""
+        return getattr(self, "iterations", np.full(len(self), -1, np.int32))
+
     def _steps(self) -> str:
         if not isinstance(self.plan, FixedSteps):
-            rejected = stored(self, "rejected_steps")
-            return f"{self.steps} adaptive steps" + (f", {rejected} rejected" if rejected != MISSING else "")
+            rejected = f", {self.rejected_steps} rejected" if hasattr(self, "rejected_steps") else ""
+            return f"{self.steps} adaptive steps{rejected}"
         return f"h = {self.h:g}"
 
     def _worst(self) -> str:
@@ -557,9 +564,6 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         """
         check_keeps_words(self.stepper.interface.words, "a data frame")
         return to_dataframe(self.states())
-
-
-record_or_raise(Trajectory, ("iterations", "rejected_steps", "fallback_steps", "bath"))
 
 
 def _range(values: Array) -> Html:

@@ -27,18 +27,19 @@ def measures_growth(stepper: Integrator, plan: StepPlan, requested: bool | None)
     if requested:
         require(stepper, "check_growth")
         return warnings_wanted()
-    is_checked = requested is None and isinstance(plan, Adaptive) and plan.admissible_error < UNCHECKED
+    is_checked = requested is None and isinstance(plan, Adaptive) and (plan.tolerance or 0.0) < UNCHECKED
     return is_checked and stepper._carries_errors and warnings_wanted()
 
 
 def warn_of_error_growth(run: Memory, t_end: float, *, requested: bool) -> None:
     """Warn if errors grew along a run that carried its error to ``t_end``, or if a requested check failed."""
-    if run._growth is None:
+    growth = run._growth
+    if growth is None:
         if requested and run.steps:
             cause = "Newton's method solved a step, or the derivatives of a step did not converge"
             warn(f"the growth of errors was not checked: {cause}. Reduce the steps, or use error=", AccuracyWarning)
         return
-    error, limit, accurate_until, meaningful_until = run._growth
+    error, limit, accurate_until, meaningful_until = growth
     if error <= limit:
         return
     if error > MEANINGLESS:

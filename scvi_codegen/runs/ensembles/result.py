@@ -25,14 +25,13 @@ from scvi_codegen.runs.forwarding import Pictured
 from scvi_codegen.runs.results.export import FORMATS, LABELLED, check_format, write_whole
 from scvi_codegen.runs.results.joining import joined, relative_changes
 from scvi_codegen.runs.results.quantities import quantities, short_title
-from scvi_codegen.runs.results.recorded import MISSING, changed, not_recorded
+from scvi_codegen.runs.results.recorded import changed, not_recorded, without
 from scvi_codegen.runs.results.saved_states import ModeHistory, checked_row
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.rotation_quantities import named_quantities
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.states.words import TwoWords, Words, check_keeps_words
 from scvi_codegen.runs.stepping.integrator import Integrator
-from scvi_codegen.runs.stepping.noise import BathReport
 from scvi_codegen.runs.stepping.step_plan import Adaptive, Fixed
 
 if TYPE_CHECKING:
@@ -139,26 +138,23 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, Pictured, TwoWords)
         for number, (good, parameters) in enumerate(parts):
             rows = np.insert(good, 0, good[0] - 1) if number else good  # the state at a breakpoint belongs to both
             q, p = (self.stepper.named(states[rows, j].copy()) for states in (self.q, self.p))
-            pieces.append(
-                trajectory(
-                    t=times[rows],
-                    q=q,
-                    p=p,
-                    iterations=np.full(len(rows), MISSING, np.int32),
-                    step_sizes=np.full(len(rows), np.nan if divided else h),
-                    h=h,
-                    tau=None if tau is None else tau[rows],
-                    actions=None if self.actions is None else self.actions[rows, j],
-                    modes=None if modes is None else modes.between(*sorted(times[rows[[0, -1]]])),
-                    parameters=parameters,
-                    stepper=self.stepper,
-                    plan=plan,
-                    steps=int(self.steps[j]),
-                    rejected_steps=MISSING if self.h is None else 0,
-                    bath=None if self.stepper.interface.temperature is None else BathReport(MISSING, np.nan, np.nan),
-                    fallback_steps=MISSING if self.fallback_steps is None else int(self.fallback_steps[j]),
-                )
+            piece = trajectory(
+                t=times[rows],
+                q=q,
+                p=p,
+                iterations=np.empty(0, np.int32),
+                step_sizes=np.full(len(rows), np.nan if divided else h),
+                h=h,
+                tau=None if tau is None else tau[rows],
+                actions=None if self.actions is None else self.actions[rows, j],
+                modes=None if modes is None else modes.between(*sorted(times[rows[[0, -1]]])),
+                parameters=parameters,
+                stepper=self.stepper,
+                plan=plan,
+                steps=int(self.steps[j]),
+                fallback_steps=0 if self.fallback_steps is None else int(self.fallback_steps[j]),
             )
+            pieces.append(without(piece, *self._unset))
         whole = joined(pieces) if len(pieces) > 1 else pieces[0]
         return changed(
             whole,
@@ -166,6 +162,17 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, Pictured, TwoWords)
             modes=modes,
             confirmation=self.confirmations[j] if self.confirmations else None,
         )
+
+    @property
+    def _unset(self) -> tuple[str, ...]:
+        """Names of the attributes of trajectories that this ensemble does not record."""
+        conditions = {
+            "iterations": True,
+            "rejected_steps": self.h is None,
+            "bath": self.stepper.interface.temperature is not None,
+            "fallback_steps": self.fallback_steps is None,
+        }
+        return tuple(name for name, is_unset in conditions.items() if is_unset)
 
     @property
     def _pictured(self) -> list[Trajectory]:

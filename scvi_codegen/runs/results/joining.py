@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.runs.results.recorded import changed, stored
+from scvi_codegen.runs.results.recorded import changed
 from scvi_codegen.runs.results.saved_states import Array, ModeHistory
 from scvi_codegen.systems.event import Crossings
 
@@ -21,14 +21,16 @@ def joined(pieces: Sequence[Result]) -> Result:
     every: Sequence[Any] = pieces
     first, last = every[0], every[-1]
     states: dict[str, Any] = {
-        name: concatenated([stored(piece, name) for piece in pieces]) for name in ("t", "q", "p", "iterations")
+        name: concatenated([getattr(piece, name) for piece in pieces])
+        for name in ("t", "q", "p", "iterations")
+        if hasattr(first, name)
     }
     states |= {name: first.stepper.named(states[name]) for name in "qp"}
     same = ("plan", "steps", "rejected_steps", "fallback_steps", "step_error", "worst_step_time")
     whole: Result = changed(
         first,
         **states,
-        **{name: stored(last, name) for name in same},
+        **{name: getattr(last, name) for name in same if hasattr(last, name)},
         step_sizes=np.concatenate([*(piece.step_sizes[:-1] for piece in every), last.step_sizes[-1:]]),
         actions=accumulated([piece.actions for piece in every]),
         events=tuple(map(joined_crossings, zip(*(piece.events for piece in every), strict=True))),
