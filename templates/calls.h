@@ -159,6 +159,21 @@ int NAME(call_integrate)(NAME(call) *c, long long steps, long long every)
   return 0;
 }
 
+/* Takes `pieces` equal steps h from each of `count` states q, p at times t; their ends are q1, p1. */
+int NAME(call_pieces)(NAME(call) *c, long long count, const double *t, const double *h, const long long *pieces,
+    const double *q, const double *p, double *q1, double *p1)
+{
+  __typeof__(NAME(advance)) *volatile fixed = NAME(advance);
+  int status = 0;
+  for (long long k = 0; k < count && !status; k++) {
+    const long long row = k * c->coordinates;
+    NAME(start)(c->run, t[k], h[k], q + row, p + row);
+    status = fixed(c->run, pieces[k], pieces[k], c->parameters, c->options, c->t, q1 + row, p1 + row, c->iterations,
+        c->report, c->workspace);
+  }
+  return status;
+}
+
 /* Advances the present trajectory by at most `steps` steps; returns 1 at its end. */
 static int NAME(call_one)(NAME(each) *c, const double *parameters, long long steps, long long *taken)
 {

@@ -19,6 +19,8 @@ typedef struct {
 } NAME(call);
 int NAME(call_advance)(const NAME(call) *call, long long steps, long long every);
 int NAME(call_integrate)(NAME(call) *call, long long steps, long long every);
+int NAME(call_pieces)(NAME(call) *call, long long count, const double *t, const double *h, const long long *pieces,
+    const double *q, const double *p, double *q1, double *p1);
 
 /* Arguments and results of trajectories that are integrated one after the other. */
 typedef struct {

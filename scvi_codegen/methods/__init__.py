@@ -111,6 +111,21 @@ def default_method(system: MechanicalSystem) -> Method:
     return as_method("svi:8", system)
 
 
+def finer_method(method: Method, *, constrained: bool) -> str:
+    """Return the name of an SVI whose step has a negligible error beside that of a method's step.
+
+    With s the degree, or half the order, of the method: degree min(2s, s + 4), which doubles the order or exceeds it by
+    8; s + 2 with constraints and rotations, which Newton's method solves; 4 or 8 for explicit methods.
+    """
+    order = getattr(method, "order", None)
+    degree = getattr(method, "degree", None) or max(1, -(-(order or DEFAULT_SIZE) // 2))
+    if constrained:
+        return f"svi:{degree + 2}"
+    if not method.implicit:
+        return "svi:4" if order is not None and order <= 2 else "svi:8"
+    return f"svi:{min(2 * degree, degree + 4)}"
+
+
 def fitted(specification: Specification, system: MechanicalSystem | None) -> Specification:
     """Add the default quadrature of an SVI for constraints: Gauss-Lobatto points, one more than the degree."""
     is_open = specification.get("method") == "svi" and "degree" in specification and "quadrature" not in specification

@@ -14,6 +14,7 @@ key of a system defined by text (:mod:`scvi_codegen.systems.system`), neither Sy
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -27,10 +28,11 @@ from scvi_codegen.codegen.native.compilers import REORDERING_FLAGS
 from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE, PRECISIONS, Interface, Source
 from scvi_codegen.codegen.variants import SUMS, Derivatives, Sums, Variant
 from scvi_codegen.common.cache import cached_source, key_of
-from scvi_codegen.common.errors import MethodError, SizesRequiredError
+from scvi_codegen.common.errors import MethodError, MethodWarning, SizesRequiredError
 from scvi_codegen.common.validation import TEXTS, OfRunTimeSizes, check_kind, checks_arguments
-from scvi_codegen.methods import SVI, StoermerVerlet, as_method, default_method, sliding
+from scvi_codegen.methods import SVI, StoermerVerlet, as_method, default_method, finer_method, sliding
 from scvi_codegen.methods.method import Method
+from scvi_codegen.runs.accuracy.run_error import FinerStepper
 from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
 from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.runs.stepping.features import warn_of_formulas
@@ -112,6 +114,8 @@ def compile_stepper(
     check_precision(precision, flags)
     if sums not in SUMS:
         raise MethodError(f"unknown sums {sums!r}: use {' or '.join(map(repr, SUMS))}")
+    of_finer = {"sizes": sizes, "tables": tables, "flags": flags, "precision": precision}
+    finer = FinerStepper(partial(_finer_stepper, system, method, tuple(contacts), of_finer))
     others = {"precision": precision, "sizes": sizes, "tables": tables, "controller": controller}
     system, rows = _with_contacts(system, method, contacts, **others, time_transformation=time_transformation)
     precision = "double" if rows else precision  # contacts have no second precision for "auto"
@@ -124,7 +128,9 @@ def compile_stepper(
     }
     _check_symmetries(symmetries)
     if isinstance(system, OfRunTimeSizes) and sizes is None and tables is None:
-        return _compile_arrays(system, method, symmetries, as_events(events), precision, common, sums)
+        of_arrays = _compile_arrays(system, method, symmetries, as_events(events), precision, common, sums)
+        of_arrays._finer = finer
+        return of_arrays
     if sums == "plain":
         raise MethodError(
             f"sums='plain' is not available for '{system.name}' with named coordinates or known sizes: leave out "
@@ -153,7 +159,20 @@ def compile_stepper(
     if not stepper.interface.modes:
         warn_of_formulas(stepper.interface, f"the stepper of '{stepper.interface.system}'")
     system.store_key()
+    stepper._finer = finer
     return stepper
+
+
+def _finer_stepper(
+    system: MechanicalSystem, method: Method | str, contacts: tuple[ContactLike, ...], options: Mapping[str, Any]
+) -> Stepper:
+    """Return the stepper of :func:`~scvi_codegen.methods.finer_method`, in physical time."""
+    constrained = bool(contacts or system.constraints or system.has_contacts or system.rotations)
+    name = finer_method(as_method(method, system), constrained=constrained)
+    precision = DOUBLE_DOUBLE if options["precision"] == DOUBLE_DOUBLE else "double"
+    with warnings.catch_warnings():  # of kinks: those of the run's own stepper were issued
+        warnings.simplefilter("ignore", MethodWarning)
+        return compile_stepper(system, name, contacts=contacts, **{**options, "precision": precision})
 
 
 def _check_symmetries(symmetries: Any) -> None:

@@ -29,6 +29,7 @@ from scvi_codegen.runs.accuracy.global_error import Runs, checked_error, warn_of
 from scvi_codegen.runs.accuracy.growth import measures_growth, warn_of_error_growth
 from scvi_codegen.runs.accuracy.local_error import warn_of_energy_errors, warn_of_inaccuracy
 from scvi_codegen.runs.accuracy.resolution import warn_of_unresolved_members
+from scvi_codegen.runs.accuracy.run_error import FinerStepper
 from scvi_codegen.runs.accuracy.warning_switch import warn_of_failed_check
 from scvi_codegen.runs.driver.bounded_motion import BoundedMotion
 from scvi_codegen.runs.driver.observation import Observe
@@ -87,10 +88,12 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
     _trajectory_type = Trajectory
     _precise: Callable[[], Stepper | None] | None = None
     """Function that returns the stepper in double-double if there is one, for ``error=`` with precision="auto"."""
+    _finer: FinerStepper | None = None
+    """Function that returns the stepper of a finer method, for ``run.error``; ``None`` without the system."""
 
     def _copy(self, events: tuple[Event, ...], source: Source | None = None) -> Self:
         copy = super()._copy(events, source)
-        copy._precise, copy._doubles = self._precise, self._doubles
+        copy._precise, copy._doubles, copy._finer = self._precise, self._doubles, self._finer
         return copy
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -98,7 +101,9 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             return (_rebuild_bound, (self.origin, self.problem, self.events))
         variants = self._variants if self._reason is None else Variants()
         made = partial(type(self), variants=variants, flags=self.flags, events=self.events, reason=self._reason)
-        further = {} if self._doubles is None or not self.events else {"_doubles": constantly(self._doubles())}
+        further: dict[str, Any] = {} if self._finer is None else {"_finer": self._finer}
+        if self._doubles is not None and self.events:
+            further["_doubles"] = constantly(self._doubles())
         return made, (self._plain, self.interface), further
 
     @checks_arguments(StateError)
@@ -276,6 +281,9 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         run._noise = noise
         if segments is None:
             trajectory = run._integrated(initial, begins_by, growth, steps, output)
+            if output.times is not None and trajectory.t[0] != initial.t:  # errors are those since the initial state
+                q, p = cast(Any, self)._consistent_state(initial) if begins_by else initial[:2]
+                trajectory._initial = float(initial.t), *self._states.pair(q, cast(Any, p))
         else:
             run._start_from(initial, begins_by, growth)
             trajectory = segments.record(run, output.save_every, output.progress)

@@ -21,6 +21,7 @@ from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.runs.accuracy.global_error import Confirmed, GlobalError
 from scvi_codegen.runs.accuracy.local_error import TOLERABLE_ERROR
 from scvi_codegen.runs.accuracy.resolution import unresolved_parts
+from scvi_codegen.runs.accuracy.run_error import RunError, WithErrors
 from scvi_codegen.runs.accuracy.size import relative
 from scvi_codegen.runs.derivatives.actions import actions_until, shadow_energy
 from scvi_codegen.runs.derivatives.trajectory_derivatives import TrajectoryDerivatives
@@ -64,7 +65,7 @@ MOST_DRAWN, MOST_CURVES = 400, 6
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class Trajectory(
-    WithUnsetAttributes, TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, Pictured, TwoWords
+    WithUnsetAttributes, TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, WithErrors, Pictured, TwoWords
 ):
     """States along a run, the initial state first.
 
@@ -116,6 +117,8 @@ class Trajectory(
     actions: Array | None = field(default=None, repr=False)
     pieces: tuple[Self, ...] = field(default=(), repr=False)
     bath: BathReport | None = None
+    _error: RunError | None = field(default=None, init=False, repr=False)
+    _initial: tuple[float, Array, Array] | None = field(default=None, init=False, repr=False)
     _has_dense_output: ClassVar[bool] = True
 
     def __repr__(self) -> str:
@@ -380,8 +383,9 @@ class Trajectory(
         values = self._joined(lambda run: in_modes(run, lambda *of: constraint_values(run.stepper, *of).swapaxes(0, 1)))
         return values[:, 0], values[:, 1]
 
-    def states(self, units: Mapping[str, str] | None = None) -> States:
-        """Return the states for :mod:`scvi_codegen.runs.results.export`."""
+    def states(self, units: Mapping[str, str] | None = None, *, error: bool = False) -> States:
+        """Return the states for :mod:`scvi_codegen.runs.results.export`, with their errors if requested."""
+        errors = self.error.arrays if error else {}
         interface, columns = self.stepper.interface, (self.t, self.q, self.p, self._known_iterations)
         by_name = dict(zip(interface.own_parameters, map(float, self.parameters), strict=False))
         derived: Callable[..., Any] = partial(quantities_of, self)
@@ -407,6 +411,7 @@ class Trajectory(
             low={f"{name}_low": low_words(getattr(self, name)) for name in ("t", "q", "p", "parameters")}
             if isinstance(self.q, Words)
             else {},
+            errors=errors,
         )
 
     def unresolved(self) -> Array:
@@ -524,7 +529,9 @@ class Trajectory(
         return f"{message}; h is too large" if self.step_error > TOLERABLE_ERROR else message
 
     @checks_arguments()
-    def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
+    def save(
+        self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None, error: bool = False
+    ) -> None:
         """Write a file in the format of its suffix, atomically; the error of an unknown suffix lists the formats.
 
         An ``.npz`` file has arrays t, q, p, iterations, h, parameters, coordinates, parameter_names, and strings title,
@@ -532,14 +539,20 @@ class Trajectory(
         columns t, coordinates x, momenta p_x, iterations, velocities x_dot and energy, NaN where undefined. HDF5 and
         Zarr files (``.h5``, ``.nc``, ``.zarr``) contain the variables of :meth:`to_xarray`.
 
+        Args:
+            path: file.
+            units: as of :meth:`to_xarray`.
+            error: whether to write the arrays q_error, p_error, q_rounding and p_rounding of :attr:`error`, which CSV
+                files do not hold.
+
         Raises:
-            StateError: if the suffix is unknown, or the format has no units.
+            StateError: if the suffix is unknown, or the format has no units or errors.
             MissingLibraryError: if h5netcdf or zarr is not installed (extra ``data``).
         """
         check_keeps_words(self.stepper.interface.words, path)
-        write_states(self.states(units), path)
+        write_states(self.states(units, error=error), path)
 
-    def to_xarray(self, *, units: Mapping[str, str] | None = None) -> xarray.Dataset:
+    def to_xarray(self, *, units: Mapping[str, str] | None = None, error: bool = False) -> xarray.Dataset:
         """Return a dataset of q, p, velocity (t, coordinate), energy, iterations (t), momentum_map (t, symmetry).
 
         Attributes are h, parameters and titles, and a ``long_name`` of each variable. Undefined values are NaN.
@@ -547,13 +560,14 @@ class Trajectory(
         Args:
             units: units of t, q, p, velocity, energy or momentum_map, ``{"t": "day", "q": "au"}``; those of velocities
                 follow.
+            error: whether to add q_error, p_error, q_rounding and p_rounding of :attr:`error` (t, coordinate).
 
         Raises:
             StateError: if units name an unknown variable, or for states of two words.
             MissingLibraryError: if xarray is not installed (extra ``data``).
         """
         check_keeps_words(self.stepper.interface.words, "a dataset")
-        return to_dataset(self.states(units).labelled())
+        return to_dataset(self.states(units, error=error).labelled())
 
     def to_dataframe(self) -> pandas.DataFrame:
         """Return one row per state, indexed by time, with the columns of a CSV file (:meth:`save`).

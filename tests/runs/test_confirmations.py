@@ -19,8 +19,6 @@ from notation import lagrange
 from scipy.integrate import solve_ivp
 
 import scvi_codegen as sc
-from scvi_codegen.runs.accuracy import global_error
-from scvi_codegen.runs.accuracy.global_error import LEAST_STOPS, irregular_stops
 
 PI = np.longdouble(4.0) * np.arctan(np.longdouble(1.0))
 REFERENCE_TOLERANCE, REFERENCE_ERROR = 3e-14, 3e-12
@@ -279,7 +277,8 @@ def test_errors_are_relative_to_the_range_of_each_coordinate(offset):
     stepper = sc.compile_stepper(system, "svi:6")
     with warnings.catch_warnings(action="ignore"):
         run = stepper.integrate([1.0, offset + 2.0**-20], [0.0, 0.0], t_end=5.0, parameters={"c": offset}, error=1e-6)
-    off = np.abs(run.q[:, 1] - offset - 2.0**-20 * np.cos(math.sqrt(2.0) * run.t)).max() / 2.0**-20
+    exact = 2.0**-20 * np.cos(math.sqrt(2.0) * run.t)
+    off = np.abs(run.q[:, 1] - offset - exact).max() / np.ptp(exact)
     assert off <= run.global_error
     assert run.confirmation.confirmed == (offset == 0.0)
 
@@ -316,34 +315,16 @@ def test_two_words_confirm_more_digits():
         assert abs(x - mpmath.cos(t)) < 1e-26
 
 
-def test_a_run_for_comparison_has_other_steps():
-    """Its steps end within all long steps of the run, at irregular fractions of them."""
-    t = np.concatenate([[0.0], np.linspace(1.0, 9.0, 9), np.linspace(9.01, 10.0, 100)])
-    for forward in (1.0, -1.0):
-        stops = np.array(irregular_stops(forward * t, 0))
-        assert stops[-1] == forward * t[-1]
-        assert (np.diff(forward * stops) > 0.0).all()
-        inside = np.searchsorted(t, forward * stops[:-1])
-        assert {*range(1, 10)} <= {*inside.tolist()}
-        fractions = (forward * stops[:9] - t[inside[:9] - 1]) / np.diff(t)[inside[:9] - 1]
-        assert np.ptp(fractions) > 0.5
-        assert len({*np.round(fractions, 6)}) == 9
-    assert len(irregular_stops(np.array([0.0, 1.0]), 0)) == LEAST_STOPS + 1
-
-
 @pytest.mark.rotated
 def test_steps_of_a_confirmed_run_with_kinks_reproduce_it(tmp_path):
     """In Python, of models and on the command line: the tolerance and the largest step; rint is not located."""
     force = "rint((t - a)/100 + 1/2)"
     stepper = sc.compile_stepper(lagrange("motion", "x", "x_dot**2/2", forces={"x": force}, a=5.0), "svi:4")
     start = {"q": [0.0], "p": [1.0], "t_end": 10.0, "parameters": {"a": 4.1}}
+    a = start["parameters"]["a"]
     with warnings.catch_warnings(action="ignore"):
-        for a in np.linspace(4.1, 5.9, 7):
-            start["parameters"]["a"] = float(a)
-            run = stepper.integrate(**start, error=1e-8)
-            if run.confirmation.confirmed and run.confirmation.max_step < math.inf:
-                break
-    assert run.confirmation.max_step < 1.0
+        run = stepper.integrate(**start, error=1e-8)
+    assert run.confirmation.confirmed
     assert np.array_equal(stepper.integrate(**start, **run.confirmation.steps).q, run.q)
     path = tmp_path / "motor.toml"
     system = f'[system]\nname = "motion"\ncoordinates = ["x"]\nlagrangian = "x_dot**2/2"\n[forces]\nx = "{force}"'
@@ -351,7 +332,7 @@ def test_steps_of_a_confirmed_run_with_kinks_reproduce_it(tmp_path):
     path.write_text(f"{system}\n{more}\n[initial]\nq = [0.0]\np = [1.0]\n")
     assert np.array_equal(sc.load_model(path).integrate().q, run.q)
     found = json_of("run", path, "-o", tmp_path / "motor.npz")["global_error"]
-    assert (found["confirmed"], found["max_step"]) == (True, run.confirmation.max_step)
+    assert (found["confirmed"], found["tolerance"]) == (True, run.confirmation.tolerance)
     with np.load(tmp_path / "motor.npz") as file:
         assert np.array_equal(file["q"], run.q)
 
@@ -425,16 +406,6 @@ class TestSizes:
 
 
 @pytest.mark.rotated
-def test_a_comparison_that_is_given_up_confirms_nothing(monkeypatch):
-    """Runs for comparison that take too many steps."""
-    monkeypatch.setattr(global_error, "MANY", -(10**6))
-    run = confirmed(("x", "x_dot**2/2 - x**2/2"), [1.0], [0.0], t_end=5.0, error=1e-6)
-    assert not run.confirmation.confirmed
-    assert run.confirmed_until == 0.0
-    assert math.isinf(run.global_error)
-
-
-@pytest.mark.rotated
 @pytest.mark.parametrize("mass", [1.0, 2.0**-30])
 def test_momenta_of_light_bodies_count(mass):
     """A body that crosses ripples: errors of its velocity are 100 times those of its position relative to its range."""
@@ -442,7 +413,7 @@ def test_momenta_of_light_bodies_count(mass):
     ripples = sc.compile_stepper(lagrange("ripples", ("x", "y"), text, m=mass), "svi:4")
     run = ripples.integrate([1.0, 0.25], velocity=[0.0, 1.5], t_end=15.0, error=1e-5)
     y, v = integrated(lambda t, z: [z[1], -4.5 * math.sin(9.0 * z[0])], [0.25, 1.5], run.t).T
-    of_q, of_v = (abs(x).max() / np.ptp(of) for x, of in ((run.q[:, 1] - y, y), (run.p[:, 1] / mass - v, v)))
+    of_q, of_v = abs(run.q[:, 1] - y).max() / np.ptp(y), abs(run.p[:, 1] / mass - v).max() / abs(v).max()
     assert of_v > 10.0 * of_q
     assert run.confirmation.confirmed
-    assert of_v / 2.0 < run.global_error < 1e-5  # of some of the states
+    assert run.global_error == pytest.approx(of_v, rel=0.01)

@@ -5,49 +5,18 @@ import re
 from contextlib import nullcontext
 from types import SimpleNamespace
 
-import mpmath
 import numpy as np
 import pytest
 from commands import error_of, json_of, output_of
+from exact_orbits import motion_stepper, on_an_ellipse
 from extrapolation import Real, integrated
 from motions import MOTIONS, recorded
 from notation import lagrange
 
 import scvi_codegen as sc
-from scvi_codegen.runs.accuracy.global_error import SAFETIES_OF_ROUNDING, SAFETY, _alternative, _Samples
-from scvi_codegen.runs.driver import segments
-from scvi_codegen.runs.driver.run import Run
-from scvi_codegen.runs.results import dense_output
+from scvi_codegen.runs.accuracy.global_error import _alternative
 
 MASSES = np.array([3, 4, 5], dtype=Real)
-
-
-def on_an_ellipse(q, p, times):
-    """Kepler's problem with mu = 1 in 40 digits, by his equation; (n, 4) states at times, from (q, p) at the first."""
-    with mpmath.workdps(40):
-        (x, y), (vx, vy) = map(mpmath.mpf, q), map(mpmath.mpf, p)
-        r = mpmath.hypot(x, y)
-        a = 1 / (2 / r - vx**2 - vy**2)
-        n, e_sin, e_cos = a ** mpmath.mpf(-1.5), (x * vx + y * vy) / mpmath.sqrt(a), 1 - r / a
-        found = []
-        for t in times:
-            mean = n * (mpmath.mpf(float(t)) - mpmath.mpf(float(times[0])))
-            g = mean  # change of the eccentric anomaly: g - e_cos sin g + e_sin (1 - cos g) = mean
-            low, high = mean - 2, mean + 2
-            for _ in range(300):
-                rest = g - e_cos * mpmath.sin(g) + e_sin * (1 - mpmath.cos(g)) - mean
-                low, high = (low, g) if rest > 0 else (g, high)
-                new = g - rest / (1 - e_cos * mpmath.cos(g) + e_sin * mpmath.sin(g))
-                new = new if low < new < high else (low + high) / 2
-                if abs(new - g) < mpmath.mpf(10) ** -38:
-                    break
-                g = new
-            f, h = 1 - a / r * (1 - mpmath.cos(g)), (mean - g + mpmath.sin(g)) / n
-            now = a * (1 - e_cos * mpmath.cos(g) + e_sin * mpmath.sin(g))
-            f_dot, h_dot = -mpmath.sqrt(a) / (now * r) * mpmath.sin(g), 1 - a / now * (1 - mpmath.cos(g))
-            state = (f * x + h * vx, f * y + h * vy, f_dot * x + h_dot * vx, f_dot * y + h_dot * vy)
-            found.append([Real(mpmath.nstr(each, 30)) for each in state])
-    return np.array(found)
 
 
 def duffing(t, y):
@@ -68,39 +37,6 @@ def pythagorean():
 PYTHAGOREAN = [1.0, 3.0, -2.0, -1.0, 1.0, -1.0], [0.0] * 6
 
 
-class Work:
-    """Iterations of the equations of steps, each of one force per stage, in runs and in dense output."""
-
-    def __init__(self, monkeypatch):
-        self.iterations = 0
-        integrate, partial_steps = Run._integrated, dense_output._take_partial_steps
-        with_stops = segments.record_with_stops
-
-        def counted_run(run, *arguments):
-            trajectory = integrate(run, *arguments)
-            self.iterations += int(trajectory.iterations.sum())
-            return trajectory
-
-        def counted_with_stops(*arguments, **named):
-            trajectory = with_stops(*arguments, **named)
-            self.iterations += int(trajectory.iterations.sum())
-            return trajectory
-
-        def counted_partial_steps(*arguments):
-            iterations = partial_steps(*arguments)
-            self.iterations += iterations
-            return iterations
-
-        monkeypatch.setattr(Run, "_integrated", counted_run)
-        monkeypatch.setattr(segments, "record_with_stops", counted_with_stops)
-        monkeypatch.setattr(dense_output, "_take_partial_steps", counted_partial_steps)
-
-    def of(self, run):
-        before, result = self.iterations, run()
-        assert self.iterations > before
-        return result, self.iterations - before
-
-
 def true_errors(name, run):
     """Return times and the errors there, relative to the largest state of the run until then, as estimates are."""
     t, high, low = recorded(name)
@@ -114,13 +50,6 @@ def true_errors(name, run):
         sizes = np.maximum.accumulate(np.maximum(norms, norms[early].max()))[rows] + 1e-300  # 0 at rest
         worst = np.maximum(worst, np.linalg.norm(found - high[:, part] - low[:, part], axis=1) / sizes)
     return t, worst
-
-
-def motion_stepper(name):
-    motion = MOTIONS[name]
-    system = made("motion", motion.coordinates.split(), motion.lagrangian, forces=motion.forces)
-    start = {"q": motion.q, "p": motion.p, "t": motion.span[0], "t_end": motion.span[1]}
-    return sc.compile_stepper(system, motion.method), start
 
 
 def check_claims(name, run, error):
@@ -138,47 +67,28 @@ class TestMotions:
 
     @pytest.mark.full
     @pytest.mark.filterwarnings("ignore:the global error")
-    def test_a_hundred_estimates_are_bounds_close_and_cheap(self, monkeypatch):
+    def test_a_hundred_estimates_are_bounds_and_close(self):
         """None is false, 97 % of those confirmed that three runs at round-off level attain by a factor of three."""
-        work, ratios, costs, attained = Work(monkeypatch), [], [], []
+        ratios, runs, attained = [], [], []
         for name in MOTIONS:
             stepper, start = motion_stepper(name)
             tight = (stepper.integrate(**start, tolerance=each, check_growth=False) for each in (None, 1e-18, 1e-20))
             least = max(true_errors(name, run)[1].max() for run in tight)
             for error in (1e-6, 1e-9, 1e-12):
-                run, cost = work.of(lambda: stepper.integrate(**start, error=error))  # noqa: B023  (called at once)
-                plain = work.of(lambda: stepper.integrate(**start, tolerance=error, check_growth=False))  # noqa: B023
+                run = stepper.integrate(**start, error=error)
                 ratios.append(check_claims(name, run, error))
-                costs.append(cost / plain[1])
+                runs.append(run.confirmation.runs)
                 if least < error / 3.0:
                     attained.append(run.confirmation.confirmed)
         assert len(ratios) > 100 > len(attained) > 75, len(attained)
         assert np.mean(attained) >= 0.97
-        assert np.median(ratios) < 30.0
-        assert np.median(costs) < 6.0
-
-    @pytest.mark.parametrize(("comparisons", "safety"), [*enumerate(SAFETIES_OF_ROUNDING, 1)])
-    def test_agreement_of_rounding_errors_by_chance_is_improbable(self, comparisons, safety):
-        first, *others = np.random.default_rng(0).standard_normal((1 + comparisons, 10**6))
-        assert np.mean(safety * np.max([abs(first - each) for each in others], axis=0) < abs(first)) < 1e-3
-
-    @pytest.mark.second
-    def test_a_third_comparison_is_made_where_two_do_not_suffice(self):
-        stepper, start = motion_stepper("kepler .6")
-        found = {
-            error: stepper.integrate(**start, error=error).confirmation
-            for error in (1e-9, 1e-10, 3e-11, 1e-11, 3e-12, 1e-12)
-        }
-        assert {each.safety for each in found.values()} <= {SAFETY, *SAFETIES_OF_ROUNDING[1:]}
-        assert len({each.safety for each in found.values()}) >= 2
-        for each in found.values():
-            assert each.confirmed
-            assert each.estimate == pytest.approx(each.safety * each.differences.max())
+        assert np.median(ratios) < 10.0
+        assert np.mean(np.array(runs) <= 2) >= 0.9
 
     @pytest.mark.second
     @pytest.mark.filterwarnings("ignore:the global error")
-    def test_an_estimate_by_one_comparison_is_no_better_than_one_by_three(self):
-        """Chaos enlarges rounding errors to 1e-9: two runs agree to 1e-10 by chance, and no third one is made."""
+    def test_rounding_errors_that_chaos_enlarges_are_part_of_the_estimate(self):
+        """To 1e-9: runs at round-off may agree by chance."""
         stepper, start = motion_stepper("duffing")
         check_claims("duffing", stepper.integrate(**start, error=1e-12), 1e-12)
 
@@ -198,14 +108,13 @@ class TestMotions:
         run = saddle.integrate([1.0], [1.0], t_end=192.0, error=1e-6)
         exact = np.exp(run.t)
         off = np.maximum(abs(run.q[:, 0] - exact), abs(run.p[:, 0] - exact)) / np.ptp(exact)
-        off = off[np.searchsorted(run.t, run.confirmation.t)]
-        assert run.confirmation.differences == pytest.approx(off, rel=0.05, abs=1e-15)
+        assert run.error.relative[-1] == pytest.approx(off.max(), rel=0.05)
         assert 1e-9 < off.max() <= run.global_error <= 1e-6
 
     @pytest.mark.second
     def test_a_short_last_step_is_no_close_encounter(self):
         oscillator = made("o", ["x"], "x_dot**2/2 - x**2/2")
-        stepper, lost = sc.compile_stepper(oscillator, "svi:6"), SimpleNamespace(estimate=1e-9, requested=1e-9)
+        stepper, lost = sc.compile_stepper(oscillator, "svi:6"), SimpleNamespace(estimate=1e-9, requested=1e-9, h=None)
         whole = stepper.integrate([1.0], [0.0], t_end=9.0)
         run = stepper.integrate([1.0], [0.0], t_end=whole.t[-3] + 1e-3)
         assert run.step_sizes[-2] < 0.01 * run.step_sizes[-3]
@@ -296,12 +205,12 @@ class TestOtherRuns:
     def test_saved_states_and_events_are_confirmed(self, kepler_stepper):
         start = {"q": [1.6, 0.0], "p": [0.0, 0.5]}
         at = kepler_stepper.integrate(**start, t_end=50.0, error=1e-9, t_eval=[10.0, 30.0])
-        assert at.t.tolist() == [10.0, 30.0] == at.confirmation.t.tolist()
-        assert at.confirmed_until == 30.0
+        assert at.t.tolist() == [10.0, 30.0]
+        assert at.confirmed_until == 50.0
         ended = kepler_stepper.integrate(**start, t_end=50.0, error=1e-9, events=sc.Event("q2", terminal=2))
         assert ended.confirmed_until == ended.t[-1] < 50.0
         exact = on_an_ellipse(start["q"], start["p"], [0.0, *ended.t[1:]])
-        assert np.abs(exact[:, :2] - ended.q).max() <= 1.6 * ended.global_error
+        assert np.abs(exact[:, :2] - ended.q).max() <= np.ptp(ended.q, axis=0).max() * ended.global_error
         saved = kepler_stepper.integrate(**start, t_end=50.0, error=1e-9, save_every=10)
         assert len(saved) == -(-saved.steps // 10) + 1
         assert saved.global_error <= 1e-9
@@ -344,7 +253,7 @@ class TestCommandLine:
         found, saved = document["global_error"], loaded(tmp_path / "orbit.npz")
         exact = on_an_ellipse(saved["q"][0], saved["p"][0], saved["t"])
         size = np.linalg.norm(saved["q"], axis=1).max()
-        assert f"global error: {found['estimate']:.1e} (relative) by comparison of {found['runs']} runs" in printed
+        assert f"global error: {found['estimate']:.1e} (relative), of {found['runs']} run" in printed
         assert np.linalg.norm(exact[:, :2] - saved["q"], axis=1).max() / size <= found["estimate"] <= 1e-9
         assert found["digits"] == math.floor(-math.log10(found["estimate"])) >= 9
         assert (found["requested"], found["confirmed"], found["confirmed_until"]) == (1e-9, True, saved["t"][-1])
@@ -401,24 +310,10 @@ def test_a_rod_that_hardly_swings_is_confirmed_in_few_steps(precision):
         assert abs(float(run.q[-1, 0]) - math.sin(u)) < 1e-8 * swing
 
 
-def test_the_other_branch_of_a_constraint_is_an_error():
-    """Mirrored motions of a free rod have equal x and p_x; the constraint determines y but for its sign."""
-    rod = sc.compile_stepper(
-        lagrange("free", "x y", "(x_dot**2 + y_dot**2)/2", constraints=["x**2 + y**2 - 1"]), "svi:2"
-    )
-    y = math.sqrt(0.99)
-    run, mirrored = (rod.integrate([0.1, k * y], velocity=[-y, k * 0.1], h=0.01, steps=5) for k in (1, -1))
-    assert np.allclose(run.q[:, 0], mirrored.q[:, 0], rtol=0, atol=1e-15)
-    samples = _Samples(run, 0.0, rod.interface)
-    assert not samples.independent[:, 1].any()
-    samples.compare(mirrored)
-    assert samples.largest() > 1.0
-
-
 def test_times_far_from_zero_are_rounded_and_said_to_be():
     """Formulas of the time see t to half an ulp, whatever the steps: that is neither a narrow force nor an error."""
     stepper = sc.compile_stepper(lagrange("late", "x", "x_dot**2/2 + x*cos(t - a)", a=0.0), "svi:8")
     for late, warning in ((1e6, nullcontext()), (1e9, pytest.warns(sc.AccuracyWarning, match="begin at t = 0: at t"))):
         with warning:
             run = stepper.integrate([0.0], [0.0], t=late, t_end=late + 5.0, parameters={"a": late}, error=1e-9)
-        assert abs(run.q[-1, 0] - (1.0 - math.cos(5.0))) < run.global_error < 1e-6
+        assert abs(run.q[-1, 0] - (1.0 - math.cos(5.0))) < np.ptp(run.q) * run.global_error < 1e-6

@@ -10,6 +10,7 @@ import click
 from scvi_codegen.analysis.advice.advice import Advice, Evidence, advise
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.common.errors import AccuracyWarning, StateError
+from scvi_codegen.common.representation import counted
 from scvi_codegen.common.validation import check_tolerance
 from scvi_codegen.interfaces.cli.command_group import tell
 from scvi_codegen.interfaces.cli.reports import duration
@@ -37,8 +38,8 @@ def model_with_adaptive_steps(model: Model, tolerance: float) -> Model:
 def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalError]:
     """Return the model with the steps that meet a global error bound, and the estimate of that error.
 
-    The estimate compares runs with different steps and is printed. Steps of one tolerance are reproducible to the last
-    bit, so that the run that follows is the one whose error was estimated.
+    The estimate is printed. Steps of one tolerance are reproducible to the last bit, so that the run that follows is
+    the one whose error was estimated.
     """
     bounded = model._with_step_size(error=error)
     with warnings.catch_warnings():
@@ -62,7 +63,7 @@ def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalEr
         "precision": result.precision,
     }
     tell(
-        f"global error: {result.estimate:.1e} (relative) by comparison of {result.runs} runs; the bound {error:g} "
+        f"global error: {result.estimate:.1e} (relative), of {counted(result.runs, 'run')}; the bound {error:g} "
         f"is confirmed until t = {result.confirmed_until:g}, with a {local}",
         global_error=numbers,
     )

@@ -73,12 +73,15 @@ def draw_robot(axes: Any, motion: Trajectory, number: int = 0) -> None:
 
 
 @checks_arguments(trajectory=MOTIONS)
-def plot_trajectory(trajectory: Motions, path: str | os.PathLike[str] | None = None) -> tuple[Axes, ...]:
+def plot_trajectory(
+    trajectory: Motions, path: str | os.PathLike[str] | None = None, *, error: bool = False
+) -> tuple[Axes, ...]:
     """Draw the path of a trajectory on the left, its relative energy error over time on the right.
 
     Args:
         trajectory: trajectory to draw, or several of the same system, a colour each.
         path: file for the picture, .png, .svg or .pdf, written atomically; equal trajectories give equal bytes.
+        error: draw the coordinates over time instead of the path, with bands of their errors (``run.error``).
 
     Returns:
         The axes, from left to right.
@@ -90,16 +93,20 @@ def plot_trajectory(trajectory: Motions, path: str | os.PathLike[str] | None = N
     if path is not None:
         check_plot_path(path)
     motions = several(trajectory)
-    interface, count = motions[0].stepper.interface, 1 + path_panels(motions[0])
+    interface, count = motions[0].stepper.interface, 2 if error else 1 + path_panels(motions[0])
     with style():
         figure = new_figure(path, (4.6 * count, 4.4))
-        kinds = [_projection(motions[0]), *[None] * (count - 1)]
+        kinds = [None if error else _projection(motions[0]), *[None] * (count - 1)]
         axes = tuple(figure.add_subplot(1, count, k + 1, projection=kind) for k, kind in enumerate(kinds))
         for panel_axes in axes:  # before axes are made equal, which a change of their ticks would undo
             panel_axes.locator_params(axis="x", nbins=5)
-        draw_paths(axes[:-1], motions)
+        if error:
+            for number, motion in enumerate(motions):
+                _draw_times(axes[0], motion, (), number if len(motions) > 1 else None, error=True)
+        else:
+            draw_paths(axes[:-1], motions)
         plot_energy(motions, ax=axes[-1])
-        named = len(bodies(interface.coordinates))
+        named = 0 if error else len(bodies(interface.coordinates))
         if 1 < named <= len(COLORS) and len(motions) == 1:
             figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=named)
         figure.suptitle(plain(interface.title), fontsize=11)
@@ -180,9 +187,9 @@ class Plots:
 
     trajectory: Any = field(repr=False)
 
-    def __call__(self, path: Path = None) -> tuple[Axes, ...]:
+    def __call__(self, path: Path = None, *, error: bool = False) -> tuple[Axes, ...]:
         """Draw path and energy error, as :func:`scvi_codegen.plot_trajectory`."""
-        return plot_trajectory(self.trajectory, path)
+        return plot_trajectory(self.trajectory, path, error=error)
 
     def motion(self, path: Path = None, *, ax: Axes | None = None) -> Axes:
         """Draw the path, as :func:`scvi_codegen.plot_motion`."""
@@ -192,8 +199,10 @@ class Plots:
         """Draw a phase portrait, as :func:`scvi_codegen.plot_phase`."""
         return plot_phase(self.trajectory, path, axes=axes, ax=ax)
 
-    def time(self, *names: str, path: Path = None, ax: Axes | None = None) -> Axes:
+    def time(self, *names: str, path: Path = None, ax: Axes | None = None, error: bool = False) -> Axes:
         """Draw quantities over time: names as of ``run[name]``, a curve each; by default the coordinates.
+
+        With ``error`` coordinates and momenta have bands of their errors (``run.error``), between saved states.
 
         Raises:
             StateError: for an unknown name, or another suffix of ``path``.
@@ -202,7 +211,8 @@ class Plots:
         motions = several(self.trajectory)
         with panel(path, ax) as panel_axes:
             for number, motion in enumerate(motions):
-                _draw_times(panel_axes, smooth(motion), names, number if len(motions) > 1 else None)
+                drawn = motion if error else smooth(motion)
+                _draw_times(panel_axes, drawn, names, number if len(motions) > 1 else None, error=error)
         return panel_axes
 
     def energy(self, path: Path = None, *, ax: Axes | None = None) -> Axes:
@@ -348,11 +358,24 @@ def _draw_path(panels: Sequence[Axes], motion: Trajectory, which: int | None) ->
         _draw_image(panels[0], motion)
 
 
-def _draw_times(axes: Axes, motion: Trajectory, names: Sequence[str], which: int | None) -> None:
-    """Draw quantities over time, by default the first coordinates, in one colour if the motion is one of several."""
-    names = names or motion.stepper.interface.coordinates[:MAX_CURVES]
+def _draw_times(
+    axes: Axes, motion: Trajectory, names: Sequence[str], which: int | None, *, error: bool = False
+) -> None:
+    """Draw quantities over time, by default the first coordinates, in one colour if the motion is one of several.
+
+    With ``error`` the errors of coordinates and momenta are drawn as bands; they are wider than the curve from some
+    per mil of the motion on.
+    """
+    interface = motion.stepper.interface
+    names = names or interface.coordinates[:MAX_CURVES]
+    columns = [*interface.coordinates, *interface.momentum_columns]
+    bounds = np.concatenate(motion.error.bounds, axis=1) if error else np.empty(0)
     for number, name in enumerate(names):
-        axes.plot(motion.t, motion[name], color=color(number if which is None else which), label=plain(name))
+        shade = color(number if which is None else which)
+        axes.plot(motion.t, motion[name], color=shade, label=plain(name))
+        if error and name in columns:
+            bound = bounds[:, columns.index(name)]
+            axes.fill_between(motion.t, motion[name] - bound, motion[name] + bound, color=shade, alpha=0.3, linewidth=0)
     axes.set(xlabel="t", ylabel=plain(names[0]) if len(names) == 1 else "", title="motion in time")
     if len(names) > 1 and not which:
         axes.legend(loc="best")

@@ -1,125 +1,72 @@
-"""Global error of an adaptive run, confirmed by runs that do not share its step sequence.
+"""Global error bound of adaptive runs, ``error=``: local tolerances are reduced until ``run.error`` is below it.
 
-A run is compared with one whose local tolerance is a thousand times smaller, so that the difference is its error, and
-whose steps end at other, irregular times, as steps that follow from the motion alone (free flight) are the same for all
-tolerances; where formulas are not smooth, they also end where these jump or have a kink. Forces that are so narrow that
-both pass over them are sought in short pieces (:mod:`.narrow_forces`), and limit the steps of further runs. Three times
-the largest difference is the estimate. While that exceeds the wanted error, a run of smaller tolerance is judged in the
-same way. Where rounding dominates, all runs have errors of the same size, and one run with nearly the same error is not
-rare: the run is compared with two others and a factor of twelve, or with three and a factor of four, for which
-agreement by chance is equally improbable. The last runs, at round-off level, are compared with each other; what they do
-not confirm stays unconfirmed. (R. D. Skeel, Thirteen ways to estimate global error, Numer. Math. 48 (1986) 1-20; E.
-Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I, II.4.)
+A run of the tolerance ``error / 100`` is judged by its global error (:mod:`.run_error`), which the next tolerance
+follows from, as the error is proportional to it. Forces so narrow that the run and its judge pass over them are sought
+in short pieces of its steps (:mod:`.narrow_forces`), and limit the steps of further runs. The last run has the accuracy
+of round-off; what its error exceeds is confirmed until the time at which it does.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate, chain, repeat
-from operator import mul
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native.arguments import checked_number
-from scvi_codegen.codegen.rendering.source import Interface
-from scvi_codegen.common.errors import AccuracyWarning, StateError, StepFailedError, warn
+from scvi_codegen.common.errors import AccuracyWarning, ScviCodegenError, StateError, StepFailedError, warn
 from scvi_codegen.runs.accuracy.narrow_forces import differences_in_pieces, longest_piece
-from scvi_codegen.runs.accuracy.size import Motion, first_of_groups, momenta_of_velocities, relative, roundoff
+from scvi_codegen.runs.accuracy.run_error import DEVIATIONS, LOST, RunError, leave_out_rounding, relative_until
+from scvi_codegen.runs.accuracy.size import relative, roundoff
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
-from scvi_codegen.runs.stepping.projection import determined_coordinates
-from scvi_codegen.runs.stepping.step_plan import Adaptive, absolute_tolerances
 
 Array = NDArray[np.float64]
 
-FIRST, RATIO = 1e-3, 1e-3
-"""First local tolerance relative to the wanted error; next tolerance, and that of a comparison, relative to a run's."""
-GAIN = 100.0
-"""Factor by which ``RATIO`` reduces the error of nearly every run."""
-ROUNDED, ROUNDED_OF_TAU, LEAST = 0.99e-12, 1e-10, 1e-17
-"""Tolerances below which rounding may dominate errors, also with steps of tau, and from which the last runs are made.
-
-Steps of tau are equal, so that many have smaller errors than the tolerance.
-"""
-FINER = 0.1
-"""Ratio of the tolerances of a run whose error rounding may dominate, of its three comparisons, and of the next run."""
-LAST = (None, 1e-18, 1e-19, 1e-20)
-"""Tolerances of the last runs (``None``: the default, round-off level), which are compared with each other."""
-ROUNDED_OF_TWO_WORDS, LEAST_OF_TWO_WORDS, LAST_OF_TWO_WORDS = 1e-26, 1e-30, (1e-30, 1e-29, 1e-28)
-"""The same with states of two words."""
-COARSER = 1e4
-"""Factor of the tolerance of a comparison that fails, for a second attempt."""
-SAFETY, SAFETIES_OF_ROUNDING = 3.0, (400.0, 12.0, 4.0)
-"""Factors between the largest difference and the estimate; for one to three comparisons where rounding may dominate.
-
-If the errors are independent normal numbers, that of a further run is within e / s of the error e of the run in
-1 / (pi s) of the cases, for s = 400 in 8 of 10,000; those of two are both within e / 12, those of three within e / 4 in
-as many.
-"""
-PARTS_AT_KINKS, LEAST_AT_KINKS = (math.inf, 0.0913, 0.0331, 0.0127, 0.00491), 1e-13
-"""Largest steps relative to the run, one after the other, of formulas that are not smooth: free flight has the same
-steps for all tolerances, one of which may end beyond a kink. The least tolerance of these runs, unless the first one is
-smaller."""
+FIRST, GOAL = 0.01, 0.5
+"""First local tolerance relative to the bound; part of it that the next tolerance aims at."""
+LEAST_REDUCTION, LARGE, LARGE_REDUCTION = 0.3, 0.05, 1e-3
+"""Largest ratio of successive tolerances; errors from which on they are not proportional to it, and its ratio then."""
+MOST_RUNS, LEAST = 5, (1e-16, 1e-30)
+"""Largest number of runs; tolerances of one and two words below which runs are at round-off."""
 MOST_EXAMINATIONS, FINER_PIECES = 2, 0.0625
-"""Searches for narrow forces; ratio of their pieces, the second one where the first one succeeds."""
+"""Searches for narrow forces; ratio of their pieces, the second one where the first one finds some."""
 PART_OF_ERROR, ROUNDINGS = 0.01, 1024.0
-"""Differences in pieces that count: parts of the wanted error, which later steps may enlarge; roundings."""
-LEAST_STOPS, LONG, STRIDE, MOST_STOPS = 8, 64, 16, 32
-"""Of a run for comparison, numbers of times at which steps end: least; see :func:`irregular_stops`; most of others."""
-GOLDEN, MARGIN, IRREGULAR = 0.6180339887498949, 0.05, 0.8191725134
-"""Golden ratio; part of a step at its ends that is not cut; ratio of steps of tau of runs for comparison."""
-FURTHER, MANY = 300, 100_000
-"""Runs end after so many times the steps of the first one in all, and so many more: what is confirmed then remains."""
-LEAST_SAMPLES, STEPS_PER_SAMPLE, MOST_SAMPLES, MOST_NUMBERS = 16, 16, 512, 2**22
-"""Numbers of states that are compared: least, per steps, most, and most times the number of coordinates."""
-ORDER = 10.0
-"""Power of a step of tau that a local tolerance stands for: ``RATIO`` halves the steps of a time transformation."""
+"""Differences in pieces that count: parts of the bound, which later steps may enlarge; roundings."""
+ROUNDINGS_OF_RESULT = 10.0
+"""Smallest estimate in roundings."""
 UNEVEN = 30.0
 """Ratio of the longest to the shortest step from which on a time transformation is recommended."""
-SLIGHT = 1e-12
-"""Ratio to the largest position or momentum below which a change is no reason to compare a state."""
-TINY = math.ulp(0.0)
-"""Smallest positive number."""
-LOST = 0.1
-"""Estimate from which on runs are uncorrelated."""
 NAMES_OF_PRECISIONS = {1: "double", 2: "double-double"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GlobalError:
-    """Differences between a run and others with smaller steps, and the estimate of its global error.
+    """Bound of the global error of a run, and how far it is confirmed.
 
     Attributes:
         requested: requested bound of the relative global error.
         tolerance: local tolerance of the returned run; ``None`` for round-off.
         h: step of tau of a run in transformed time, else ``None``.
-        t: (n,) times at which the runs were compared: at most 512 of the saved states, where the motion is fast.
-        differences: (n,) the largest difference of a position relative to the range of that coordinate over the run, or
-            of a momentum relative to its own or that of its velocity (:mod:`scvi_codegen.runs.accuracy.size`); not of
-            coordinates that constraints determine from others at that time, where their positions differ by rounding.
-        safety: factor of the estimate: 3; where rounding may dominate the error, 400 for one comparison (which confirms
-            nothing), 12 for two, 4 for three.
-        estimate: this factor times the largest difference, at least ten roundings and the tolerance; meaningless above
-            about 0.1, where runs are uncorrelated.
-        confirmed_until: last of the times up to which the factor times each difference is at most the requested error.
+        estimate: largest relative error of the run with its rounding errors, ``run.error.relative`` at the end, at
+            least ten roundings; an order of magnitude only above 0.01, infinite where it is unknown.
+        confirmed_until: last of the times up to which the error, relative to the size of the motion until then, is at
+            most the requested one.
         runs: number of runs.
         precision: ``"double"`` or ``"double-double"``.
-        max_step: largest step of the returned run, limited where the formulas are not smooth or forces are narrow.
+        max_step: largest step of the returned run, limited where forces are narrow.
+        reason: why the error is unknown from ``confirmed_until`` on, else empty.
     """
 
     requested: float
     tolerance: float | None
     h: float | None
-    t: Array
-    differences: Array
-    safety: float
     estimate: float
     confirmed_until: float
     runs: int
     precision: str = "double"
     max_step: float = math.inf
+    reason: str = ""
 
     @property
     def confirmed(self) -> bool:
@@ -141,24 +88,24 @@ class GlobalError:
 
 
 class Confirmed:
-    """Properties of a trajectory whose global error may have been estimated by a second run (``error=``)."""
+    """Properties of a trajectory whose global error was bounded (``error=``)."""
 
     __slots__ = ()
     confirmation: GlobalError | None
 
     @property
     def global_error(self) -> float:
-        """Relative error of all states, by a second run with other steps; NaN without ``error=``."""
+        """Relative error of all states, of the run, :class:`GlobalError`; NaN without ``error=``."""
         return math.nan if self.confirmation is None else self.confirmation.estimate
 
     @property
     def confirmed_digits(self) -> int | None:
-        """Number of decimal digits of all states that a second run confirms; ``None`` without ``error=``."""
+        """Number of decimal digits of all states that are confirmed; ``None`` without ``error=``."""
         return None if self.confirmation is None else self.confirmation.digits
 
     @property
     def confirmed_until(self) -> float:
-        """Time until which a second run confirms the error asked for; NaN without ``error=``."""
+        """Time until which the error asked for is confirmed; NaN without ``error=``."""
         return math.nan if self.confirmation is None else self.confirmation.confirmed_until
 
 
@@ -178,12 +125,12 @@ class ConfirmedEnsemble:
 
     @property
     def confirmed_digits(self) -> NDArray[np.int64]:
-        """(k,) numbers of decimal digits of all states that a second run confirms; 0 where there is none."""
+        """(k,) numbers of decimal digits of all states that are confirmed; 0 where there is none."""
         return self._of_each("digits", 0).astype(np.int64)
 
     @property
     def confirmed_until(self) -> Array:
-        """(k,) times until which a second run confirms the error asked for; NaN where there is none."""
+        """(k,) times until which the error asked for is confirmed; NaN where there is none."""
         return self._of_each("confirmed_until", math.nan)
 
 
@@ -224,7 +171,7 @@ def checked_error(error: Any, others: Mapping[str, Any], stepper: Any = None) ->
 
 def smallest_estimate(words: int) -> float:
     """Return the smallest estimate of an error of states of one or two words."""
-    return 10.0 * roundoff(words)
+    return ROUNDINGS_OF_RESULT * roundoff(words)
 
 
 def warn_of_unconfirmed_run(trajectory: Any) -> None:
@@ -232,36 +179,21 @@ def warn_of_unconfirmed_run(trajectory: Any) -> None:
     result: GlobalError = trajectory.confirmation
     if result.confirmed or not warnings_wanted():
         return
+    at_start = result.confirmed_until == float(trajectory.t[0])
+    until = "at no time" if at_start else f"until t = {result.confirmed_until:.6g} only"
+    why = f" ({result.reason})" if result.reason else f": that of the run is up to about {result.estimate:.1e}"
+    remedy = "Give a larger error" if at_start else "End the run there, or give a larger error"
     warn(
-        f"the global error {result.requested:g} is {_confirmed_part(result, float(trajectory.t[0]))}: runs with other "
-        f"steps differ by up to about {result.estimate:.1e}. {_remedy(result, float(trajectory.t[0]))}"
-        f"{_alternative(trajectory, result)}",
+        f"the global error {result.requested:g} is confirmed {until}{why}. {remedy}{_alternative(trajectory, result)}",
         AccuracyWarning,
     )
 
 
-def _confirmed_part(result: GlobalError, start: float) -> str:
-    if result.confirmed_until == start:
-        return "confirmed at no time"
-    return f"confirmed until t = {result.confirmed_until:.6g} only"
-
-
-def _remedy(result: GlobalError, start: float) -> str:
-    return "Give a larger error" if result.confirmed_until == start else "End the run there, or give a larger error"
-
-
 def _alternative(trajectory: Any, result: GlobalError) -> str:
-    """Return the recommendation of ends of steps at kinks, or of a time transformation for uneven steps.
-
-    The latter is for conservative motions.
-    """
-    if trajectory.modes is not None and trajectory.modes.ambiguous:
-        return "; but several motions of the contacts were consistent: others are as consistent as this one"
+    """Return a further remedy: for kinks, times far from 0, or by a time transformation of conservative motions."""
     latest = float(abs(trajectory.t).max())
     if math.ulp(latest) > result.requested * float(np.ptp(trajectory.t)):
         return f"; or begin at t = 0: at t = {latest:g} times are rounded by {math.ulp(latest):.1e}"
-    if math.isinf(result.estimate):
-        return f"; or use a method of higher order: others took more than {FURTHER} times the steps of the first run"
     if kinks := trajectory.stepper.interface.kinks:
         return (
             "; or give max_step=, a tenth of the shortest pulse or contact, or, without error=, events there "
@@ -269,8 +201,7 @@ def _alternative(trajectory: Any, result: GlobalError) -> str:
         )
     lengths = abs(trajectory.step_sizes[:-1])
     lengths = lengths[np.isfinite(lengths)][:-1]  # t_end shortens the last step
-    adaptive = isinstance(trajectory.plan, Adaptive)
-    suitable = adaptive and trajectory.stepper.interface.conserves_energy and result.estimate < LOST
+    suitable = result.h is None and trajectory.stepper.interface.conserves_energy and result.estimate < LOST
     if not suitable or not lengths.size or lengths.max() < UNEVEN * lengths.min():
         return ""
     return (
@@ -279,355 +210,139 @@ def _alternative(trajectory: Any, result: GlobalError) -> str:
     )
 
 
-Attempt: TypeAlias = tuple[Any, GlobalError]
-"""Run, and the estimate of its error."""
-
-
 class Runs:
-    """Runs of one motion by tolerance, one of which is returned and confirmed by others.
+    """Runs of one motion by tolerance, one of which is returned with its global error.
 
     Args:
         motion: makes the runs (:class:`~scvi_codegen.runs.driver.bounded_motion.BoundedMotion`).
     """
 
     def __init__(self, motion: Any) -> None:
-        self.motion, self.requested, self.interface = motion, motion.error, motion.stepper.interface
-        self.start: float = checked_number(motion.initial.t, "the time t")
-        self.words: int = self.interface.words
-        self.first, self.count, self.most = min(self.requested * FIRST, 0.1), 0, math.inf
-        self.taken: float = 0.0
-        self.h: float | None = None
-        self.least, self.rounded = LEAST, ROUNDED
-        self.last: tuple[float | None, ...] = LAST
-        self.failure: StepFailedError | None = None
-        self.compared: Any = None
-        if self.words > 1:
-            self.least, self.rounded, self.last = LEAST_OF_TWO_WORDS, ROUNDED_OF_TWO_WORDS, LAST_OF_TWO_WORDS
-        if not motion.smooth:  # errors are as random as those of rounding
-            self.rounded = 1.0
-        has_tau = motion.stepper._has_tau
-        if has_tau:
-            self.rounded, self.first = ROUNDED_OF_TAU, max(self.first, LEAST)
-            self.h = motion.step_of_tau(self.first)
-        elif self.first < self.rounded:  # the factor of the estimate is larger there
-            self.first *= FINER
-        self.parts = () if has_tau or not self.interface.kinks else PARTS_AT_KINKS
-        self.is_examined = not (has_tau or self.interface.kinks or self.words > 1)
-        self.examinations, self.largest = 0, math.inf
+        self.motion, self.requested, interface = motion, motion.error, motion.stepper.interface
+        self.words, self.has_tau = interface.words, motion.stepper._has_tau
+        self.is_examined = not (self.has_tau or interface.kinks or self.words > 1)
+        self.examinations, self.largest, self.count = 0, math.inf, 0
 
     @without_accuracy_warnings()
     def confirmed_run(self) -> Any:
         """Return the run whose global error is at most ``requested``, or the most accurate one.
 
         Raises:
-            StepFailedError: if the most accurate run fails.
+            StepFailedError: if all runs fail.
         """
-        trajectory, result = self._judged()
-        trajectory.confirmation = result
-        return trajectory
+        tolerance: float | None = FIRST * self.requested
+        best, failure, run = None, None, None
+        while self.count < MOST_RUNS:
+            is_last = self.count == MOST_RUNS - 1
+            tolerance = None if is_last or tolerance is None or tolerance < LEAST[self.words - 1] else tolerance
+            try:
+                run = self._run(tolerance)
+            except StepFailedError as failed:
+                failure, result, run = failed, None, None
+            else:
+                result = run.confirmation
+                if result.confirmed and self._passes_over_forces(run):
+                    run.confirmation = replace(result, estimate=math.inf, confirmed_until=float(run.t[0]))
+                    best = run if best is None else best
+                    continue
+                if best is None or result.estimate <= best.confirmation.estimate:
+                    best = run
+            if tolerance is None or (result is not None and (result.confirmed or result.reason)):
+                break
+            tolerance = None if self._is_rounded(run) else tolerance * self._reduction(result)
+        if best is None:
+            assert failure is not None  # of the last run
+            raise failure
+        best.confirmation = replace(best.confirmation, runs=self.count)
+        return self._with_output(best)
 
-    def _steps(self, tolerance: float | None, factor: float = 1.0) -> dict[str, float | None]:
-        if self.h is None:
-            return {"tolerance": tolerance}
-        ratio = (LEAST if tolerance is None else tolerance) / self.first
-        return {"h": factor * self.h * ratio ** (1.0 / ORDER)}
+    def _is_rounded(self, run: Any) -> bool:
+        """Return whether the rounding errors of a run alone exceed the bound, which no tolerance reduces."""
+        if run is None or (error := run._error) is None:
+            return False
+        rounding = np.nanmax(np.array([error.rounding_q, error.rounding_p]), axis=1)
+        return bool(DEVIATIONS * relative(rounding, error.sizes).max() > self.requested)
 
-    def _run(self, tolerance: float | None, max_step: float = math.inf) -> Any:
+    def _reduction(self, result: GlobalError | None) -> float:
+        """Return the ratio of the next tolerance to that of a run, or of one that failed."""
+        if result is None or not result.estimate <= LARGE:
+            return LARGE_REDUCTION
+        return float(min(LEAST_REDUCTION, GOAL * self.requested / result.estimate))
+
+    def _steps(self, tolerance: float | None) -> dict[str, float | None]:
+        if self.has_tau:
+            return {"h": self.motion.step_of_tau(roundoff(self.words) if tolerance is None else tolerance)}
+        limit = {} if self.largest == math.inf else {"max_step": self.largest}
+        return {"tolerance": tolerance, **limit}
+
+    def _run(self, tolerance: float | None) -> Any:
+        """Return a run with all states and its confirmation."""
+        steps = self._steps(tolerance)
+        run = self.motion.run(**steps)
         self.count += 1
-        check = self._check_count if self.most < math.inf else None
-        limit = {} if (max_step := min(max_step, self.largest)) == math.inf else {"max_step": max_step}
-        trajectory = self.motion.run(check, **self._steps(tolerance), **limit)
-        self.most = min(self.most, FURTHER * trajectory.steps + MANY)
-        self.taken += trajectory.steps
-        return trajectory
-
-    def _other(self, tolerance: float | None, compared: "_Samples", number: int) -> Any:
-        """Return a run for comparison, to its last state if it fails or takes too many steps."""
-        self.count += 1
-        stops = irregular_stops(compared.steps_of_run, number)
-        limit = {} if self.largest == math.inf else {"max_step": IRREGULAR * self.largest}
+        h, floor, start = steps.get("h"), smallest_estimate(self.words), float(run.t[0])
+        estimate, until, reason = math.inf, start, ""
         try:
-            run = self.motion.compared_run(stops, self._check_count, **self._steps(tolerance, IRREGULAR), **limit)
-        except StepFailedError as failure:
-            if failure.trajectory is None:
-                raise
-            run = failure.trajectory
-        self.taken += run.steps
+            error = run.error
+        except ScviCodegenError as refused:
+            reason = str(refused)
+        else:
+            missed = 0.0 if run.modes is None else run.modes.missed
+            floor = max(floor, missed)
+            estimate = max(float(error.relative[-1]), floor)
+            until, reason = self._confirmed_until(error, floor), error.reason
+        run.confirmation = GlobalError(
+            requested=self.requested,
+            tolerance=tolerance,
+            h=h,
+            estimate=estimate,
+            confirmed_until=until,
+            runs=self.count,
+            precision=NAMES_OF_PRECISIONS[self.words],
+            max_step=self.largest,
+            reason=reason,
+        )
         return run
 
-    def _check_count(self, steps: int) -> None:
-        if self.taken + steps > self.most:
-            self.taken = self.most  # no further run begins
-            raise _TooManyStepsError
+    def _confirmed_until(self, error: RunError, floor: float) -> float:
+        """Return the time up to which errors are at most ``requested`` parts of the motion until then.
 
-    def _judged(self, passing: Attempt | None = None) -> Attempt:
-        """Return the first run that is confirmed, and its estimate; otherwise the better one.
-
-        Args:
-            passing: the run before that passes over forces; it is lost if none of smaller steps can be made.
+        The size of a motion that is not confirmed is that up to the last confirmed time, as what follows is not known.
         """
-        attempts: list[tuple[Attempt, _Samples]] = []
-        for attempt in chain(self._limited() if self.parts else self._by_tolerance(), self._at_round_off()):
-            if attempt[1].confirmed:
-                return self._judged(attempt) if self._passes_over_forces(self.compared) else attempt
-            attempts.append((attempt, self.compared))
-        if not attempts and passing is not None:
-            return passing[0], replace(passing[1], estimate=math.inf, confirmed_until=self.start)
-        if self.failure is not None and not attempts:
-            raise self.failure
-        best, compared = min(attempts, key=lambda attempt: attempt[0][1].estimate)
-        further = [best[0]] if len(best[0].t) == best[0].steps + 1 else []
-        return self._judged(best) if self._passes_over_forces(compared, *further) else best
+        relative, rows = error.relative, len(error.t)
+        while rows > 1:
+            met = np.maximum(relative, floor) <= self.requested
+            if met.all():
+                break
+            rows = int(np.argmin(met))
+            relative = relative_until(error, rows)[1] if rows else relative
+        return float(error.t[max(rows - 1, 0)])
 
-    def _passes_over_forces(self, samples: "_Samples", *further: Any) -> bool:
-        """Return whether the farthest run, or a further one, passes over forces; runs have smaller steps then."""
-        run = samples.farthest
-        if not self.is_examined or self.examinations == MOST_EXAMINATIONS or run is None:
+    def _passes_over_forces(self, run: Any) -> bool:
+        """Return whether a run passes over forces, which its steps in pieces meet; further runs have smaller steps."""
+        if not self.is_examined or self.examinations == MOST_EXAMINATIONS or self.count == MOST_RUNS:
             return False
-        size = longest_piece(run, self.motion.end - self.start) * FINER_PIECES**self.examinations
+        start, end = float(run.t[0]), float(run.t[-1])
+        size = longest_piece(run, self.motion.end - start) * FINER_PIECES**self.examinations
         self.examinations += 1
-        apart = np.array([differences_in_pieces(compared, size) for compared in (run, *further)]).max(axis=0)
-        apart[:, ~samples.independent.any(axis=0) & samples.is_rounding(apart[0]).any(axis=0)] = 0.0
-        differences = relative(apart, samples.sizes(len(samples.t), apart)).max()
-        end = samples.end
-        rounding = samples.epsilon * max(1.0, max(abs(self.start), abs(end)) / abs(end - self.start))  # also of times
-        if differences <= max(PART_OF_ERROR * self.requested, ROUNDINGS * rounding):
+        apart = differences_in_pieces(run, size)
+        if not apart.any():
+            return False
+        rounding = roundoff(1) * max(1.0, max(abs(start), abs(end)) / abs(end - start))  # also of times
+        bound = max(PART_OF_ERROR * self.requested, ROUNDINGS * rounding)
+        entries = relative(apart, run.error.sizes)[:, None]
+        leave_out_rounding(run, apart[:, None], entries)
+        if entries.max() <= bound:
             return False
         self.largest = size
         return True
 
-    def _by_tolerance(self) -> Iterator[Attempt]:
-        """Yield runs of smaller and smaller tolerances, until errors are too large for an extrapolation."""
-        tolerance, estimate = self.first, 0.0
-        while tolerance > 2.0 * self.least and estimate < 1.0:
-            powers, (ratio, smaller) = 1, self._smaller(tolerance)
-            with self._suppressed_failure():
-                trajectory = self._run(tolerance)
-                result = self._estimated(trajectory, tolerance, smaller)
-                yield trajectory, result
-                estimate = result.estimate
-                powers = max(1, math.ceil(math.log(min(estimate, 1.0) / self.requested, GAIN) * math.log(RATIO, ratio)))
-            tolerance = list(accumulate(repeat(ratio, powers), mul, initial=tolerance))[-1]
-
-    def _limited(self) -> Iterator[Attempt]:
-        """Yield runs of smaller and smaller largest steps."""
-        tolerance, last, longest = self.first, None, math.inf
-        for part in self.parts:
-            max_step = part * abs(self.motion.end - self.start)
-            if (last, max_step >= longest) == (tolerance, True):
-                continue  # the steps would be those of the run before
-            last = tolerance
-            with self._suppressed_failure():
-                trajectory = self._run(tolerance, max_step)
-                longest = float(np.abs(np.diff(trajectory.t)).max(initial=0.0))
-                yield trajectory, self._estimated(trajectory, tolerance, self._smaller(tolerance)[1], max_step)
-            tolerance = max(RATIO * tolerance, min(tolerance, LEAST_AT_KINKS))
-
-    def _at_round_off(self) -> Iterator[Attempt]:
-        """Yield the last runs, as long as their errors are not far above the wanted one."""
-        for tolerance in self.last:
-            with self._suppressed_failure():
-                trajectory = self._run(tolerance)
-                others = [other for other in self.last if other != tolerance]
-                result = self._estimated(trajectory, tolerance, others, last=True)
-                yield trajectory, result
-                if result.estimate > GAIN * self.requested:
-                    return
-
-    @contextmanager
-    def _suppressed_failure(self) -> Iterator[None]:
-        """Go on after a run that fails, or takes too many steps."""
-        try:
-            yield
-        except StepFailedError as failure:
-            self.failure = failure
-        except _TooManyStepsError:
-            pass
-
-    def _smaller(self, tolerance: float) -> tuple[float, list[float]]:
-        """Return the tolerances of the runs that a run is compared with, and their ratio."""
-        ratio, count = (FINER, 3) if tolerance < self.rounded else (RATIO, 1)
-        return ratio, list(accumulate(repeat(ratio, count), mul, initial=tolerance))[1:]
-
-    def _estimated(
-        self,
-        trajectory: Any,
-        tolerance: float | None,
-        others: Sequence[float | None],
-        max_step: float = math.inf,
-        *,
-        last: bool = False,
-    ) -> GlobalError:
-        """Return the estimate of the error of a run by others; the last runs are compared with all of them."""
-        self.compared = compared = _Samples(trajectory, self.start, self.interface)
-        safety = SAFETY if len(others) == 1 else SAFETIES_OF_ROUNDING[-1]
-        missed = 0.0 if trajectory.modes is None else trajectory.modes.missed
-        floor = max(smallest_estimate(self.words), 0.0 if tolerance is None else tolerance, missed)
-        for number, other in enumerate(others if compared.end != self.start else ()):
-            if number == 2 and SAFETIES_OF_ROUNDING[1] * compared.largest() <= self.requested:
-                safety = SAFETIES_OF_ROUNDING[1]
-                break
-            try:
-                complete = compared.compare(self._other(other, compared, number))
-                if last and not complete:
-                    coarser = COARSER * (self.least if other is None else other)
-                    compared.compare(self._other(coarser, compared, number))
-            except _TooManyStepsError:
-                compared.lose()
-            if not last and safety * compared.largest() > self.requested:
-                safety = SAFETY if len(others) == 1 else SAFETIES_OF_ROUNDING[number]
-                break
-        if trajectory.modes is not None and trajectory.modes.ambiguous:
-            compared.lose()  # all runs chose the same one of several motions
-        differences, reached = compared.relative(lambda errors: np.maximum(safety * errors, floor) <= self.requested)
-        largest = float(differences.max(initial=0.0))
-        return GlobalError(
-            requested=self.requested,
-            tolerance=tolerance,
-            h=self._steps(tolerance).get("h"),
-            max_step=min(max_step, self.largest),
-            t=compared.t,
-            differences=differences,
-            safety=safety,
-            estimate=math.inf if math.isnan(largest) else max(safety * largest, floor),
-            confirmed_until=float(compared.t[reached - 1]) if reached else self.start,
-            runs=self.count,
-            precision=NAMES_OF_PRECISIONS[self.words],
-        )
-
-
-class _TooManyStepsError(Exception):
-    """Raised if a run for comparison takes many more steps than the run that it is compared with."""
-
-
-def irregular_stops(t: Array, number: int) -> list[float]:
-    """Return times within the steps of a run at which another ends steps, so that it does not share their sequence.
-
-    Steps that follow from the motion alone, as in free flight, are the same for all tolerances. At least
-    ``LEAST_STOPS`` steps are cut, all that are longer than a ``LONG``-th of the run, and of others every
-    ``STRIDE``-th, at fractions that are multiples of the golden ratio modulo 1.
-
-    Args:
-        t: (n,) ends of steps, or other times of the run, with the first and the last time of the run.
-        number: of the comparison; each has other times.
-    """
-    sizes = np.diff(t)
-    pieces = max(1, -(-LEAST_STOPS // max(1, len(sizes))))
-    is_cut = abs(sizes) * LONG > abs(t[-1] - t[0])
-    is_cut[number :: max(STRIDE, -(-len(sizes) // MOST_STOPS))] = True
-    k = np.repeat(np.flatnonzero(is_cut), pieces)
-    parts = (np.arange(1, len(k) + 1) * GOLDEN + number / 3.0) % 1.0
-    stops = np.unique(t[k] + (MARGIN + (1.0 - 2.0 * MARGIN) * parts) * sizes[k])
-    inner = stops[(stops != t[0]) & (stops != t[-1])]
-    return [*(inner if t[-1] > t[0] else inner[::-1]).tolist(), float(t[-1])]
-
-
-class _Samples:
-    """States of a run for comparison with others.
-
-    Attributes:
-        t, states: (k,) times, and (2, k, m) positions and momenta: the last state, and from each of equal numbers of
-            states the one where positions or momenta change fastest relative to their sizes, as an error in time has
-            the largest effect there.
-        kinetic: (k, m) momenta of velocities.
-        independent: (k, m) whether constraints do not determine a coordinate, and its momentum, from others.
-        errors: (2, k, m) largest differences from other runs, at least the rounding errors of the states; 0 of
-            coordinates that constraints determine, where their positions differ by rounding.
-        steps_of_run: (n,) initial time, and times of all saved states.
-        end: last time.
-        farthest: run with the largest difference.
-    """
-
-    def __init__(self, trajectory: Any, start: float, interface: Interface) -> None:
-        t, states = np.asarray(trajectory.t), [trajectory.q, trajectory.p]
-        self.start, self.end, steps = start, t.item(-1), len(t) - 1
-        self.forward = math.copysign(1.0, self.end - start)
-        self.steps_of_run = t if t[0] == start else np.insert(t, 0, start)
-        m = trajectory.q.shape[1]
-        count = max(LEAST_SAMPLES, min(len(t) // STEPS_PER_SAMPLE, MOST_SAMPLES, MOST_NUMBERS // m))
-        rows: Any = slice(None)
-        if count < steps:
-            speed = np.zeros(steps)
-            with np.errstate(all="ignore"):
-                for columns in map(np.asarray, states):
-                    largest = np.abs(columns).max(axis=0)
-                    unit = np.maximum(largest, SLIGHT * largest.max() or 1.0)
-                    speed = np.fmax(speed, np.abs(np.diff(columns / unit, axis=0)).max(axis=1))
-                speed /= np.maximum(abs(np.diff(t)), TINY)
-            size = -(-steps // count)
-            parts = np.full((-(-steps // size), size), -1.0)
-            parts.ravel()[:steps] = speed
-            fastest = np.arange(1, steps + 1, size) + parts.argmax(axis=1)
-            rows = [0, *fastest.tolist()]
-            rows += [steps] if rows[-1] < steps else []
-        if trajectory.modes is not None:  # momenta jump at impacts, a rounding earlier or later
-            changed = {*trajectory.modes.t.tolist()} - {t[0], t[-1]}
-            rows = [k for k in np.arange(len(t))[rows] if t[k] not in changed]
-        self.t, self.states = t[rows], [vectors[rows] for vectors in states]
-        self.epsilon, self.firsts = roundoff(interface.words), first_of_groups(interface, m)
-        self.independent = np.ones(self.states[0].shape, bool)
-        for row, t_row, q in zip(self.independent, self.t, self.states[0], strict=True):
-            row[determined_coordinates(trajectory.stepper, np.asarray(q), float(t_row), trajectory.parameters)] = False
-        self.errors = self.epsilon * self.independent * np.abs(np.array([np.asarray(x) for x in self.states]))
-        self.motion: Motion | None = None
-        self.farthest: Any = None
-        q, p = self.states
-        self.kinetic = momenta_of_velocities(trajectory.stepper, self.t, q, p, trajectory.parameters)
-        plan = trajectory.plan
-        self.absolute: Array | float = 0.0
-        if isinstance(plan, Adaptive):
-            self.absolute = absolute_tolerances(interface, m, plan.absolute_tolerance)
-
-    def compare(self, other: Any) -> bool:
-        """Compare with another run, whose differences are infinite after its end; return whether it is complete."""
-        ahead = self.forward * (self.t - np.asarray(other.t)[-1])
-        some = ahead <= 0.0
-        differences = np.full(self.errors.shape, np.inf)
-        with suppress(StepFailedError), np.errstate(all="ignore"):  # a partial step
-            if some.any():
-                states = other._states_at(self.t[some])
-                differences[:, some] = [abs(x - y[some]) for x, y in zip(states, self.states, strict=True)]
-        differences[:, ~self.independent & self.is_rounding(differences[0])] = 0.0
-        before = self.largest()
-        np.maximum(self.errors, differences, out=self.errors)
-        self.motion = Motion(np.asarray(other.t), other.q, other.p, self.firsts, self.epsilon, self.absolute)
-        if self.farthest is None or self.largest() > before:
-            self.farthest = other
-        return bool(np.isfinite(differences).all())
-
-    def is_rounding(self, apart: Array) -> NDArray[np.bool_]:
-        """Return (k, m) whether differences of positions are those of rounding, and not of another branch."""
-        return np.asarray(apart <= ROUNDINGS * self.epsilon * np.abs(np.asarray(self.states[0])))
-
-    def lose(self) -> None:
-        """Record that a run for comparison has not ended."""
-        self.errors[:, self.t != self.start] = np.inf
-
-    def largest(self) -> float:
-        """Return the largest error relative to the size of the whole motion."""
-        return float(self.relative()[0].max(initial=0.0))
-
-    def sizes(self, reached: int, errors: Array) -> Array:
-        """Return (2, m) sizes of positions and momenta up to a sample, for errors of shape (2, m)."""
-        assert self.motion is not None
-        return self.motion.sizes(float(self.t[reached - 1]), errors, self.kinetic[:reached].max(axis=0))
-
-    def relative(self, within: Callable[[Array], NDArray[np.bool_]] | None = None) -> tuple[Array, int]:
-        """Return (k,) errors relative to the size of the motion, and up to which of them ``within`` is true.
-
-        The size of an unconfirmed run is that up to the last confirmed time, as what follows is not known.
-        """
-        if self.motion is None:  # no run for comparison was necessary, or none has ended
-            differences = np.where(np.isfinite(self.errors).all(axis=(0, 2)), 0.0, np.inf)
-            return differences, len(self.t) if np.isfinite(differences).all() else int(np.argmax(differences))
-        whole, reached = np.empty(0), len(self.t)
-        while reached:
-            errors = self.errors[:, :reached]
-            sizes = self.sizes(reached, errors.max(axis=1))
-            differences = relative(errors, sizes[:, None]).max(axis=(0, 2))
-            whole = whole if whole.size else differences
-            met = np.ones(reached, bool) if within is None else within(differences)
-            if met.all():
-                break
-            reached = int(np.argmin(met))
-        return whole, reached
+    def _with_output(self, run: Any) -> Any:
+        """Return the states of a run that were asked for, with its confirmation."""
+        output = {name: value for name, value in self.motion.output.items() if value not in (None, 1)}
+        if not output:
+            return run
+        result = replace(run.confirmation, runs=self.count + 1)
+        saved = self.motion.run(**result.steps, **output)
+        saved.confirmation = result
+        return saved

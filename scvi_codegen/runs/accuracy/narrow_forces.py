@@ -5,21 +5,18 @@ all pass over it agree. A step in pieces samples the forces at many more times; 
 error (E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I, II.4).
 """
 
-import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.common.errors import StepFailedError
-from scvi_codegen.runs.results.saved_states import parameters_on_sides
-from scvi_codegen.runs.stepping.step_plan import Fixed
+from scvi_codegen.runs.results.saved_states import parameters_on_sides, times_of_changes
 
 Array = NDArray[np.float64]
 
-MOST_PIECES, LEAST_PIECES, NUMBERS = 2048, 64, 2**20
+MOST_PIECES, LEAST_PIECES, NUMBERS = 1024, 64, 2**20
 """Pieces of a run: of few coordinates, of arrays, and times the number of coordinates: narrower forces are not seen."""
-LONG = 4.0
+LONG = 2.0
 """Pieces from which on a step is long: the stages of others are as close together."""
 
 
@@ -38,19 +35,30 @@ def differences_in_pieces(run: Any, size: float) -> Array:
     """
     largest = np.zeros((2, run.q.shape[1]))
     for part in run.pieces or (run,):
-        pieces, times, ends = part._restarted(0, size), list[float](), list[tuple[Array, Array]]()
-        for k in np.flatnonzero(np.abs(np.diff(part.t)) > LONG * size).tolist():
-            t, h = part.t.item(k), part.t.item(k + 1) - part.t.item(k)
-            try:
-                pieces.plan = Fixed(h / (count := math.ceil(abs(h) / size)))
-                pieces._parameters[:] = parameters_on_sides(part, t)
-                pieces._begin(part.q[k], part.p[k], t)
-                pieces.advance(last := count - (part.modes is not None and part.t[k + 1] in part.modes.t))
-                times.append(part.t.item(k + 1) if last == count else t + last * h / count)
-                ends.append((pieces.q, pieces.p))
-            except StepFailedError:  # the step was solved over what its pieces meet
-                largest[:] = np.inf
-        if times:
-            states = np.stack(part._states_at(np.array(times)), 1)
-            np.fmax(largest, np.abs(np.array(ends) - states).max(axis=0), out=largest)
+        spans, changes = np.diff(part.t), times_of_changes(part)
+        rows = np.flatnonzero(np.abs(spans) > LONG * size)
+        modes = np.searchsorted(part.forward * changes, part.forward * part.t[rows], side="right")
+        for mode in {*modes.tolist()}:
+            apart = _apart(part, rows[modes == mode], spans, size, changes)
+            np.fmax(largest, apart, out=largest)
     return largest
+
+
+def _apart(part: Any, rows: NDArray[np.intp], spans: Array, size: float, changes: Array) -> Array:
+    """Return (2, m) largest differences of the steps at some rows in one mode, by one call of C."""
+    taken = part._restarted(0, size)
+    taken._parameters[:] = parameters_on_sides(part, float(part.t[rows[0]]))
+    counts = np.ceil(np.abs(spans[rows]) / size)
+    h, before = spans[rows] / counts, np.zeros(len(rows), bool)
+    if len(changes):
+        before = np.isin(part.t[rows + 1], changes)
+    (q, p), binding = (np.ascontiguousarray(np.asarray(x)[rows]) for x in (part.q, part.p)), part.stepper.binding
+    pieces, ends = (counts - before).astype(np.int64), np.empty((2, *q.shape))
+    numbers = binding.whole_numbers(pieces)
+    arguments = *map(binding.pointer, (np.ascontiguousarray(part.t[rows]), h)), numbers
+    if binding.call("pieces", taken._call)(len(rows), *arguments, *map(binding.pointer, (q, p, *ends))):
+        return np.full((2, q.shape[1]), np.inf)  # the step was solved over what its pieces meet
+    states = np.array([np.asarray(x)[rows + 1] for x in (part.q, part.p)])
+    if before.any():
+        states[:, before] = part._states_at((part.t[rows] + pieces * h)[before])
+    return np.asarray(np.abs(ends - states).max(axis=1, initial=0.0))

@@ -33,6 +33,8 @@ def roundoff(words: int) -> float:
 
 def first_of_groups(interface: Interface, dimension: int) -> NDArray[np.intp]:
     """Return the indices of the first coordinates of groups with a common unit: coordinates, arrays, rotations."""
+    if not (interface.arrays or interface.rotations):
+        return np.arange(dimension)
     counts = [int(np.prod(shape)) for _, shape in coordinate_shapes(interface)]
     if sum(counts) != dimension or interface.rotations:
         counts = [1] * dimension
@@ -89,6 +91,8 @@ class Motion:
 
     def _of_groups(self, values: Array) -> Array:
         """Return the largest value of the group of each coordinate."""
+        if len(self.firsts) == len(values):
+            return values
         counts = np.diff(self.firsts, append=len(values))
         return np.asarray(np.repeat(np.maximum.reduceat(values, self.firsts), counts))
 
@@ -104,11 +108,21 @@ def momenta_of_velocities(stepper: Any, t: Array, q: Array, p: Array, parameters
     Those without velocity, of a vector potential, depend on its gauge.
     """
     kinetic, rows = np.zeros(np.shape(p)), slice(None, None, -(-len(t) // SAMPLES))
-    at_rest: Any = 0.0
-    with suppress(StateError):  # Hamiltonians, inputs that are not set
-        at_rest = np.asarray(stepper.momentum(q[rows], np.zeros_like(kinetic[rows]), t[rows], parameters))
-    kinetic[rows] = np.abs(np.asarray(p[rows]) - at_rest)
+    kinetic[rows] = np.abs(np.asarray(p[rows]) - _momenta_at_rest(stepper, t[rows], q[rows], parameters))
     return kinetic
+
+
+def _momenta_at_rest(stepper: Any, t: Array, q: Array, parameters: Array) -> Array | float:
+    """Return (n, m) momenta without velocity, in one call of C if they do not depend on time; 0 if undefined."""
+    at_rest, binding = np.zeros(np.shape(q)), stepper.binding
+    if stepper.interface.words == 1 and stepper.interface.conserves_energy and not stepper.in_tau:
+        q, v = np.ascontiguousarray(q), np.zeros_like(at_rest)
+        pointers = map(binding.pointer, (q, v, parameters, at_rest))
+        binding.function("call_momenta")(len(q), float(t[0]), q.shape[1], 0, *pointers, binding.workspace())
+        return np.where(np.isfinite(at_rest), at_rest, 0.0)
+    with suppress(StateError):  # Hamiltonians, inputs that are not set
+        return np.asarray(stepper.momentum(q, at_rest, t, parameters))
+    return 0.0
 
 
 def largest_range(values: Array) -> float:

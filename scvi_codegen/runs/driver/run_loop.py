@@ -2,7 +2,7 @@
 
 import math
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from functools import lru_cache, partial
 from math import isfinite
@@ -21,7 +21,7 @@ from scvi_codegen.runs.states.words import block_of, from_block
 from scvi_codegen.runs.stepping.chunks import drive
 from scvi_codegen.runs.stepping.memory import Memory
 from scvi_codegen.runs.stepping.noise import report_of
-from scvi_codegen.runs.stepping.step_plan import Adaptive, FixedSteps, InTau, ending_at
+from scvi_codegen.runs.stepping.step_plan import Adaptive, FixedSteps, InTau
 from scvi_codegen.runs.trajectory import Trajectory
 from scvi_codegen.systems.event import Crossings
 from scvi_codegen.systems.formulas.symbols import DOT
@@ -64,8 +64,6 @@ States = tuple[Any, ...]
 NATIVE_DOUBLE, INT32 = struct.Struct("d"), np.dtype(np.int32)
 GROWTH = 8.0
 """Largest ratio of successive numbers of steps of calls that save few states."""
-STEPS_TO_STOP = 64
-"""Number of steps of a call towards a stop."""
 
 
 def record(
@@ -114,26 +112,6 @@ def record(
         memory.longest = float(np.abs(np.diff(trajectory.t)).max(initial=memory.longest))
         check_energy_surface(trajectory, memory.longest)
     return trajectory
-
-
-def record_with_stops(
-    memory: Memory, stops: Sequence[float], *, progress: Callable[[int], None] | None = None
-) -> Trajectory:
-    """Advance as :func:`record` with adaptive steps that end at each of the times ``stops``, and save all states."""
-    recorder, first, target = _StateRecorder(memory, 1, None, 0), memory.steps, memory._plan
-    try:
-        for t_end in stops:
-            memory._call.t_end = t_end  # without the checks of a new plan
-            while memory.left_to(t_end) != 0.0:
-                recorder.advance(STEPS_TO_STOP)
-                if progress is not None:
-                    progress(memory.steps - first)
-    except StepFailedError as failure:
-        end_run(failure, memory, recorder.trajectory())
-        raise
-    finally:
-        memory.plan = ending_at(target, stops[-1])
-    return recorder.trajectory()
 
 
 class StateRows:

@@ -20,16 +20,14 @@ from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.accuracy.local_error import warn_of_large_steps
 from scvi_codegen.runs.accuracy.resolution import warn_of_unresolved_fields
-from scvi_codegen.runs.driver.run_loop import record_with_stops
 from scvi_codegen.runs.results.dense_output import checked_times
 from scvi_codegen.runs.results.joining import joined
-from scvi_codegen.runs.results.output import Output
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import Array, check_left_to_inputs, no_input
 from scvi_codegen.runs.states.words import exact_product, exact_sum, low_words, split, with_low
 from scvi_codegen.runs.stepping.features import refusal
 from scvi_codegen.runs.stepping.memory import Memory
-from scvi_codegen.runs.stepping.step_plan import Adaptive, Fixed, FixedSteps, StepPlan, ending_at
+from scvi_codegen.runs.stepping.step_plan import Fixed, FixedSteps, StepPlan, ending_at
 from scvi_codegen.runs.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -307,23 +305,6 @@ class InputSegments:
             warn_of_large_steps(trajectory)
         warn_of_unresolved_fields(trajectory)
         return trajectory
-
-    def record_with_stops(self, run: Run, stops: Sequence[float], progress: Callable[[int], None] | None) -> Trajectory:
-        """Integrate with adaptive steps that end at the breakpoints and at ``stops``, in order; save all states."""
-
-        def recorded(steps: int | None) -> Trajectory:
-            start, end = run.t, cast(Adaptive, run.plan).t_end
-            ends = [*(t for t in stops if min(start, end) < t < max(start, end)), end]
-            if not run.stepper.searched:
-                return record_with_stops(run, ends, progress=progress)
-            return record_segments(run, prepared_ends(ends), partial(run._recorded, output=Output(progress=progress)))
-
-        def prepared_ends(ends: Sequence[float]) -> Iterator[None]:
-            for end in ends:
-                run.plan = ending_at(run.plan, end)
-                yield None
-
-        return record_segments(run, prepared_segments(run, self.inputs, self.t_end, self.values), recorded)
 
 
 def prepared_segments(

@@ -78,6 +78,7 @@ class States:
             the attitudes by name.
         units: of t, q, p and these, as far as known.
         low: low words of t, q, p and parameters in double-double arithmetic, by name of the file's arrays.
+        errors: (n, m) errors of q and p and their rounding errors, by name of the file's arrays; or none.
     """
 
     count: int
@@ -92,6 +93,7 @@ class States:
     quantities: Callable[[Array, Array, Array], Mapping[str, Array]] | None = None
     units: Mapping[str, str] = field(default_factory=dict)
     low: Mapping[str, Array] = field(default_factory=dict)
+    errors: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def attributes(self) -> dict[str, Any]:
@@ -109,6 +111,7 @@ class States:
         """Return the arrays with named dimensions, including derived quantities."""
         dimensions: dict[str, tuple[str, ...]] = {"t": ("t",), "coordinate": ("coordinate",)}
         dimensions |= {"q": ("t", "coordinate"), "p": ("t", "coordinate"), "iterations": ("t",)}
+        dimensions |= dict.fromkeys(self.errors, ("t", "coordinate"))
         whole = {"coordinate": np.array(self.coordinates)}
         if len(self.parameters) > MOST_IN_TEXT:
             dimensions |= {"parameter": ("parameter",), "parameters": ("parameter",)}
@@ -135,9 +138,12 @@ class States:
         )
 
     def _labelled_pieces(self) -> Iterator[dict[str, NDArray[Any]]]:
+        first = 0
         for t, q, p, iterations in self.pieces():
             more = {} if self.quantities is None else self.quantities(t, q, p)
-            yield {"t": t, "q": q, "p": p, "iterations": iterations, **more}
+            errors = {name: values[first : first + len(t)] for name, values in self.errors.items()}
+            first += len(t)
+            yield {"t": t, "q": q, "p": p, "iterations": iterations, **errors, **more}
 
 
 def chunk_rows(dimension: int) -> int:
@@ -161,6 +167,8 @@ def write_states(states: States, path: str | os.PathLike[str]) -> None:
     suffix = Path(path).suffix.lower()
     if states.units and suffix not in LABELLED:
         raise StateError(f"the format {suffix} does not support units; {', '.join(LABELLED)} do")
+    if states.errors and suffix == ".csv":
+        raise StateError(f"the format .csv has no errors of the states; .npz, {', '.join(LABELLED)} do")
     write_whole(path, lambda new: WRITERS[suffix](states, new))
 
 
@@ -218,6 +226,7 @@ def _write_npz(states: States, path: Path) -> None:
         "parameter_names": np.array(list(states.parameters), dtype=str),
         **{name: np.array(text) for name, text in states.about.items()},
         **states.low,
+        **states.errors,
     }
     with zipfile.ZipFile(path, "w") as archive:
         for i, (name, (shape, kind)) in enumerate(states.columns().items()):

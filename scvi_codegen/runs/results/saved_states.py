@@ -133,6 +133,16 @@ def parameters_on_sides(states: SavedStates, t: float) -> Array:
     return parameters
 
 
+def times_of_changes(states: Any) -> Array:
+    """Return the sorted times of events that change the state, and of transitions of contacts and kinks."""
+    if not (states.events or states.transitions or states.modes):
+        return np.empty(0)
+    times = [of.t for of in states.events if of.event.changes_state] + [of.t for of in states.transitions]
+    times += [] if states.modes is None else [states.modes.t]
+    values = np.concatenate([np.asarray(of, float) for of in times]) if times else np.empty(0)
+    return np.asarray(states.forward * np.unique(states.forward * values))
+
+
 def in_modes(states: SavedStates, quantity: Callable[[Any, Any, Any, Array], Array]) -> Array:
     """Return a (n, ..) quantity of (q, p, t, parameters), with the modes after each state."""
     modes = getattr(states, "modes", None)

@@ -12,6 +12,7 @@ from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
 OPERATIONS = {
     "adaptive": "adaptive step size (t_end without h)",
     "error": "error=",
+    "run_error": "run.error",
     "check_growth": "check_growth=True",
     "t_eval": "t_eval",
     "observe": "observe",
@@ -118,8 +119,8 @@ FEATURES = {
     for property_, operations, remedy in (
         (
             "in a heat bath",
-            "adaptive error t_eval dense_output events advice single tangent pullback sensitivity hessian "
-            f"{_RUNS} {_ACTIONS}",
+            "adaptive error run_error t_eval dense_output events advice single tangent pullback sensitivity "
+            f"hessian {_RUNS} {_ACTIONS}",
             "give h and steps, and use saved states and averages of them; steps alone have derivatives",
         ),
         (
@@ -153,7 +154,7 @@ FEATURES = {
         ("with events that set parameters", _DERIVATIVES, "make them terminal, and restart with the new parameters"),
         (
             "with events that change the state",
-            "error observe_ensemble single hessian chaos_ensemble flow advice shadow_energy",
+            "observe_ensemble single hessian chaos_ensemble flow advice shadow_energy",
             "make them terminal and restart",
         ),
         ("with kinks that runs locate", "observe_ensemble single", "save states of runs in double precision"),
@@ -238,7 +239,7 @@ FEATURES = {
         ),
         ("with events", "observe_ensemble", "count them by observe='events', or pass stepper.with_events(())"),
         ("with t_eval", "observe", "omit observe"),
-        ("with observe", "error dense_output", "omit observe"),
+        ("with observe", "error run_error dense_output", "omit observe"),
     )
     for operation in operations.split()
 }

@@ -291,6 +291,30 @@ class LinearisedMethod(StateFunctions):
             raise step_failure(status, report, step=failed, h=float(starts.h[failed]))
         return q1, p1
 
+    def _transport_errors(self, starts: Starts, vectors: Array, parameters: Array) -> None:
+        """Transport global errors, and further tangent vectors, along the saved states of another run, in place.
+
+        Args:
+            starts: n steps; their (n + 1, m) states are those of the run.
+            vectors: (n + 1, count, 2m + k + 2) as of :meth:`_propagate`; the first one of each row is the error, to
+                which the difference of the state from the end of this step is added.
+            parameters: as of :meth:`_propagate`.
+        """
+        binding = self.tangent
+        report, work = binding.new("report *"), np.empty((2, len(starts.h), self.dimension))
+        status = binding.function("transport_errors")(
+            len(starts.h),
+            *map(binding.pointer, (starts.t, starts.h, starts.q, starts.p, parameters)),
+            binding.options(None),
+            vectors.shape[1],
+            *map(binding.pointer, (vectors, *work)),
+            report,
+            binding.workspace(),
+        )
+        if status:
+            failed = int(report.steps)
+            raise step_failure(status, report, step=failed, h=float(starts.h[failed]))
+
     def _second_order_adjoint(
         self, starts: Starts, changes: Array, vectors: Array, parameters: Array, options: SolverOptions | None
     ) -> None:

@@ -25,6 +25,7 @@ typedef struct {
   lanes D[GROUPS][M], E[GROUPS][M], u[GROUPS][2 * M + POINT_DERIVATIVES], given[GROUPS][INPUT_DERIVATIVES],
       mass[GROUPS][MASS];
   weight end_position[GROUPS], end_momentum[GROUPS];
+  double accepted; /* squared: relative change of vectors still to come that is accepted */
 } iterated_step;
 
 /* Stores the velocities and increments of a step, from which linearise_points linearises it. */
@@ -87,7 +88,7 @@ static inline int solve_vectors(iterated_step *at, int back, lanes (*x0)[M], lan
 {
   const lanes *table = back ? CHANGE_POSITION_BACK : CHANGE_MOMENTUM;
   lanes v[GROUPS][M], F[GROUPS][M], p[GROUPS][M];
-  vector_changes past = {INFINITY, INFINITY};
+  vector_changes past = {INFINITY, INFINITY, at->accepted};
   int status = 0;
   memset(v, 0, sizeof v);
   memset(p, 0, sizeof p);

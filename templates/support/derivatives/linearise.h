@@ -7,10 +7,11 @@ typedef struct {
   const real *t, *h, *q, *p, *parameters;
   const solver_options *options;
   int back, count;
+  int defects; /* whether the first vectors receive the defects of the saved states: q1, p1 are increments then */
   real *vectors, *q1, *p1, *workspace;
   solver_report *report;
   long long guess; /* number of previous steps that the predictor uses (fixed-point iteration only) */
-  int look; /* first iteration of the linearised equations whose convergence is tested */
+  int look, look_at_rounding; /* first iteration of the linearised equations whose convergence is tested */
 } propagation;
 
 /* Propagation by the arguments of a function. */
@@ -28,6 +29,18 @@ static step_data step_of(const propagation *over, long long k, const real *nothi
 static real *vectors_at(const propagation *over, long long k)
 {
   return over->vectors + k * over->count * STEP_INPUTS;
+}
+
+/* Adds x[k + 1] - phi(x[k]) to the first vector at the end of step k, with phi from the increments, or else the ends, in
+ * q1 and p1. Errors of rounded states cancel in the sum, those of increments do not. */
+static void add_defect(propagation *over, long long k, int increments)
+{
+  const real *x[2] = {over->q + k * M, over->p + k * M}, *step[2] = {over->q1 + k * M, over->p1 + k * M};
+  real *to = vectors_at(over, k + 1);
+  for (int j = 0; j < 2 * M; j++) {
+    const int i = j % M, of = j / M;
+    to[j] += (x[of][M + i] - (increments ? x[of][i] : 0)) - step[of][i];
+  }
 }
 
 /* Propagates the vectors from index `first` on over step k. */
@@ -80,8 +93,8 @@ static int solve_steps(propagation *over, long long first, long long end)
     if (!solve_by_iteration(over, &step, &data, dq, dp))
       return 0;
     for (int i = 0; over->q1 && i < M; i++) {
-      over->q1[k * M + i] = step.q0[i] + (dq[i] + dq[M + i]);
-      over->p1[k * M + i] = step.p0[i] + (dp[i] + dp[M + i]);
+      over->q1[k * M + i] = (over->defects ? 0.0 : step.q0[i]) + (dq[i] + dq[M + i]);
+      over->p1[k * M + i] = (over->defects ? 0.0 : step.p0[i]) + (dp[i] + dp[M + i]);
     }
     store_step(&step, &data, over->workspace + SCRATCH, dq, dp, stored_of(over, k - first));
   }
@@ -100,8 +113,10 @@ static int propagate_by_iteration(propagation *over, long long k, const double *
   linearise_points(&step, &data, kept, &at);
   for (int j = 0; j < over->count; j++) {
     double v[STEP_INPUTS];
+    int *look = over->defects && j ? &over->look_at_rounding : &over->look;
+    at.accepted = !over->defects ? LEFT_TO_COME : j ? LEFT_IN_ROUNDING : LEFT_IN_ERRORS;
     memcpy(v, from + j * STEP_INPUTS, sizeof v);
-    if ((over->back ? vjp_by_iteration : jvp_by_iteration)(&at, v, &over->look) != OK)
+    if ((over->back ? vjp_by_iteration : jvp_by_iteration)(&at, v, look) != OK)
       return j;
     for (int i = 0; i < STEP_INPUTS; i++)
       to[j * STEP_INPUTS + i] += v[i];
@@ -125,28 +140,48 @@ static int propagate_steps(propagation *over, long long first, long long end)
   for (long long done = 0; status == OK && done < end - first; done++) {
     const long long k = over->back ? end - 1 - done : first + done;
     const int carried = iterated ? propagate_by_iteration(over, k, stored_of(over, k - first)) : 0;
-    if (!iterated || carried < over->count)
+    const int by_newton = !iterated || carried < over->count;
+    if (by_newton)
       status = vectors_by_newton(over, k, carried);
     else if (!all_finite(vectors_at(over, k + !over->back), over->count * STEP_INPUTS))
       status = NOT_FINITE;
+    if (over->defects && status == OK)
+      add_defect(over, k, !by_newton);
     over->report->steps += status == OK;
   }
   return status;
 }
 
-/* Tangent or adjoint vectors over a sequence of steps, forward or backward. On failure report->t is the time of the
- * failed step. Requires: propagate_steps, which propagates them over at most STEPS_AT_ONCE steps. */
+/* Propagates over all steps in blocks. On failure report->t is the time of the failed step. */
+static int propagate_blocks(propagation *over, long long steps)
+{
+  int status = OK;
+  memset(over->report, 0, sizeof *over->report);
+  for (long long done = 0; status == OK && done < steps; done += STEPS_AT_ONCE) {
+    const long long left = steps - done, own = left < STEPS_AT_ONCE ? left : STEPS_AT_ONCE;
+    const long long first = over->back ? left - own : done;
+    status = propagate_steps(over, first, first + own);
+  }
+  return status;
+}
+
+/* Tangent or adjoint vectors over a sequence of steps, forward or backward. Requires: propagate_steps, which propagates
+ * them over at most STEPS_AT_ONCE steps. */
 int NAME(linearise)(long long steps, const real *t, const real *h, const real *q, const real *p,
     const real *parameters, const solver_options *options, int back, int count, real *vectors, real *q1, real *p1,
     solver_report *report, real *workspace)
 {
   propagation over = {PROPAGATION_OF_ARGUMENTS, .back = back, .count = count, .vectors = vectors};
-  int status = OK;
-  memset(report, 0, sizeof *report);
-  for (long long done = 0; status == OK && done < steps; done += STEPS_AT_ONCE) {
-    const long long left = steps - done, own = left < STEPS_AT_ONCE ? left : STEPS_AT_ONCE;
-    const long long first = back ? left - own : done;
-    status = propagate_steps(&over, first, first + own);
-  }
-  return status;
+  return propagate_blocks(&over, steps);
+}
+
+/* Global errors delta[k + 1] = Dphi(x[k]) delta[k] + x[k + 1] - phi(x[k]) of a run by another method from its saved
+ * states, transported by the tangent map of that step phi (Hairer, Norsett & Wanner, Solving ODEs I, sec. II.3 and II.4);
+ * further vectors are propagated alone. */
+int NAME(transport_errors)(long long steps, const real *t, const real *h, const real *q, const real *p,
+    const real *parameters, const solver_options *options, int count, real *vectors, real *q1, real *p1,
+    solver_report *report, real *workspace)
+{
+  propagation over = {PROPAGATION_OF_ARGUMENTS, .defects = 1, .count = count, .vectors = vectors};
+  return propagate_blocks(&over, steps);
 }

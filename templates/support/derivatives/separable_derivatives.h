@@ -24,6 +24,7 @@ typedef struct {
   double mass_derivative[MASS_DERIVATIVES];
 #endif
   lanes D[GROUPS][M], u[GROUPS][M + POINT_DERIVATIVES], given[GROUPS][INPUT_DERIVATIVES];
+  double accepted; /* squared: relative change of vectors still to come that is accepted */
 } iterated_step;
 
 /* Stores the displacements and increments of a step, from which linearise_points linearises it. */
@@ -87,7 +88,7 @@ static inline int solve_vectors(iterated_step *at, int back, lanes (*f)[M], int 
 {
   const lanes *table = back ? PRODUCT_BACK : PRODUCT;
   lanes(*x)[M + POINT_DERIVATIVES] = at->u, x0[GROUPS][M];
-  vector_changes past = {INFINITY, INFINITY};
+  vector_changes past = {INFINITY, INFINITY, at->accepted};
   int status = 0;
   for (int n = 0; n < GROUPS; n++)
     memcpy(x0[n], x[n], sizeof x0[n]);

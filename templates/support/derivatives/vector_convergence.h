@@ -8,11 +8,14 @@ enum { INPUT_T = STEP_INPUTS - 2 };
 #define MOVED_BY_ROUNDING (4.0 * DBL_EPSILON * DBL_EPSILON) /* squared: relative change that rounding alone may cause */
 #define LEFT_TO_COME (DBL_EPSILON * DBL_EPSILON / 16.0) /* squared: relative change still to come that is accepted */
 
+#define LEFT_IN_ERRORS 1e-14 /* the same of transported errors: seven digits a step */
+#define LEFT_IN_ROUNDING 1e-4 /* and of transported rounding errors: two digits */
+
 #define LEAST_SIZE 1e-250 /* squared size below which vectors underflow */
 
 /* Squared relative changes of the last two iterations; infinite if there were none. */
 typedef struct {
-  double last, before;
+  double last, before, accepted; /* accepted: change still to come */
 } vector_changes;
 
 /* Returns 1 if the iteration has converged after a change `moved` of vectors of size `size` (both squared), 0 if it
@@ -22,9 +25,9 @@ static inline int vectors_status(double moved, double size, vector_changes *past
 {
   const double last = past->last, before = past->before, relative = size > 0.0 ? moved / size : moved;
   const int first = !(last < INFINITY), finite = size < INFINITY && (size > LEAST_SIZE || moved == 0.0);
-  const int small = relative <= (first ? MOVED_BY_ROUNDING : LEFT_TO_COME);
-  const int last_but_one = !first && relative * relative <= LEFT_TO_COME * last &&
-      relative * SUDDEN_CONVERGENCE * last <= LEFT_TO_COME * before;
+  const int small = relative <= (first ? fmax(MOVED_BY_ROUNDING, past->accepted) : past->accepted);
+  const int last_but_one = !first && relative * relative <= past->accepted * last &&
+      relative * SUDDEN_CONVERGENCE * last <= past->accepted * before;
   const int stopped = !first && relative >= last &&
       (relative < CERTAIN_ROUNDING || (relative < ROUNDING_LEVEL && relative >= STAGNATION * before));
   const int shrinks = first || relative < 0.5 * last || relative < STAGNATION * before || relative < PROGRESS_LEVEL;

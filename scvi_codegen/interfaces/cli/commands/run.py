@@ -1,6 +1,7 @@
 """Command ``scvi-codegen run``: integrate a model or an ensemble, in memory or into a folder, and print a summary."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import click
 
 from scvi_codegen.analysis.advice.tolerance_check import missed_tolerance
 from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE
+from scvi_codegen.common.errors import ScviCodegenError
 from scvi_codegen.interfaces.cli.command_group import (
     FAILURE,
     INTERRUPTED,
@@ -126,6 +128,9 @@ ERRORS = {option.name: option for option in OWN if option.determines == STEP_SIZ
 @click.option(
     "--ensemble", type=click.Path(), metavar="FILE", help="Many initial states: a grid (.toml) or a table (.csv)."
 )
+@click.option(
+    "--error-bars", is_flag=True, help="Print the final state with its uncertain digits, write errors with -o."
+)
 @reporting
 def run(
     model_name: str | None,
@@ -134,6 +139,7 @@ def run(
     checkpoint: float | None,
     plot: str | None,
     ensemble: str | None,
+    error_bars: bool,
     **choices: Any,
 ) -> None:
     """Integrate MODEL; the help text is ``ABOUT``."""
@@ -144,6 +150,7 @@ def run(
     if model_name is None:
         raise click.UsageError("Missing argument 'MODEL', or --resume FOLDER.")
     recorded = output is not None and is_run_folder(output)
+    _check_error_bars(error_bars, recorded, ensemble)
     _check_outputs(output, plot, ensemble, checkpoint)
     requested = {name: choices.pop(name) for name in ERRORS}
     _check_combination(choices, plot=plot, ensemble=ensemble, requested=requested, folder=output if recorded else None)
@@ -176,8 +183,14 @@ def run(
     if output is not None and recorded:
         _finish_recording(record_model(model, output, checkpoint))
     else:
-        _run_one(model, output, plot, advised=requested["advise"])
+        _run_one(model, output, plot, advised=requested["advise"], error_bars=error_bars)
     _check_confirmed(confirmation)
+
+
+def _check_error_bars(error_bars: bool, recorded: bool, ensemble: str | None) -> None:
+    if error_bars and (recorded or ensemble is not None):
+        where = "for a run recorded in a folder" if recorded else "with --ensemble"
+        raise click.UsageError(f"--error-bars is not available {where}: use runs in memory (Python: run.error)")
 
 
 def _check_ensemble(model: Model) -> None:
@@ -261,14 +274,19 @@ def _check_combination(
         check_flag(ERRORS[arguments[0]], IN_ENSEMBLE)
 
 
-def _run_one(model: Model, output: str | None, plot: str | None, *, advised: float | None) -> None:
+def _run_one(
+    model: Model, output: str | None, plot: str | None, *, advised: float | None, error_bars: bool = False
+) -> None:
     outcome = integrate_model(model)
     final_error = known_at_end(model, outcome)
     account = known_account(outcome.trajectory)
     tell(summary(model, outcome, final_error, account), **run_numbers(model, outcome, final_error, account))
     result = outcome.trajectory
     draw = result.plot if model.array_system is None else result.plot.field
-    written = _write_outputs(model, result, output, plot, draw=draw)
+    if error_bars:
+        _tell_error(result)
+        draw = partial(result.plot, error=True) if model.array_system is None else draw
+    written = _write_outputs(model, result, output, plot, draw=draw, **{"error": True} if error_bars else {})
     tell(written=written)
     if outcome.failure is not None:
         raise CommandFailure(f"{outcome.failure}\n{_kept(outcome, written)}", FAILURE) from outcome.failure
@@ -315,9 +333,21 @@ def _run_ensemble(
         _fail_for(missed, f"trajectory {member}: ")
 
 
-def _write_outputs(model: Model, result: Any, output: str | None, plot: str | None, *, draw: Any) -> list[str]:
+def _tell_error(trajectory: Any) -> None:
+    """Print the final state with the uncertain digits of its error, or why that is unknown."""
+    try:
+        error = trajectory.error
+    except ScviCodegenError as unknown:
+        raise CommandFailure(f"--error-bars: {unknown}", FAILURE) from unknown
+    numbers = {"relative": error.relative[-1], "signed": error.signed, "lost": error.lost, "reason": error.reason}
+    tell(str(error), error=numbers | {"q": error.q[-1].tolist(), "p": error.p[-1].tolist()})
+
+
+def _write_outputs(
+    model: Model, result: Any, output: str | None, plot: str | None, *, draw: Any, **saved: bool
+) -> list[str]:
     if output is not None:
-        result.save(output)
+        result.save(output, **saved)
     if plot is not None and Path(plot).suffix.lower() in FILMS:
         progress = (lambda *_: None) if is_quiet() else None
         result.animate(plot, picture=model.picture or None, progress=progress)

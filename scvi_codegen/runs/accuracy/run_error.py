@@ -1,0 +1,507 @@
+"""Global error of a run, with its sign: local errors against a finer method, transported by its tangent map.
+
+For the saved states x_k of a run, the steps phi of a finer method from each of them, and delta_0 = 0,
+
+    delta_{k+1} = Dphi(x_k) delta_k + (x_{k+1} - phi(x_k))
+
+is the error of x_{k+1}, up to terms of the order of delta^2 and the error of phi (E. Hairer, S. P. Norsett, G. Wanner,
+Solving Ordinary Differential Equations I, II.4; R. D. Skeel, Thirteen ways to estimate global error, Numer. Math. 48
+(1986) 1-20). It holds for any sequence of states: phi is one step where all states are saved, else a run at round-off
+from one state to the next, over events, so that no interval ends at one. Further vectors rho transport samples of
+the rounding errors of the states, u |x| times a normal number for each step of the run.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError
+from scvi_codegen.runs.accuracy.size import (
+    Motion,
+    first_of_groups,
+    momenta_of_velocities,
+    neighbouring,
+    relative,
+    roundoff,
+)
+from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
+from scvi_codegen.runs.results.dense_output import parameters_set_until
+from scvi_codegen.runs.results.joining import concatenated
+from scvi_codegen.runs.results.output import ALL_STATES
+from scvi_codegen.runs.results.recomputation import steps_after
+from scvi_codegen.runs.results.saved_states import Array, SavedStates, parameters_on_sides, times_of_changes
+from scvi_codegen.runs.states.rotations import members_of
+from scvi_codegen.runs.states.words import low_words, with_low
+from scvi_codegen.runs.stepping.features import refusal, require
+from scvi_codegen.runs.stepping.projection import determined_coordinates, projected
+from scvi_codegen.runs.stepping.step_derivatives import Starts
+from scvi_codegen.runs.stepping.step_plan import Adaptive, absolute_tolerances, ending_at
+
+LOST = 0.1
+"""Relative error from which on a state has no meaningful digits, as terms of the order of delta^2 count."""
+SAMPLES, DEVIATIONS = 3, 6.0
+"""Samples of transported rounding errors, and how many times their root mean square a bound contains.
+
+Along the direction that grows all are multiples of one vector by normal numbers: the ratio of another one to the root
+mean square of k is Student's t with k degrees of freedom, above 6 in 0.9 % for k = 3, above 4 in 16 % for k = 1.
+"""
+ROUNDINGS = 1024.0
+"""Errors of coordinates that constraints determine below so many roundings are those of rounding."""
+MOST_STEPS = 2048
+"""Number of steps of one call of C."""
+AT_EVENT = 64.0
+"""Distance of a time from that of an event, in roundings of the largest time, within which a state is that of it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RunError:
+    """Errors of the states of a run, ``computed - exact``, and the rounding errors that they may contain.
+
+    Attributes:
+        t: (n,) times of the states.
+        q, p: (n, m) errors of positions and momenta with their signs; absolute values if ``signed`` is false. NaN at
+            events that change the state, and where they are unknown.
+        rounding_q, rounding_p: (n, m) standard deviations of transported rounding errors, from three samples.
+        relative: (n,) largest (abs(error) + 6 rounding) / size up to each state, of all positions and momenta.
+            Sizes are the ranges of the coordinates over the run (:mod:`scvi_codegen.runs.accuracy.size`).
+        signed: false for errors by comparison with a run of a finer method.
+        reason: why the errors are unknown from some time on, else empty.
+        sizes: (2, m) sizes of positions and momenta that ``relative`` refers to.
+    """
+
+    t: Array
+    q: Array
+    p: Array
+    rounding_q: Array
+    rounding_p: Array
+    relative: Array
+    signed: bool = True
+    reason: str = ""
+    sizes: Array = field(default_factory=lambda: np.empty(0), repr=False)
+    _run: Any = field(repr=False)
+
+    @property
+    def lost(self) -> float | None:
+        """First time at which ``relative`` is 0.1 or more, an order of magnitude only; ``None`` if there is none."""
+        beyond = np.flatnonzero(~(self.relative < LOST))
+        return float(self.t[beyond[0]]) if len(beyond) else None
+
+    @property
+    def arrays(self) -> dict[str, Array]:
+        """The four (n, m) arrays by their names in files."""
+        rounding = {"q_rounding": self.rounding_q, "p_rounding": self.rounding_p}
+        return {"q_error": self.q, "p_error": self.p, **rounding}
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """(n, m) bounds of the absolute errors of positions and of momenta: abs(error) + 6 rounding."""
+        pairs = (self.q, self.rounding_q), (self.p, self.rounding_p)
+        q, p = (np.abs(error) + DEVIATIONS * np.abs(rounding) for error, rounding in pairs)
+        return q, p
+
+    def __str__(self) -> str:
+        """Return the last state whose errors are known, with the uncertain digits in parentheses."""
+        known = np.flatnonzero(np.isfinite(self.q).all(axis=1))
+        k, interface = int(known[-1]) if len(known) else 0, self._run.stepper.interface
+        names = interface.coordinates, interface.momentum_columns
+        values, bounds = (np.asarray(self._run.q)[k], np.asarray(self._run.p)[k]), [part[k] for part in self.bounds]
+        lines = [f"t = {float(self.t[k]):g}: relative error {self.relative[k]:.1e}"]
+        for group in zip(names, values, bounds, strict=True):
+            lines += [f"{name} = {with_uncertainty(*of)}" for name, *of in zip(*group, strict=True)]
+        if self.lost is not None:
+            lines.append(f"no meaningful digits from t = {self.lost:g}")
+        return "\n".join([*lines, self.reason] if self.reason else lines)
+
+
+def with_uncertainty(value: float, error: float) -> str:
+    """Return a value with the uncertain digits of its error in parentheses: ``0.512345(12)`` is 0.512345 +- 0.000012.
+
+    The error has two digits, rounded up; an error above the value is written in full, ``3(12)``.
+    """
+    if not (math.isfinite(value) and math.isfinite(error)):
+        return f"{value:.3g}(lost)"
+    if error == 0.0:
+        return repr(float(value))
+    decimals = 1 - math.floor(math.log10(error))
+    digits = math.ceil(error * 10.0**decimals - 1e-9) if abs(decimals) < 300 else 0
+    if digits >= 100:
+        digits, decimals = 10, decimals - 1
+    exponent = math.floor(math.log10(abs(value))) if value else -decimals
+    if -5 < exponent < 16 and decimals >= 0:
+        return f"{value:.{decimals}f}({digits})"
+    shown = max(0, decimals + exponent)
+    if decimals + exponent < 0:
+        digits = math.ceil(error / 10.0**exponent)
+    return f"{value / 10.0**exponent:.{shown}f}({digits})e{exponent:+03d}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CorrectedStates:
+    """States of a run minus their errors, on the constraints and with unit quaternions; NaN where errors are.
+
+    Attributes:
+        t: (n,) times.
+        q, p, velocity: (n, m) positions, momenta and velocities.
+    """
+
+    t: Array
+    q: Array
+    p: Array
+    velocity: Array
+
+
+class WithErrors:
+    """Properties of a trajectory whose global error is estimated at first access."""
+
+    __slots__ = ()
+    _error: RunError | None
+
+    @property
+    def error(self: Any) -> RunError:
+        """Global errors of all states since the first one, with their signs (:class:`RunError`), made at first access.
+
+        One step of a finer method and a product with its Jacobian for each step, about four to ten times the cost of
+        the run; a finer method is compiled once. docs/digits.md lists which runs have signs, which are compared with a
+        finer run, and which are refused.
+
+        Raises:
+            MethodError, StateError: for runs whose error is not defined or not known, with the reason.
+        """
+        known: RunError | None = getattr(self, "_error", None)
+        if known is None:
+            known = error_of(self)
+            self._error = known
+        return known
+
+    @property
+    def corrected(self: Any) -> CorrectedStates:
+        """States minus their errors, usually more accurate than the states by several digits.
+
+        They are NaN at events and where the states have no meaningful digits.
+
+        Raises:
+            StateError: if the errors have no sign.
+        """
+        return corrected_states(self, self.error)
+
+
+class FinerStepper:
+    """Function that compiles the stepper of a finer method for the same system, once.
+
+    Attributes:
+        compiled: function without arguments that compiles it.
+    """
+
+    def __init__(self, compiled: Callable[[], Any]) -> None:
+        self.compiled = compiled
+        self._result: Any = None
+
+    def __call__(self) -> Any:
+        """Return the stepper."""
+        if self._result is None:
+            self._result = self.compiled()
+        return self._result
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return FinerStepper, (self.compiled,)
+
+
+@without_accuracy_warnings()
+def error_of(run: Any) -> RunError:
+    """Return the global error of a run; raises as :attr:`WithErrors.error`."""
+    if run.observed is not None:
+        raise refusal("run_error", "with observe")
+    stepper = run.stepper
+    require(stepper, "run_error")
+    if run.modes is not None and run.modes.ambiguous:
+        raise StateError("the error is undefined: several motions of the contacts were consistent, and the run is one")
+    finer = finer_of(stepper)
+    if _is_compared(stepper, finer):
+        return _compared(run, finer)
+    finer = finer.with_events(stepper.events if stepper.changes_states else ())
+    vectors, reason = _Replay(run, finer).of_run()
+    m = stepper.dimension
+    columns = [np.ascontiguousarray(part) for part in (vectors[:, 0, :m], vectors[:, 0, m:])]
+    deviations = np.sqrt(np.mean(vectors[:, 1:] ** 2, axis=1))
+    rounding = [deviations[:, :m], deviations[:, m:]]
+    return _described(run, columns, rounding, reason=reason)
+
+
+def finer_of(stepper: Any) -> Any:
+    """Return the stepper of the finer method, compiled once; MethodError if the system is not known."""
+    make = (stepper.origin or stepper)._finer
+    if make is None:
+        raise MethodError(
+            f"the error of runs of {stepper.title} requires its system, to compile a finer method: compile the stepper "
+            "from the system instead of loading it"
+        )
+    finer = make()
+    return finer if stepper.problem is None else finer._bound_to(stepper.problem)
+
+
+def _is_compared(stepper: Any, finer: Any) -> bool:
+    """Return whether errors are differences from a finer run: without a signed replay of single steps.
+
+    These are steps of tau of a transformed system, double-double arithmetic, arrays of run-time sizes, and kinks that
+    steps do not locate.
+    """
+    interface = stepper.interface
+    unlocated = len(interface.kinks) > len(interface.modes) or finer.interface.mode_names != interface.mode_names
+    return bool(stepper.in_tau or interface.words > 1 or stepper.origin is not None or unlocated)
+
+
+def _described(run: Any, errors: list[Array], rounding: list[Array], **others: Any) -> RunError:
+    """Return the error of a run from (n, m) errors and rounding errors of positions and of momenta."""
+    error = RunError(
+        t=np.asarray(run.t),
+        q=errors[0],
+        p=errors[1],
+        rounding_q=rounding[0],
+        rounding_p=rounding[1],
+        relative=np.zeros(len(run)),
+        _run=run,
+        **others,
+    )
+    sizes, relative_errors = relative_until(error, len(run))
+    return replace(error, sizes=sizes, relative=relative_errors)
+
+
+def relative_until(error: RunError, rows: int) -> tuple[Array, Array]:
+    """Return (2, m) sizes of the motion in the first ``rows`` states and (rows,) running maxima of relative errors."""
+    bounds = np.array([part[:rows] for part in error.bounds])
+    is_known = np.isfinite(bounds).all(axis=(0, 2))
+    with np.errstate(all="ignore"):
+        bounds = np.where(is_known[:, None], bounds, 0.0)
+        sizes = sizes_of(error._run, rows, bounds.max(axis=1))
+        entries = relative(bounds, sizes[:, None])
+        leave_out_rounding(error._run, bounds, entries)
+        parts = entries.max(axis=(0, 2))
+    if error.reason:  # unknown from the last known state on
+        parts[np.count_nonzero(np.cumsum(is_known[::-1])[::-1]) :] = np.inf
+    return sizes, np.asarray(np.maximum.accumulate(parts))
+
+
+def leave_out_rounding(run: Any, bounds: Array, entries: Array) -> None:
+    """Set relative errors (2, n, m) to 0 of coordinates that constraints determine, where they are those of rounding.
+
+    The height of a rod that swings by 1e-7 has no digits, as the constraint gives it up to rounding.
+    """
+    if not run.stepper.interface.constraints:
+        return
+    epsilon = roundoff(run.stepper.interface.words)
+    tiny = bounds[0] <= ROUNDINGS * epsilon * np.abs(np.asarray(run.q)[: bounds.shape[1]])
+    largest = np.where(tiny, 0.0, entries).max(initial=0.0)
+    for k in np.flatnonzero((np.where(tiny, entries, 0.0) > largest).any(axis=(0, 2))).tolist():
+        determined = np.zeros(tiny.shape[1], bool)
+        q, t = np.asarray(run.q[k]), float(run.t[k])
+        determined[determined_coordinates(run.stepper, q, t, parameters_on_sides(run, t))] = True
+        entries[:, k, tiny[k] & determined] = 0.0
+
+
+def sizes_of(run: Any, rows: int, errors: Array) -> Array:
+    """Return (2, m) sizes of positions and momenta of the first ``rows`` states of a run, for errors (2, m)."""
+    interface, plan, m = run.stepper.interface, run.plan, run.stepper.dimension
+    absolute: Array | float = 0.0
+    if isinstance(plan, Adaptive) and plan.absolute_tolerance != ():
+        absolute = absolute_tolerances(interface, m, plan.absolute_tolerance)
+    t, q, p = (np.asarray(column)[:rows] for column in (run.t, run.q, run.p))
+    motion = Motion(t, q, p, first_of_groups(interface, m), roundoff(interface.words), absolute)
+    kinetic = momenta_of_velocities(run.stepper, t, q, p, run.parameters).max(axis=0)
+    return motion.sizes(float(t[-1]), errors, kinetic)
+
+
+class _Replay:
+    """Replay of a run from its saved states.
+
+    Args:
+        run: trajectory.
+        finer: stepper of the finer method, with the events of the run that change the state.
+    """
+
+    def __init__(self, run: Any, finer: Any) -> None:
+        self.run, self.finer, self.m = run, finer, run.stepper.dimension
+        self.u, self.calls = roundoff(1), 0
+        self.now = np.zeros((1 + SAMPLES, 2 * self.m))
+
+    def of_run(self) -> tuple[Array, str]:
+        """Return (n, 1 + samples, 2m) errors and rounding errors, NaN where unknown, and the reason for that."""
+        first, result = 0, np.full((len(self.run), *self.now.shape), np.nan)
+        initial = getattr(self.run, "_initial", None)
+        try:
+            if initial is not None:  # t_eval without the initial time
+                t, q, p = initial
+                self._by_run(self.run, t, q, p, 0, steps=self._steps_between(self.run))
+            result[0] = self.now
+            for piece in self.run._runs:
+                for row, vectors in self._along(piece):
+                    result[first:][row] = vectors
+                first += len(piece) - 1
+        except (ScviCodegenError, FloatingPointError) as failure:
+            known = int(np.count_nonzero(np.isfinite(result[:, 0, 0])))
+            lost = known and not np.abs(self.now[0]).max() <= np.abs(self._state(self.run, slice(None))).max()
+            return result, f"errors are lost: {failure}" if lost else str(failure)
+        return result, ""
+
+    def _along(self, piece: Any) -> Iterator[tuple[Any, Array]]:
+        """Yield indices of states, a slice or a number, and their vectors."""
+        special = times_of_changes(piece)
+        rows = _rows_between(piece, special)
+        single = self._single_steps(piece, rows, special)
+        first, steps = 0, self._steps_between(piece)
+        while first < len(rows) - 1:
+            last = first + 1
+            if single[first]:
+                ahead = np.flatnonzero(~single[first : first + MOST_STEPS])
+                last = first + int(ahead[0]) if len(ahead) else min(first + MOST_STEPS, len(rows) - 1)
+                begin, end = int(rows[first]), int(rows[last])
+                yield slice(begin + 1, end + 1), self._by_steps(piece, begin, end)
+            else:
+                begin, end = int(rows[first]), int(rows[last])
+                start = float(piece.t[begin]), piece.q[begin], piece.p[begin]
+                self._by_run(piece, *start, end, steps=steps * (end - begin))
+                yield end, self.now
+            first = last
+
+    def _single_steps(self, piece: Any, rows: NDArray[np.intp], special: Array) -> NDArray[np.bool_]:
+        """Return (rows,) whether the interval after a row is one step of the run in one mode; the last is false."""
+        single = np.zeros(len(rows), bool)
+        begin, end = rows[:-1], rows[1:]
+        lengths = piece.step_sizes[begin]
+        with np.errstate(invalid="ignore"):
+            one = (end == begin + 1) & (np.abs(piece.stepped[end] - piece.stepped[begin]) < 1.5 * np.abs(lengths))
+        if len(special):
+            passed = [np.searchsorted(piece.forward * special, piece.forward * piece.t[of]) for of in (begin, end)]
+            one &= passed[0] == passed[1]
+        single[:-1] = one
+        return single
+
+    def _steps_between(self, piece: Any) -> float:
+        """Return the mean number of steps of the run between two of its states."""
+        return float(max(1.0, self.run.steps / max(1, len(self.run) - 1)))
+
+    def _by_steps(self, piece: SavedStates, begin: int, end: int) -> Array:
+        """Transport the errors over single steps between two rows; return (end - begin, 1 + samples, 2m) vectors."""
+        h = steps_after(piece, begin, end)
+        parameters = parameters_on_sides(piece, float(piece.t[begin]))
+        return self._transport(piece.t[begin:end], h, piece.q, piece.p, slice(begin, end + 1), parameters)
+
+    def _transport(
+        self, t: Array, h: Array, q: Array, p: Array, rows: slice, parameters: Array, steps: float = 1.0
+    ) -> Array:
+        """Transport the errors over steps h of the finer method from times t, each of so many steps of the run."""
+        m, n = self.m, len(h)
+        states = [np.ascontiguousarray(np.asarray(column)[rows]) for column in (q, p)]
+        vectors = np.zeros((n + 1, 1 + SAMPLES, self.finer._input_size))
+        vectors[0, :, : 2 * m] = self.now
+        here = vectors[1:, :, : 2 * m]
+        here[:, 1:] = self._rounding(n, steps) * np.abs(np.concatenate(states, axis=1)[1:, None])
+        starts = Starts(np.ascontiguousarray(t), np.ascontiguousarray(h), states[0], states[1])
+        self.finer._transport_errors(starts, vectors, parameters)
+        self.now = vectors[-1, :, : 2 * m].copy()
+        return here
+
+    def _by_run(self, piece: Any, t: float, q: Array, p: Array, end: int, *, steps: float) -> None:
+        """Transport the errors to a row by a run of the finer method at round-off, over the events in between."""
+        parameters, stop = parameters_set_until(piece, t), float(piece.t[end])
+        if stop == t:
+            return
+        plan = ending_at(Adaptive(stop), stop)
+        run = self.finer._run(np.asarray(q), np.asarray(p), plan=plan, t=t, parameters=parameters)
+        fine = run._recorded(None, ALL_STATES)
+        if len(times_of_changes(fine)) or (fine.modes is not None and len(fine.modes.t)):
+            self.now = fine.tangent(self.now.T)[-1].T
+            self.now[1:] += self._rounding(1, steps)[0] * np.abs(self._state(piece, end))
+        else:
+            h, sides = np.diff(fine.t), parameters_on_sides(fine, t)
+            for k in range(0, len(h), MOST_STEPS):
+                rows = slice(k, min(k + MOST_STEPS, len(h)) + 1)
+                own = h[rows.start : rows.stop - 1]
+                self._transport(fine.t[rows][:-1], own, fine.q, fine.p, rows, sides, steps / len(h))
+        self.now[0] += self._state(piece, end) - self._state(fine, -1)
+
+    def _rounding(self, rows: int, steps: float) -> Array:
+        """Return (rows, samples, 2m) rounding errors relative to the states, each of so many steps."""
+        self.calls += 1
+        return _normal_numbers(self.calls, rows, 2 * self.m) * (math.sqrt(steps) * self.u)
+
+    @staticmethod
+    def _state(states: Any, k: Any) -> Array:
+        return np.concatenate([np.asarray(states.q)[k], np.asarray(states.p)[k]], axis=-1)
+
+
+@lru_cache(maxsize=16)
+def _normal_numbers(seed: int, rows: int, columns: int) -> Array:
+    return np.random.default_rng(seed).standard_normal((rows, SAMPLES, columns))
+
+
+def _rows_between(states: Any, special: Array) -> NDArray[np.intp]:
+    """Return the rows of the first state and of those at none of the times ``special``."""
+    t, kept = np.asarray(states.t), np.ones(len(states), bool)
+    if len(special):
+        near = AT_EVENT * np.finfo(float).eps * max(np.abs(t).max(), np.abs(special).max())
+        order = np.sort(special)
+        after = np.minimum(np.searchsorted(order, t), len(order) - 1)
+        apart = np.minimum(np.abs(order[after] - t), np.abs(order[np.maximum(after - 1, 0)] - t))
+        kept = apart > near
+        kept[0] = True
+    return np.flatnonzero(kept)
+
+
+def _compared(run: Any, finer: Any) -> RunError:
+    """Return the differences of a run from one of the finer method at round-off, without signs.
+
+    Rounding errors are estimated by the difference of a second one whose initial state is rounded differently, once for
+    each step of the run as independent ones.
+    """
+    finer = finer.with_events(run.stepper.events if run.stepper.changes_states else ())
+    exact, rounded = _states_of(run, finer, np.asarray), _states_of(run, finer, neighbouring)
+    growth = math.sqrt(max(1.0, run.steps))
+    errors = [np.abs(np.asarray(x - y)) for x, y in zip((run.q, run.p), exact, strict=True)]
+    rounding = [growth * np.abs(np.asarray(x - y)) for x, y in zip(exact, rounded, strict=True)]
+    return _described(run, errors, rounding, signed=False)
+
+
+def _states_of(run: Any, finer: Any, begin: Callable[[Any], Any]) -> tuple[Any, Any]:
+    """Return (n, m) positions and momenta of the finer run at the times of a run, from ``begin`` of its first state."""
+    two_words, parts = finer.interface.words > 1, list[Any]()
+    start = [x if two_words else begin(x) for x in (run.q[0], run.p[0])]
+    if two_words and begin is neighbouring:
+        start = [with_low(np.asarray(x), low_words(x) + roundoff(2) * np.asarray(x)) for x in start]
+    for piece in run._runs:
+        end = float(piece.t[-1])
+        control = Adaptive(end, float(finer.binding.function("smallest_tolerance")()) if two_words else None)
+        plan = ending_at(piece.plan, end) if run.stepper.in_tau else control
+        fine = finer._run(*start, plan=plan, t=piece.t[0], parameters=piece.parameters)._recorded(None, ALL_STATES)
+        parts.append(fine._states_at(piece.t))
+        start = [x[-1] for x in parts[-1]]
+    q, p = (concatenated(list(of)) for of in zip(*parts, strict=True))
+    return q, p
+
+
+def corrected_states(run: Any, error: RunError) -> CorrectedStates:
+    """Return the states of a run minus their errors; raises as :attr:`WithErrors.corrected`."""
+    if not error.signed:
+        raise StateError("corrected requires errors with signs, but those of this run are by comparison: use run.error")
+    stepper, q, p = run.stepper, np.asarray(run.q) - error.q, np.asarray(run.p) - error.p
+    q[~(error.relative < LOST)] = p[~(error.relative < LOST)] = np.nan
+    for member in members_of(stepper.dimension, stepper.interface.rotations):
+        if member.kind != "spin":  # unit quaternions and directions: p is tangent to their sphere
+            unit = q[:, member.columns] / np.linalg.norm(q[:, member.columns], axis=1, keepdims=True)
+            along = np.sum(unit * p[:, member.columns], axis=1, keepdims=True)
+            q[:, member.columns], p[:, member.columns] = unit, p[:, member.columns] - along * unit
+    velocity = np.full_like(q, np.nan)
+    for k in np.flatnonzero(np.isfinite(q).all(axis=1)).tolist():
+        parameters = parameters_on_sides(run, float(run.t[k]))
+        if stepper.interface.constraints:
+            q[k], p[k], _ = projected(stepper, q[k], p[k], float(run.t[k]), parameters)
+        velocity[k] = stepper.velocity(q[k], p[k], float(run.t[k]), parameters)
+    return CorrectedStates(
+        t=np.asarray(run.t), q=stepper.named(q), p=stepper.named(p), velocity=stepper.named(velocity)
+    )

@@ -1,0 +1,261 @@
+"""``run.error``: the signed global error of a run, compared with closed forms, records of 30 digits and other runs."""
+
+import math
+import re
+import warnings
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import error_of, output_of
+from exact_orbits import motion_stepper, on_an_ellipse
+from motions import MOTIONS, recorded
+from notation import lagrange
+
+import scvi_codegen as sc
+from scvi_codegen.runs.accuracy.run_error import with_uncertainty
+
+PAGE = Path(__file__).parents[2] / "docs" / "steps.md"
+
+
+@cache
+def kepler(method="svi:4", **options):
+    """Return the stepper of Kepler's problem with mass and centre as parameters."""
+    system = lagrange("kepler", "x y", "(x_dot**2 + y_dot**2)/2 + mu/sqrt((x - c)**2 + y**2)", mu=1.0, c=0.0)
+    return sc.compile_stepper(system, method, **options)
+
+
+def start_of(e, length=1.0, time=1.0, c=0.0):
+    """Return arguments of an orbit of eccentricity e from its pericentre, in units of length and time."""
+    q, v = [length * (1.0 - e) + c, 0.0], [0.0, length / time * math.sqrt((1.0 + e) / (1.0 - e))]
+    return {"q": q, "velocity": v, "parameters": {"mu": length**3 / time**2, "c": c}, "check_growth": False}
+
+
+def truth(run, rows, length=1.0, time=1.0, c=0.0):
+    """Return (rows, 4) exact errors of states, in units of length and velocity."""
+    q = (np.asarray(run.q) - [c, 0.0]) / length
+    p = np.asarray(run.p) * time / length
+    times = np.r_[run.t[0], run.t[rows]] / time
+    exact = on_an_ellipse(q[0], p[0], times)[1:]
+    return np.asarray(np.concatenate([q, p], axis=1)[rows] - exact, float)
+
+
+def estimate(run, rows, length=1.0, time=1.0):
+    """Return the same by ``run.error``."""
+    return np.concatenate([run.error.q / length, run.error.p * time / length], axis=1)[rows]
+
+
+@pytest.mark.parametrize("method", ["svi:4", "svi:8"])
+def test_errors_have_sign_and_size(method):
+    """Random orbits, tolerances, units, origins and directions: to 1 % of the largest error."""
+    random = np.random.default_rng(8)
+    for _ in range(12):
+        e, tolerance = random.uniform(0.0, 0.7), 10.0 ** random.uniform(-10.0, -4.0)
+        length, time = 10.0 ** random.uniform(-6.0, 6.0, 2)
+        c = length * random.choice([0.0, 3.0, -40.0])
+        span = time * random.uniform(5.0, 30.0) * random.choice([-1.0, 1.0])
+        run = kepler(method).integrate(**start_of(e, length, time, c), t_end=span, tolerance=tolerance)
+        rows = [len(run) // 2, -1]
+        true, error = truth(run, rows, length, time, c), estimate(run, rows, length, time)
+        size, rounding = np.abs(true).max(), 1e-14 * (1.0 + abs(c) / length)
+        assert np.abs(error - true).max() <= max(0.01 * size, 100.0 * rounding), (e, tolerance)
+        assert run.error.relative[-1] >= 0.5 * np.abs(true).max() / 8.0
+        corrected = run.corrected
+        off = np.abs((np.asarray(corrected.q)[-1] - np.asarray(run.q)[-1]) + run.error.q[-1]).max()
+        assert off <= 4e-16 * (abs(c) + length) * 4.0
+
+
+def test_saving_seldom_and_output_times_do_not_change_the_errors():
+    start = start_of(0.3)
+    runs = [kepler().integrate(**start, t_end=20.0, tolerance=1e-7, save_every=k) for k in (1, 7, 10**6)]
+    runs.append(kepler().integrate(**start, t_end=20.0, tolerance=1e-7, t_eval=[3.0, 20.0]))
+    ends = np.array([np.r_[run.error.q[-1], run.error.p[-1]] for run in runs])
+    assert np.abs(np.diff(ends, axis=0)).max() <= 3e-5 * np.abs(ends).max()
+    assert runs[-1].error.q[0].any()  # the error since the initial state, which is not among the times
+
+
+def test_a_changed_state_changes_later_errors_by_the_tangent_map():
+    """Kicks that a run suffers are errors: by e at the state, and by its image later."""
+    run = kepler().integrate(**start_of(0.3), t_end=12.0, tolerance=1e-8)
+    k, e = len(run) // 3, np.array([1e-6, -2e-6, 3e-6, 1e-6])
+    changed = replace(run, q=run.q.copy(), p=run.p.copy())
+    changed.q[k] += e[:2]
+    changed.p[k] += e[2:]
+    apart = estimate(changed, slice(None)) - estimate(run, slice(None))
+    assert np.abs(apart[k] - e).max() <= 1e-9 * np.abs(e).max()
+    assert np.abs(apart[-1]).max() <= 1e-3 * np.abs(e).max()  # the next saved state does not continue the changed one
+    rest = kepler().integrate(changed.q[k], changed.p[k], t=run.t[k], t_end=12.0, tolerance=1e-8, check_growth=False)
+    moved = run[k:].tangent(e[:, None])[-1][:, 0]
+    plain = run[k:]
+    after = np.r_[rest.q[-1] - plain.q[-1], rest.p[-1] - plain.p[-1]]
+    assert np.abs(after - moved).max() <= 1e-2 * np.abs(moved).max()
+
+
+def test_error_of_a_slice_is_that_since_its_first_state():
+    run = kepler().integrate(**start_of(0.2), t_end=12.0, tolerance=1e-6)
+    assert not run[5:].error.q[0].any()
+    assert np.array_equal(run[:6].error.q, run.error.q[:6])
+
+
+def test_uncertain_digits():
+    cases = {
+        (0.5123451, 1.15e-5): "0.512345(12)",
+        (-3.0, 0.0121): "-3.000(13)",
+        (1234.5, 56.0): "1234(56)",
+        (1.5e-9, 2.4e-12): "1.5000(24)e-09",
+        (2.0, 0.0): "2.0",
+        (0.1, math.inf): "0.1(lost)",
+    }
+    assert {key: with_uncertainty(*key) for key in cases} == cases
+    run = kepler().integrate(**start_of(0.2), t_end=12.0, tolerance=1e-6)
+    lines = str(run.error).split("\n")
+    assert re.fullmatch(r"t = 12: relative error \d\.\de-0\d", lines[0])
+    assert [line.split(" = ")[0] for line in lines[1:]] == ["x", "y", "p_x", "p_y"]
+    assert re.fullmatch(r"x = -?0\.\d+\(\d\d\)", lines[1])
+
+
+def test_files_pictures_and_the_command_line_show_errors(tmp_path):
+    run = kepler().integrate(**start_of(0.2), t_end=12.0, tolerance=1e-6)
+    run.save(tmp_path / "orbit.npz", error=True)
+    with np.load(tmp_path / "orbit.npz") as file:
+        assert np.array_equal(file["q_error"], run.error.q)
+        assert np.array_equal(file["p_rounding"], run.error.rounding_p)
+    with pytest.raises(sc.StateError, match=r"\.csv has no errors"):
+        run.save(tmp_path / "orbit.csv", error=True)
+    printed = output_of(
+        "run", "kepler", "--span", "20", "--tolerance", "1e-7", "--error-bars", "-o", tmp_path / "k.npz"
+    )
+    assert re.search(r"^p_q1 = -?\d\.\d+\(\d\d\)$", printed, re.M)
+    with np.load(tmp_path / "k.npz") as file:
+        assert file["q_error"].shape == file["q"].shape
+    assert "is not available" in error_of("run", "kepler", "--error-bars", "-o", tmp_path / "k.run", status=2)
+
+
+def test_lost_digits_are_reported_and_not_corrected():
+    """exp(-t) on a saddle, whose errors grow by exp(t)."""
+    saddle = sc.compile_stepper(lagrange("saddle", "q", "q_dot**2/2 + q**2/2"), "svi:4")
+    run = saddle.integrate([1.0], [-1.0], t_end=42.0, check_growth=False)
+    lost = run.error.lost
+    assert 30.0 < lost < 42.0
+    corrected, known = run.corrected.q[:, 0], run.error.relative < 0.1
+    assert np.isnan(corrected[~known]).all()
+    assert np.abs(corrected[known] - np.exp(-run.t[known])).max() < 0.05
+    known = run.error.relative < 1e-3
+    assert np.abs(corrected[known] - np.exp(-run.t[known])).max() < 1e-4
+
+
+@pytest.mark.full
+def test_recorded_motions():
+    """All recorded motions at tolerances from 1e-4 to 1e-12: 5 % of the truth, and bounds of it everywhere."""
+    ratios, bounds, worse = [], [], []
+    for name in MOTIONS:
+        stepper, start = motion_stepper(name)
+        _, high, low = recorded(name)
+        for tolerance in (1e-4, 1e-6, 1e-8, 1e-10, 1e-12):
+            run = stepper.integrate(**start, tolerance=tolerance, check_growth=False)
+            error = run.error
+            states = np.concatenate([run.q, run.p], axis=1)[-1]
+            true = (states - high[-1]) - low[-1]
+            sizes, m = error.sizes.ravel(), run.q.shape[1]
+            found = np.r_[error.q[-1], error.p[-1]]
+            rounding = np.r_[error.rounding_q[-1], error.rounding_p[-1]]
+            i = int(np.argmax(np.abs(true) / sizes))
+            bounds.append(abs(true[i]) / sizes[i] / error.relative[-1])
+            if 30.0 * (np.abs(rounding) / sizes).max() < error.relative[-1] < 1e-3:
+                ratios.append(found[i] / true[i])
+                worse.append(np.abs(true - found).max() > np.abs(true).max())
+            assert len(sizes) == 2 * m
+    ratios = np.array(ratios)
+    assert len(ratios) > 60
+    assert np.mean((ratios > 0.95) & (ratios < 1.05)) >= 0.95, ratios
+    assert ((ratios > 0.5) & (ratios < 2.0)).all(), ratios
+    assert max(bounds) <= 2.0, bounds
+    assert not any(worse)
+
+
+def oscillator(method="svi:4", **options):
+    return sc.compile_stepper(lagrange("oscillator", "x", "x_dot**2/2 - x**2/2"), method, **options)
+
+
+ORBIT = {"t_end": 9.0, "tolerance": 1e-6, "check_growth": False}
+FLOOR = "y_dot**2/2 - 9.8*y - 1e5*positive_part(-y)**2"
+KINDS = {
+    "fixed steps": lambda: oscillator().integrate([1.0], [0.0], h=0.3, steps=30),
+    "adaptive steps": lambda: oscillator().integrate([1.0], [0.0], **ORBIT),
+    "explicit methods and compositions": lambda: oscillator("composition:4").integrate([1.0], [0.0], h=0.1, steps=90),
+    "`save_every`, `t_eval`": lambda: oscillator().integrate([1.0], [0.0], **ORBIT, save_every=5),
+    "inputs": lambda: sc.compile_stepper(
+        sc.LagrangianSystem.from_text("i", ["x"], "x_dot**2/2 - x**2/2 + u*x", inputs=["u"]), "svi:4"
+    ).integrate([1.0], [0.0], **ORBIT, inputs={"u": ([0.0, 4.0, 9.0], [0.0, 1.0, 0.5])}),
+    "impacts and other events that change the state": lambda: sc.compile_stepper(
+        lagrange("ball", "x y", "(x_dot**2 + y_dot**2)/2 - y"), "svi:4", events=sc.impact("y", restitution="0.8")
+    ).integrate([0.0, 1.0], [1.0, 0.0], t_end=4.0, check_growth=False),
+    "located kinks and jumps": lambda: sc.compile_stepper(lagrange("floor", "y", FLOOR), "svi:4").integrate(
+        [1.0], [0.0], t_end=1.5, tolerance=1e-6, check_growth=False
+    ),
+    "contacts and dry friction": lambda: sc.compile_stepper(
+        lagrange("o", "x", "x_dot**2/2 - x**2/2"), "svi:3", contacts=[sc.friction("x_dot - 0.3", limit=0.25)]
+    ).integrate([0.0], velocity=[0.3], t_end=9.0, tolerance=1e-6),
+    "constraints": lambda: sc.compile_stepper(
+        lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 - 1"]), "svi:3"
+    ).integrate([0.6, -0.8], velocity=[0.8, 0.6], **ORBIT),
+    "rotations": lambda: sc.compile_stepper(
+        lagrange("top", [], "(omega_1**2 + 2*omega_2**2 + 3*omega_3**2)/2", rotations={"R": "omega"}), "svi:3"
+    ).integrate({"R": [1, 0, 0, 0]}, velocity={"omega": [1.0, 0.1, 0.2]}, **ORBIT),
+    "Hamiltonians": lambda: sc.compile_stepper(
+        sc.HamiltonianSystem.from_text(
+            name="h", coordinates=["q"], momenta=["p"], hamiltonian="(q**2 + 1)*(p**2 + 1)/2"
+        ),
+        "svi:4",
+    ).integrate([-1.0], [0.3], **ORBIT),
+    "trajectories of ensembles": lambda: oscillator().integrate_ensemble([[1.0]], [[0.0]], t_end=9.0, tolerance=1e-6)[
+        0
+    ],
+    "time transformation by a controller": lambda: oscillator(time_transformation="1 + x**2").integrate(
+        [1.0], [0.0], h=0.1, t_end=5.0
+    ),
+    "systems in transformed time (`reparametrise`)": lambda: sc.compile_stepper(
+        sc.reparametrise(lagrange("o", "x", "x_dot**2/2 - x**2/2"), "1 + x**2"), "svi:4"
+    ).integrate([1.0], [0.0], h=0.1, t_end=5.0),
+    "double-double arithmetic": lambda: oscillator("svi:8", precision="double-double").integrate(
+        [1.0], [0.0], t_end=5.0, tolerance=1e-20
+    ),
+    "arrays of run-time sizes": lambda: sc.compile_stepper(
+        lagrange("a", "q[N]", "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)"), "svi:4"
+    ).integrate([1.0, 0.5], [0.0, 0.1], **ORBIT),
+    "kinks that steps do not locate": lambda: sc.compile_stepper(
+        lagrange("floor", "y", FLOOR), "svi:4", kinks="as formulas"
+    ).integrate([1.0], [0.0], t_end=1.5, tolerance=1e-6),
+    "heat baths": lambda: sc.compile_stepper(
+        sc.LagrangianSystem.from_text("bath", ["x"], "x_dot**2/2 - x**2/2", damping=0.1, temperature=1.0), "svi:2"
+    ).integrate([1.0], [0.0], h=0.1, steps=10),
+    "runs with `observe`": lambda: oscillator().integrate([1.0], [0.0], h=0.1, steps=10, observe="extremes"),
+}
+
+
+def table_of_kinds():
+    rows = re.findall(r"^\| (.+?) \| (signed|by comparison|refused) \|", PAGE.read_text("utf-8"), re.M)
+    return {kind: judge for names, judge in rows for kind in names.split("; ")}
+
+
+def test_the_page_lists_the_kinds_of_runs():
+    assert [*table_of_kinds()] == [*KINDS]
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize("kind", KINDS)
+def test_kinds_of_runs(kind):
+    judge = table_of_kinds()[kind]
+    with warnings.catch_warnings(action="ignore"):
+        run = KINDS[kind]()
+        if judge == "refused":
+            with pytest.raises((sc.StateError, sc.MethodError), match=r"run\.error is not available"):
+                _ = run.error
+            return
+    error = run.error
+    assert error.signed == (judge == "signed")
+    assert 0.0 < error.relative[-1] < 1e-2
+    assert error.lost is None
+    assert not error.reason
