@@ -282,8 +282,8 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         if segments is None:
             trajectory = run._integrated(initial, begins_by, growth, steps, output)
             if output.times is not None and trajectory.t[0] != initial.t:  # errors are those since the initial state
-                q, p = cast(Any, self)._consistent_state(initial) if begins_by else initial[:2]
-                trajectory._initial = float(initial.t), *self._states.pair(q, cast(Any, p))
+                start: Any = self._consistent_state(initial) if begins_by else initial[:2]
+                trajectory._initial = float(initial.t), *self._states.pair(*start)
         else:
             run._start_from(initial, begins_by, growth)
             trajectory = segments.record(run, output.save_every, output.progress)
