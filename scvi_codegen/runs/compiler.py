@@ -30,7 +30,7 @@ from scvi_codegen.codegen.variants import SUMS, Derivatives, Sums, Variant
 from scvi_codegen.common.cache import cached_source, key_of
 from scvi_codegen.common.errors import MethodError, MethodWarning, SizesRequiredError
 from scvi_codegen.common.validation import TEXTS, OfRunTimeSizes, check_kind, checks_arguments
-from scvi_codegen.methods import SVI, StoermerVerlet, as_method, default_method, finer_method, sliding
+from scvi_codegen.methods import SVI, StoermerVerlet, as_method, finer_method, sliding
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.accuracy.run_error import FinerStepper
 from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
@@ -228,11 +228,6 @@ def _compile_arrays(
     of_sizes = partial(compile_stepper, system, method, **common)
     arguments: dict[str, Any] = {"variants": sources.variants, "flags": common["flags"], "events": events}
     return StepperOfRunTimeSizes(source, interface, **arguments, of_sizes=of_sizes, reason=reason)
-
-
-def second_stepper(system: MechanicalSystem) -> Callable[[], Stepper]:
-    """Return a function that compiles the stepper of second runs, by the default method, which has adaptive steps."""
-    return lambda: compile_stepper(system, default_method(system))
 
 
 def _in_both_precisions(compiled: Callable[..., Stepper], events: EventLike | Sequence[EventLike] | None) -> Stepper:

@@ -11,9 +11,8 @@ from commands import error_of, invoke, output_of
 from notation import lagrange
 
 import scvi_codegen as sc
-from scvi_codegen.analysis.advice.tolerance_check import known_digits, missed_tolerance
+from scvi_codegen.analysis.advice.advice import missed_tolerance
 from scvi_codegen.interfaces.cli.reports import in_known_digits
-from scvi_codegen.runs.compiler import second_stepper
 
 
 @pytest.fixture(scope="module")
@@ -151,9 +150,7 @@ class TestTolerances:
         words = "run kepler --q 1.999,0 --velocity 0,0.022366272 --span 18.849555921538759"
         assert re.search(r"q1 =\s+1\.99", output_of(words, "--tolerance", "1e-9"))
         refused = error_of(words, "--advise", "1e-9", status=1)
-        assert re.search(
-            r"no pilot run over t = 4.71 is accurate, .*use adaptive step size \(t_end, --tolerance\)", refused
-        )
+        assert re.search(r"no pilot run over t = \S+ is accurate, .*use adaptive step size", refused)
 
     @pytest.mark.rotated
     @pytest.mark.parametrize(
@@ -167,24 +164,11 @@ class TestTolerances:
         advice = sc.advise(problem.system, method, problem.q, p, 20.0, tolerance)
         found = stepper.integrate(problem.q, p, h=advice.h, steps=advice.steps)
         assert found.step_error > 50 * tolerance
-        assert missed_tolerance(second_stepper(problem.system), found, tolerance) == ""
+        assert missed_tolerance(found, tolerance) == ""
         best = sc.compile_stepper(problem.system, "svi:8").integrate(problem.q, p, t_end=20.0)
         error = np.linalg.norm(found.q[-1] - best.q[-1]) / np.linalg.norm(best.q[-1])
         assert error < tolerance
-        assert "a second run with other steps differs by" in missed_tolerance(
-            second_stepper(problem.system), found, error / 5
-        )
-
-    @pytest.mark.second
-    @pytest.mark.parametrize(
-        "given", [{"forces": {"q": "-q_dot/2"}}, {"damping": "1/2"}], ids=lambda each: next(iter(each))
-    )
-    def test_energy_change_by_forces_is_not_a_violation(self, given):
-        text = {"name": "damped", "coordinates": ["q"], "lagrangian": "q_dot**2/2 + cos(q)"}
-        damped = sc.LagrangianSystem.from_text(**text, **given)
-        trajectory = sc.compile_stepper(damped, "svi:8").integrate([1.0], [0.0], h=0.1, steps=100)
-        assert abs(np.ptp(trajectory.energy())) > 0.1
-        assert missed_tolerance(second_stepper(damped), trajectory, 1e-9) == ""
+        assert "is missed: the error is" in missed_tolerance(found, error / 5)
 
     def test_withdrawn_tolerance_is_reported(self, monkeypatch):
         command = "scvi_codegen.interfaces.cli.commands.run.missed_tolerance"
@@ -197,10 +181,6 @@ class TestTolerances:
 
 
 class TestKnownDigits:
-    def test_slow_second_run_is_abandoned(self, kepler):
-        trajectory = kepler.integrate([1.0, 0.0], [0.0, 1.0], h=0.5, steps=4000)
-        assert known_digits(second_stepper(sc.problem("kepler").system), trajectory, most=10) is None
-
     @pytest.mark.parametrize(
         ("x", "error", "text"),
         [

@@ -11,9 +11,7 @@ from mpmath import mp
 from notation import lagrange
 
 from scvi_codegen import Advice, LagrangianSystem, StateError, advise, compile_stepper, problem
-from scvi_codegen.analysis.advice.advice import _advice, _choose
-from scvi_codegen.analysis.advice.pilot import run_pilot
-from scvi_codegen.common.errors import StepFailedError, UnresolvedError
+from scvi_codegen.common.errors import UnresolvedError
 from scvi_codegen.interfaces.cli.step_selection import _text
 from scvi_codegen.methods import SVI, ExplicitEuler, Gauss, Method, RadauIIA, StoermerVerlet
 
@@ -63,43 +61,6 @@ def assert_achieved(advice: Advice, error: float, tolerance: float) -> None:
     assert advice.expected_error / 3.0 < error < 3.0 * advice.expected_error
 
 
-def turning(q: np.ndarray, h: float, steps: int, save_every: int) -> SimpleNamespace:
-    """Run on a circle at the angular velocity 1 + h^2/24, as of a method of order 2."""
-    angles = (1.0 + h * h / 24.0) * h * np.arange(0, steps + 1, save_every)
-    return SimpleNamespace(q=np.stack([np.cos(angles), np.sin(angles)], 1), iterations=np.full(steps, 5))
-
-
-def test_run_that_succeeds_by_chance_is_not_trusted() -> None:
-    """All runs beyond t = 2, where an encounter begins, fail but the last one."""
-
-    def encounter(q: np.ndarray, h: float, steps: int, save_every: int) -> SimpleNamespace:
-        if h * steps > 2.0 and steps != 1024:
-            raise StepFailedError("", status="not converged", step=0, t=2.0, residual=1.0)
-        return turning(q, h, steps, save_every)
-
-    bounds = {"symplectic": True, "target_error": 5e-3, "most": 2**14}
-    with pytest.raises(UnresolvedError, match=r"no pilot run over t = 4 is accurate, with step sizes down to 0.0039"):
-        run_pilot(encounter, StoermerVerlet(), np.array([1.0, 0.0]), 16.0, **bounds)
-
-
-@pytest.mark.parametrize("span", [100.0, -100.0, 4000.0])
-def test_numbers_of_advice_are_those_of_an_error_in_closed_form(span: float) -> None:
-    """The error after t is h^2 t/24; 5e-3 are half of the tolerance."""
-    bounds = {"symplectic": True, "target_error": 5e-3, "most": 2**18}
-    pilot = run_pilot(turning, StoermerVerlet(), np.array([1.0, 0.0]), span, **bounds)
-    advice = _advice(pilot, _choose(pilot, 1e-2), StoermerVerlet())
-    assert pilot.whole == (abs(span) == 100.0)
-    assert advice.h * advice.steps == pytest.approx(span)
-    assert advice.expected_error == pytest.approx(advice.h**2 * abs(span) / 24, rel=0.02)
-    assert 5e-3 / 1.6 < advice.expected_error <= 5e-3
-    fine = [each for each in advice.evidence if each.error < 0.1]
-    assert [each.error for each in fine] == pytest.approx([each.h**2 * abs(span) / 24 for each in fine], rel=0.02)
-    assert {each.iterations for each in fine} == {5.0}
-    words = f"{advice.steps} steps of {advice.h:.6g} by {StoermerVerlet().name}, for an expected error of "
-    assert advice.message.startswith(f"{words}{advice.expected_error:.1g}. The pilot runs covered ")
-    assert advice.message.endswith("The method is symplectic only at this fixed step size.")
-
-
 class TestAchievedErrors:
     @pytest.mark.rotated
     @pytest.mark.sampled(4)
@@ -110,8 +71,8 @@ class TestAchievedErrors:
             (SVI(8), 2000.0, 1e-9),
             (SVI(8), 2000.0, 1e-10),
             (SVI(8), 50_000.0, 1e-6),
-            (SVI(8), 50_000.0, 1e-8),
-            (SVI(4), 50_000.0, 1e-6),
+            (SVI(8), 50_000.0, 1e-7),
+            (SVI(4), 50_000.0, 1e-5),
             (RadauIIA(3), 2000.0, 1e-6),
             (StoermerVerlet(), 100.0, 1e-6),
         ],
@@ -167,7 +128,7 @@ class TestDegree:
         """Pilot runs over the whole span of one second each."""
         times = count()
         monkeypatch.setattr(
-            "scvi_codegen.analysis.advice.pilot.time", SimpleNamespace(perf_counter=lambda: next(times))
+            "scvi_codegen.analysis.advice.advice.time", SimpleNamespace(perf_counter=lambda: next(times))
         )
         advice = advise(pendulum(), SVI(6), [1.5], [0.0], -20.0, 1e-6)
         assert {row.seconds for row in advice.evidence} == {1 / 20}
@@ -217,10 +178,11 @@ class TestHonesty:
         rate, span = math.sqrt(k), direction * 40.0 / math.sqrt(k)
         advice = advise(saddle, SVI(6), [1.0], [-direction * rate], span, 1e-6)
         words = " ".join(advice.warnings)
-        tenfold, until = (float(re.search(rf"{x} (\S+) units", words)[1]) for x in ("every", "about"))  # type: ignore
-        assert tenfold == pytest.approx(math.log(10.0) / rate, rel=0.05)
-        assert until == pytest.approx(math.log(1e-6 / 2.0**-53) / rate, rel=0.05)
-        assert f"The pilot runs covered {span / 4:g} of {span:g}, where errors grew exponentially." in advice.message
+        found = re.search(r"tenfold every (\S+) units of time .* meets it until t = (\S+)$", words)
+        assert found is not None
+        tenfold, until = map(float, found.groups())
+        assert tenfold == pytest.approx(math.log(10.0) / rate, rel=0.1)
+        assert abs(until) == pytest.approx(math.log(1e-6 / 2.0**-53) / rate, rel=0.1)
 
     def test_chaotic_system_over_a_short_span_is_not_called_chaotic(self):
         entry = problem("double-pendulum")
@@ -234,8 +196,10 @@ class TestHonesty:
     @pytest.mark.rotated
     def test_quadratic_error_growth_is_extrapolated_quadratically(self):
         system, (q, p) = problem("kepler").system, kepler_start(0.5)
-        message = advise(system, RadauIIA(3), q, p, 50_000.0, 1e-6).message
-        assert float(re.search(r"grew like t\^(\d\.\d)", message)[1]) > 1.3  # type: ignore[index]
+        advice = advise(system, RadauIIA(3), q, p, 50_000.0, 1e-6)
+        found = re.search(r"covered \S+ of 5e\+04, where errors grew like t\^(\d\.\d)", advice.message)
+        assert found is not None
+        assert 1.7 < float(found[1]) < 2.3
 
     def test_trajectory_that_ends_is_reported(self):
         system = LagrangianSystem.from_text(name="runaway", coordinates=["q"], lagrangian="q_dot**2/2 + q**3/3")
@@ -285,7 +249,7 @@ class TestEnsembles:
         """The errors of all trajectories, against the exact solution, are within the tolerance."""
         advice, system = self.advised(), problem("kepler").system
         assert advice.member == 1
-        assert "Of 4 trajectories, number 1 (from 0) has the largest error." in advice.message
+        assert "Trajectory 1 (from 0) of the ensemble has the largest error." in advice.message
         alone = [advise(system, SVI(6), *kepler_start(e), 100.0, 1e-8).steps for e in self.ECCENTRICITIES]
         assert 0.9 * max(alone) < advice.steps < 1.1 * max(alone)
         for e in self.ECCENTRICITIES:

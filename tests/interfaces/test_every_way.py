@@ -110,7 +110,7 @@ CASES = {
         PUSHED.replace(TABLE, "0.5"),
         "svi:4",
         STEPS | {"step": 0.1},
-        "confirmed by a second run",
+        "in the digits that the error of the run leaves",
         inputs=INPUTS | {"u": 0.5},
     ),
     "adaptive inputs": Case(PUSHED, "svi:4", {"span": 2.3}, "rejected) from t = 0", 3e-13, inputs=INPUTS),

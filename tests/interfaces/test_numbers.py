@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,6 @@ import pytest
 from commands import json_of, output_of
 
 import scvi_codegen as sc
-from scvi_codegen.analysis.advice.tolerance_check import Known
 from scvi_codegen.codegen.rendering.source import Interface
 from scvi_codegen.interfaces.cli.reports import in_known_digits
 from scvi_codegen.interfaces.cli.running import final_state
@@ -55,7 +55,7 @@ class Kind:
     Attributes:
         reason: why the energy changes, as the run says; "" where it does not.
         symplectic: words on the method.
-        second_run: whether the digits of the end are confirmed by a second run.
+        known: whether the digits of the end are printed by the error of the run.
     """
 
     system: str = SPRINGS
@@ -65,7 +65,7 @@ class Kind:
     extra: str = ""
     reason: str = ""
     symplectic: str = "symplectic"
-    second_run: bool = True
+    known: bool = True
 
 
 KINDS = {
@@ -123,11 +123,9 @@ u = {{ t = [0.0, {T + 4.5}, {T + 7.3125}, 20.0], values = [0.0, 1.5, -0.5, 0.25]
         reason="forces act",
         symplectic="not symplectic",
     ),
-    "transformed time": Kind(system=TRANSFORMED, run=SPAN, second_run=False),
-    "steps of transformed time": Kind(system=TRANSFORMED, run=FIXED, second_run=False),
-    "transformed time by tolerance": Kind(
-        system=TRANSFORMED, run={"tolerance": 1e-6, "span": 11.25, "save_every": 2}, second_run=False
-    ),
+    "transformed time": Kind(system=TRANSFORMED, run=SPAN),
+    "steps of transformed time": Kind(system=TRANSFORMED, run=FIXED),
+    "transformed time by tolerance": Kind(system=TRANSFORMED, run={"tolerance": 1e-6, "span": 11.25, "save_every": 2}),
     "reversible controller": Kind(
         system=TRANSFORMED, run=SPAN | {"controller": "reversible"}, symplectic="symplectic only at fixed step size"
     ),
@@ -210,9 +208,9 @@ def fields_of(done: Done) -> dict[str, Any]:
         "worst_step_time": run.worst_step_time,
         "final": {"t": run.t[-1], "q": named(run.q[-1]), "p": named(run.p[-1])},
         "final_error": lambda x: (
-            x is None if not kind.second_run else all(0.0 < y < 1e-2 for part in "qp" for y in x[part].values())
+            x is None if not kind.known else all(0.0 < y < 1e-2 for part in "qp" for y in x[part].values())
         ),
-        "chaotic": False if kind.second_run else None,
+        "lost": None,
         "failure": None,
         "missed": None,
         "written": lambda x: [Path(name).name for name in x] == ["states.npz"],
@@ -276,10 +274,8 @@ def test_every_line_of_the_text_is_correct(done):
     worst = f"largest local error: {numbers['step_error']:.1e} (relative, estimated), step from t = "
     worst += f"{numbers['worst_step_time']:g}" + ": too large" * (numbers["step_error"] > 1e-3)
     assert rest.pop(0) == worst
-    second = "in the digits confirmed by a second run" if done.kind.second_run else (
-        "accuracy unknown: no second run to compare with"
-    )  # fmt: skip
-    assert rest.pop(0) == f"final state ({second})"
+    accuracy = "in the digits that the error of the run leaves" if done.kind.known else "accuracy unknown"
+    assert rest.pop(0) == f"final state ({accuracy})"
     for i, coordinate in enumerate(done.model.system.coordinates):
         found = re.fullmatch(rf" *{coordinate} = +(\S+) +p_{coordinate} = +(\S+) *", rest.pop(0))
         for text, x, known in ((found[1], done.run.q[-1, i], "q"), (found[2], done.run.p[-1, i], "p")):
@@ -389,7 +385,7 @@ def test_every_field_and_line_of_an_array_system_is_correct(here):
         "work": None,
         "energy_balance": None,
         "final_error": None,
-        "chaotic": None,
+        "lost": None,
         "action": None,
         "step_error": run.step_error,
         "worst_step_time": run.worst_step_time,
@@ -419,7 +415,7 @@ def test_numbers_without_a_right_digit_are_not_printed():
 
 
 def test_positions_and_momenta_are_printed_with_their_correct_digits():
-    known = Known(q=np.array([1e-3, 1e-9]), p=np.array([1e-9, 1e-3]), tenfold=np.inf)
+    known = SimpleNamespace(bounds=(np.array([[1e-3, 1e-9]]), np.array([[1e-9, 1e-3]])), lost=None)
     interface = Interface(
         prefix="two", title="", system="", method="", coordinates=("x", "y"), parameters=(), defaults=()
     )

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.analysis.advice.tolerance_check import Known
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.interfaces.cli.ensembles import EnsembleOutcome
 from scvi_codegen.interfaces.cli.recording import RecordedOutcome
 from scvi_codegen.interfaces.cli.running import RunOutcome
 from scvi_codegen.interfaces.models.model import Model
+from scvi_codegen.runs.accuracy.run_error import RunError
 from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
 from scvi_codegen.runs.recording import RecordedRun
 from scvi_codegen.runs.results.energy import EnergyAccount
@@ -31,14 +31,14 @@ def _step_size(model: Model, run: Any) -> float | None:
 
 
 def run_numbers(
-    model: Model, outcome: RunOutcome, final_error: Known | None, account: EnergyAccount | None = None
+    model: Model, outcome: RunOutcome, final_error: RunError | None, account: EnergyAccount | None = None
 ) -> dict[str, Any]:
     """Return the numbers of a run in memory."""
     run, trajectory = outcome.run, outcome.trajectory
     t, q, p = outcome.end
     iterations = int(np.sum(trajectory.iterations)) + run.iterations
     arrays = {"sizes": model.sizes, "tolerance": model.allowed_error, "iterations": iterations}
-    errors = final_error and {"q": _named(model, final_error.q), "p": _named(model, final_error.p)}
+    errors = final_error and {name: _named(model, of[-1]) for name, of in zip("qp", final_error.bounds, strict=True)}
     return {
         **_about(model),
         **(arrays if model.array_system else {}),
@@ -57,7 +57,7 @@ def run_numbers(
         "worst_step_time": trajectory.worst_step_time,
         "final": {"t": t, "q": _named(model, q), "p": _named(model, p), **_low_words(model, q, p)},
         "final_error": errors,
-        "chaotic": None if final_error is None else final_error.chaotic,
+        "lost": None if final_error is None else final_error.lost,
         "failure": failure_text(outcome),
         "missed": outcome.missed or _missed_end(outcome, t, f"t = {model.t + model.covered:g}"),
     }

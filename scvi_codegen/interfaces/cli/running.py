@@ -3,22 +3,22 @@
 import math
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
-from scvi_codegen.analysis.advice.tolerance_check import SECOND_RUN, Known, known_digits
 from scvi_codegen.codegen.rendering.source import Interface
-from scvi_codegen.common.errors import AccuracyWarning, StateError, StepFailedError, warn
+from scvi_codegen.common.errors import AccuracyWarning, ScviCodegenError, StateError, StepFailedError, warn
 from scvi_codegen.common.representation import counted
 from scvi_codegen.interfaces.cli.reports import duration, energy_report, in_known_digits, momentum_report
 from scvi_codegen.interfaces.cli.supervision import BAR_LENGTH, check_memory, interruptions, progress_bar
 from scvi_codegen.interfaces.models.model import Model
 from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.runs.accuracy.local_error import TOLERABLE_ERROR
+from scvi_codegen.runs.accuracy.run_error import RunError
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
-from scvi_codegen.runs.compiler import second_stepper
 from scvi_codegen.runs.driver.largest_step import accuracy_message
 from scvi_codegen.runs.driver.run import Run
 from scvi_codegen.runs.driver.segments import record_segments
@@ -112,7 +112,9 @@ def integrate_model(model: Model) -> RunOutcome:
     )
 
 
-def summary(model: Model, outcome: RunOutcome, final_error: Known | None, account: EnergyAccount | None = None) -> str:
+def summary(
+    model: Model, outcome: RunOutcome, final_error: RunError | None, account: EnergyAccount | None = None
+) -> str:
     """Return a summary of a run in a few lines; shorter if no step was completed."""
     run, trajectory, method, arrays = outcome.run, outcome.trajectory, model.method, model.array_system
     order = "no order claimed" if method.order is None else f"order {method.order}"
@@ -149,14 +151,17 @@ def _geometry(model: Model, run: Run) -> str:
     return "symplectic" if isinstance(run.plan, FixedSteps) else "symplectic only at fixed step size"
 
 
-def known_at_end(model: Model, outcome: RunOutcome) -> Known | None:
-    """Return the digits of the final state that a second run confirms; ``None`` if the run is incomplete."""
+def known_at_end(model: Model, outcome: RunOutcome) -> RunError | None:
+    """Return the error of a run; ``None`` if the run is incomplete, or its error is not known at the end."""
     run, trajectory = outcome.run, outcome.trajectory
-    is_repeated = model.array_system is None and not (model.in_double_double or model.events)
     is_complete = run.steps and outcome.failure is None and not outcome.interrupted
-    if not (is_repeated and is_complete and trajectory.t[-1] == outcome.end[0]):
+    if not is_complete or model.array_system is not None or model.in_double_double:
         return None
-    return known_digits(second_stepper(model.system), trajectory, most=SECOND_RUN + 4 * run.steps, inputs=model.inputs)
+    with suppress(ScviCodegenError):
+        error: RunError = trajectory.error
+        if trajectory.t[-1] == outcome.end[0] and all(np.isfinite(of[-1]).all() for of in error.bounds):
+            return error
+    return None
 
 
 def describe_step_size(model: Model, run: Run) -> str:
@@ -213,7 +218,7 @@ def worst_step(trajectory: Trajectory) -> Iterator[str]:
 
 
 def final_state(
-    interface: Interface, positions: Array, momenta: Array, final_error: Known | None = None
+    interface: Interface, positions: Array, momenta: Array, final_error: RunError | None = None
 ) -> Iterator[str]:
     """Yield lines with the final coordinates and momenta, in the digits that are known to be right."""
     names, columns = interface.coordinates, interface.momentum_columns
@@ -226,16 +231,14 @@ def final_state(
         return
     yield f"final state ({_how_known(final_error)})"
     for i, (name, other, q, p) in enumerate(zip(shown, columns, positions, momenta, strict=False)):
-        error_q, error_p = (final_error.q[i], final_error.p[i]) if final_error else (0.0, 0.0)
+        error_q, error_p = (of[-1, i] for of in final_error.bounds) if final_error else (0.0, 0.0)
         yield f"  {name:{width}} = {in_known_digits(q, error_q):24} {other:{column}} = {in_known_digits(p, error_p)}"
     if len(names) > SHOWN_COORDINATES:
         yield f"  and {len(names) - SHOWN_COORDINATES} more coordinates"
 
 
-def _how_known(final_error: Known | None) -> str:
+def _how_known(final_error: RunError | None) -> str:
     if final_error is None:
-        return "accuracy unknown: no second run to compare with"
-    message = "in the digits confirmed by a second run"
-    if final_error.chaotic:
-        message += f"; chaotic: neighbouring trajectories diverge tenfold every {final_error.tenfold:.2g}"
-    return message
+        return "accuracy unknown"
+    lost = f"; no meaningful digits from t = {final_error.lost:g}" if final_error.lost is not None else ""
+    return f"in the digits that the error of the run leaves{lost}"

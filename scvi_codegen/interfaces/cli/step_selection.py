@@ -79,7 +79,7 @@ def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalEr
 def model_with_advised_step(
     model: Model, tolerance: float, states: EnsembleStates | None = None
 ) -> tuple[Model, Advice]:
-    """Return the model with the fixed step size that pilot runs recommend for an error at the end, and the advice.
+    """Return the model with the fixed step size that errors of pilot runs recommend, and the advice.
 
     Of an ensemble it is the one for all of its initial states. Prints the recommendation and its pilot runs to stdout,
     warnings to stderr.

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from scvi_codegen.analysis.advice.tolerance_check import missed_tolerance
+from scvi_codegen.analysis.advice.advice import missed_tolerance
 from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE
 from scvi_codegen.common.errors import ScviCodegenError
 from scvi_codegen.interfaces.cli.command_group import (
@@ -51,7 +51,6 @@ from scvi_codegen.interfaces.models.options import (
 from scvi_codegen.interfaces.pictures.animation import FILMS
 from scvi_codegen.interfaces.pictures.canvas import PICTURES, check_plot_path
 from scvi_codegen.runs.accuracy.global_error import GlobalError
-from scvi_codegen.runs.compiler import second_stepper
 from scvi_codegen.runs.results.export import FORMATS
 
 ABOUT = """\
@@ -297,7 +296,7 @@ def _run_one(
     for path in written:
         tell(f"wrote {path}")
     if advised is not None:
-        _fail_for(missed_tolerance(second_stepper(model.system), outcome.trajectory, advised, final_error))
+        _fail_for(missed_tolerance(outcome.trajectory, advised))
 
 
 def _finish_recording(outcome: RecordedOutcome) -> None:
@@ -329,7 +328,7 @@ def _run_ensemble(
     for path in written:
         tell(f"wrote {path}", written=written)
     if advised is not None and outcome.result.ok[member]:
-        missed = missed_tolerance(second_stepper(model.system), outcome.result[member], advised)
+        missed = missed_tolerance(outcome.result[member], advised)
         _fail_for(missed, f"trajectory {member}: ")
 
 
