@@ -186,6 +186,26 @@ def test_biased_parameters_warn_of_too_long_steps():
     assert abs(sc.fit(coarse, times, noisy, h=0.02, **given).parameters["b"] - 1.0) < 0.02
 
 
+@pytest.mark.parametrize("damping", [0.2, 0.15])
+def test_chi_squared_tells_a_model_that_fits_from_one_that_does_not(damping):
+    """With less damping than that of the data, beta is wrong by many standard errors; with the true one none warns."""
+    guess = GUESS | {"parameters": TRUE | {"delta": damping, "beta": 0.85}}
+    settings = {"unknown": ["alpha", "beta"], "deviations": NOISE, **guess}
+    if damping == 0.15:
+        with pytest.warns(
+            sc.AccuracyWarning, match=r"the model does not fit the measurements: chi\^2/n = \S+ with n = 146"
+        ):
+            found = sc.fit(oscillator(), TIMES, recorded(1)[0], **settings)
+        assert abs(found.parameters["beta"] - TRUE["beta"]) > 10.0 * found.standard_errors["beta"]
+        return
+    fits = [sc.fit(oscillator(), TIMES, recorded(seed)[0], **settings) for seed in range(10)]
+    values = np.array([found.chi_squared for found in fits])
+    away = np.array([np.sum(found.residuals**2) / NOISE**2 for found in fits])
+    assert_allclose(values, away, rtol=1e-12)
+    assert abs(values.mean() - 146.0) < 4.0 * np.sqrt(2.0 * 146.0 / len(fits))
+    assert str(fits[0]).endswith(f"chi^2/n = {values[0] / 146:.3g} with n = 146")
+
+
 def test_parameter_at_a_bound_has_no_standard_error():
     """The parameter counts as known; other errors are those to first order."""
     bound = {"alpha": (-0.95, 0.0)}

@@ -6,6 +6,7 @@ The cost is a smooth function of the unknowns, and its gradient is exact for the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -33,6 +34,8 @@ REFINEMENT_ITERATIONS = 4
 """Gauss-Newton iterations from the solution with half the step size."""
 NEGLIGIBLE_CHANGE = 1e-6
 """Relative change of an unknown with half the step size below which no warning is issued."""
+FALSE_ALARM = 1e-3
+"""Probability that a model that fits is warned of, by the distribution of chi squared."""
 NAMED_FRACTION = 0.1
 """Fraction of the largest entry of a null direction from which on an unknown is named."""
 
@@ -56,6 +59,9 @@ class Fit:
         deviations: (c,) standard deviations of the noise, as passed or estimated from the residuals.
         evaluations: number of trajectory evaluations.
         jumps: (segments - 1, 2m) remaining discontinuities between consecutive segments.
+        surplus: number n of measurements beyond the estimated unknowns.
+        chi_squared: sum of the squared residuals in standard deviations of the noise, about n if the model fits; NaN
+            without ``deviations``, which are then estimated so that it is n.
     """
 
     names: tuple[str, ...]
@@ -73,6 +79,8 @@ class Fit:
     deviations: Array
     evaluations: int
     jumps: Array
+    surplus: int
+    chi_squared: float
 
     __repr__ = summary("names", "values", "evaluations")
 
@@ -88,6 +96,8 @@ class Fit:
             f"{name:{width}} = {value:.8g} " + ("at its bound" if name in self.at_bounds else f"+- {error:.2g}")
             for name, value, error in zip(self.names, self.values, errors, strict=True)
         ]
+        if self.surplus and not math.isnan(self.chi_squared):
+            lines.append(f"chi^2/n = {self.chi_squared / self.surplus:.3g} with n = {self.surplus}")
         return "\n".join(lines)
 
     @property
@@ -143,7 +153,8 @@ def fit(
 
     Returns:
         A :class:`Fit`. An :class:`~scvi_codegen.AccuracyWarning` is issued if half the step size would change an
-        unknown by more than its standard error.
+        unknown by more than its standard error, and if the model does not fit measurements of known ``deviations``:
+        chi squared is above its quantile at 0.999.
 
     Raises:
         FitError: if the measurements do not determine an unknown, or least squares do not converge.
@@ -162,8 +173,9 @@ def fit(
     chain, x = chained(measurements, model.prior, model.unknown_indices, checked_count(segments, "segments", least=1))
     chain, x, at_bound, evaluations = _solved(model, chain, x, bounds or {})
     fitted = model.fit(chain, x, at_bound, evaluations, known_noise=deviations is not None)
-    if message := _step_size_warning(chain, fitted, x, ~at_bound):
-        warn(message, AccuracyWarning)
+    for message in (_step_size_warning(chain, fitted, x, ~at_bound), _misfit(fitted)):
+        if message:
+            warn(message, AccuracyWarning)
     return fitted
 
 
@@ -294,6 +306,8 @@ class _Model:
             deviations=noise * measurements.deviations,
             evaluations=evaluations,
             jumps=chain.jumps,
+            surplus=free,
+            chi_squared=float(scaled @ scaled) if known_noise else np.nan,
         )
 
 
@@ -320,6 +334,23 @@ def _step_size_warning(chain: Chain, fitted: Fit, x: Array, free: NDArray[np.boo
             "errors. Reduce h, or use a method of higher order"
         )
     return ""
+
+
+def _misfit(fitted: Fit) -> str:
+    """Return a warning if chi squared is above the quantile that a model that fits exceeds with FALSE_ALARM, else "".
+
+    Its distribution is that of a sum of n squared normal numbers (W. H. Press et al., Numerical Recipes, 15.1).
+    """
+    from scipy.special import chdtri  # here: slow to import
+
+    n = fitted.surplus
+    if not (n and fitted.chi_squared > chdtri(n, FALSE_ALARM)):
+        return ""
+    return (
+        f"the model does not fit the measurements: chi^2/n = {fitted.chi_squared / n:.3g} with n = {n}, but one that "
+        f"fits exceeds {chdtri(n, FALSE_ALARM) / n:.3g} with a probability of {FALSE_ALARM:g}. Standard errors are "
+        "those of noise alone: free more parameters (unknown=[...]), add the missing forces, or correct deviations"
+    )
 
 
 def _check_determined(names: Sequence[str], jacobian: Array, sizes: Array, at_bound: NDArray[np.bool_]) -> None:
