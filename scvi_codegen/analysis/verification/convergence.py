@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from scvi_codegen.analysis.verification.certificate import Check, Finding, checked
-from scvi_codegen.analysis.verification.system_under_test import State, SystemUnderTest
+from scvi_codegen.analysis.verification.system_under_test import LARGEST_RATIO, State, SystemUnderTest
 from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.methods import (
@@ -57,8 +57,6 @@ SLACK = 0.2
 """Difference allowed between measured and claimed order."""
 LEAST_ORDER = 0.8
 """Smallest order of methods that claim none: they converge all the same."""
-ERROR_RATIO = 0.25
-"""Largest ratio of the errors of methods whose degrees differ by two."""
 
 
 def convergence_checks(tested: SystemUnderTest) -> Iterator[Check]:
@@ -134,7 +132,7 @@ def _rate_in_degree(tested: SystemUnderTest) -> Finding | None:
     remark = f"{pair[0].name}: {float(coarse):.1e}, {pair[1].name}: {float(fine):.1e}, h = {float(h):.3g}"
     if coarse < FLOOR:
         return Finding(float(fine), float(FLOOR), remark)
-    return Finding(float(fine / coarse), ERROR_RATIO, remark)
+    return Finding(float(fine / coarse), LARGEST_RATIO, remark)
 
 
 def _errors_of(tested: SystemUnderTest, pair: tuple[Method, Method]) -> tuple[Number, list[Number]]:

@@ -11,7 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.analysis.verification.certificate import Check, Finding, checked
-from scvi_codegen.analysis.verification.system_under_test import State, SystemUnderTest, canonical_form
+from scvi_codegen.analysis.verification.system_under_test import (
+    BOUND,
+    ROUND_OFF,
+    State,
+    SystemUnderTest,
+    canonical_form,
+)
 from scvi_codegen.analysis.verification.variable_steps import VariableSteps
 from scvi_codegen.common.errors import MethodError
 from scvi_codegen.common.precision import Number, mp
@@ -22,10 +28,6 @@ from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.step_derivatives import Starts
 
-BOUND = 1e-10
-"""Bound on relative differences of directional derivatives, and of products relative to their largest terms."""
-JACOBIAN_ROUNDOFF = 1e-12
-"""Bound on the defect of J^T Omega J = Omega: round-off of an analytic derivative."""
 WIDTH = mp.mpf(10) ** -15
 """Relative perturbation of the arguments for differences in 60 digits."""
 LEAST = 1e-2
@@ -239,4 +241,4 @@ def _symplecticity(runs: VariableSteps) -> Finding:
     areas = np.tile(scales[:m] * scales[m:], 2)
     largest = float(np.abs(J).max()) ** 2
     defect = float((np.abs(J.T @ omega @ J - omega) / np.sqrt(np.outer(areas, areas))).max())
-    return Finding(defect / largest, JACOBIAN_ROUNDOFF, "in units of the areas of coordinates")
+    return Finding(defect / largest, ROUND_OFF, "in units of the areas of coordinates")

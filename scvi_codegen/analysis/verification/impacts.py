@@ -11,8 +11,14 @@ import numpy as np
 import sympy
 
 from scvi_codegen.analysis.verification.certificate import Check, Finding, checked
+from scvi_codegen.analysis.verification.convergence import MAX_HALVINGS
 from scvi_codegen.analysis.verification.system_under_test import (
     EPSILON,
+    ROUND_OFF,
+    ROUNDINGS,
+    SAMPLED_STATES,
+    STEP_DIVISOR,
+    WIDTH,
     State,
     SystemUnderTest,
     canonical_form,
@@ -33,14 +39,12 @@ from scvi_codegen.systems.event import Crossings, Kink
 from scvi_codegen.systems.formulas.expressions import Tape
 from scvi_codegen.systems.formulas.symbols import TIME, symbol
 
-STEPS, ROUND_OFF, ROUNDINGS = 2000, 64.0 * EPSILON, 16.0
-"""Number of steps of the run; bounds on g relative to its terms, and on errors in units of their rounding."""
-DIVISOR, LEAST_REDUCTION = 8.0, 4.0
-"""Ratio of two step sizes, and least ratio of the defects of the symplectic form, which are those of the method."""
+STEPS = 2000
+"""Number of steps of the run."""
+LEAST_REDUCTION = 4.0
+"""Least ratio of the defects of the symplectic form at two step sizes, which are those of the method."""
 REVERSED = 5
 """Number of impacts that are undone."""
-WIDTH = 1e-6
-"""Relative width of the differences by which the rounding of a normal is estimated."""
 SPREAD, NOISE = 100.0, 1e-9
 """Bound on deviations from finite differences, in units of their uncertainty, and besides."""
 
@@ -85,7 +89,7 @@ def _surfaces(tested: SystemUnderTest, stepper: Stepper, parameters: Any, crossi
     """Return the largest value of an event function; add the run and its changes to ``crossings``."""
     run = run_of(stepper, tested.initial, tested.initial.h, steps=STEPS, parameters=parameters)
     crossings.extend((run, _changes(run)))
-    return Finding(max(change.residual for change in crossings[1]), ROUND_OFF, f"{len(crossings[1])} changes")
+    return Finding(max(change.residual for change in crossings[1]), ROUNDED, f"{len(crossings[1])} changes")
 
 
 def _changes(run: Trajectory) -> list[Change]:
@@ -227,16 +231,16 @@ def _symplecticity(run: Trajectory, changes: list[Change]) -> Finding | None:
     if not elastic:
         return None
     form = canonical_form(run.stepper.dimension)
-    for h in (run.h, run.h / DIVISOR):
+    for h in (run.h, run.h / STEP_DIVISOR):
         start, step = _across(run, elastic[0], h)
         matrix = step(start).tangent()[-1]
         defects.append(float(np.abs(matrix.T @ form @ matrix - form).max() / np.abs(matrix).max() ** 2))
     return Finding(defects[1], max(defects[0] / LEAST_REDUCTION, NOISE), "step / 8")
 
 
-SAMPLED_STATES, SAMPLED_CHANGES, ROUNDED, DIFFERENCE = 40, 12, 256.0 * EPSILON, mp.mpf(10) ** -30
-LEAST_STEPS, HALVINGS, TRANSITIONS, SLACK, DECIDED, OUTSIDE = 16, 4, 2, 0.5, 1e-12, 1e-9
-"""Bound on zeros relative to their terms; of runs that measure an order: slack of the order, rounding errors; part of
+SAMPLED_CHANGES, ROUNDED, DIFFERENCE = 12, 256.0 * EPSILON, mp.mpf(10) ** -30
+LEAST_STEPS, TRANSITIONS, SLACK, OUTSIDE = 16, 2, 0.5, 1e-9
+"""Bound on zeros relative to their terms; of runs that measure an order: slack of the order; part of
 their size by which impulses may leave their cone, ten times that by which runs choose them (CONTACT_ROUNDING)."""
 
 
@@ -406,12 +410,12 @@ def _order(of: RunInModes) -> Finding:
     start, best, stepper = of.tested.initial, Finding(-math.inf, math.nan), of.tested.stepper
     times = [*(change[0] for change in of.changes), of.run.t.item(-1)][: TRANSITIONS + 1]
     end, scales = sum(times[-2:]) / len(times[-2:]), of.tested.scales(start)
-    for halving in range(HALVINGS):
+    for halving in range(MAX_HALVINGS):
         steps = max(LEAST_STEPS, math.ceil((end - start.t) / abs(of.run.h))) << halving
         runs = [run_of(stepper, start, (end - start.t) / (part * steps), t_end=end) for part in (1, 2, 8)]
         apart = [np.abs((np.hstack([run.q[-1] - runs[2].q[-1], run.p[-1] - runs[2].p[-1]])) / scales) for run in runs]
         errors = [(float(z.max()), run.energy_error()) for z, run in zip(apart[:2], runs, strict=False)]
-        orders = [math.log2(a / b) for a, b in zip(*errors, strict=True) if b > DECIDED]
+        orders = [math.log2(a / b) for a, b in zip(*errors, strict=True) if b > ROUND_OFF]
         remark = f"errors {max(errors[0]):.1e}, then {max(errors[1]):.1e}; infinite: round-off"
         least = (of.tested.method.order or 1) - SLACK
         best = max(best, Finding(min(orders, default=math.inf), least, remark, at_least=True))

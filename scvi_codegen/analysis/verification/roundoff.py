@@ -17,7 +17,13 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from scvi_codegen.analysis.verification.certificate import Check, Finding, ViolationError, checked
-from scvi_codegen.analysis.verification.system_under_test import EPSILON, State, SystemUnderTest
+from scvi_codegen.analysis.verification.system_under_test import (
+    CONSECUTIVE_STEPS,
+    EPSILON,
+    ROUNDINGS,
+    State,
+    SystemUnderTest,
+)
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.precision import mp
@@ -31,7 +37,6 @@ from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.splittings.kinetic import kinetic_splitting
 
-ROUNDINGS = 16.0
 SHORT = 2.0**-40
 SHORT_STEPS = 64
 LOST = 1e-6
@@ -44,7 +49,6 @@ MAX_LOSS = 1e-3
 """Part of the effect of the compensation that may be lost; the term of second order in h is a tenth of it."""
 SHORTER = 1 / 64
 """Factor of h: until the last iteration the stages may lack the compensation, a term of second order in h."""
-COMPENSATED_STEPS = 3
 LANES = 3
 RUNS, SPREAD = 64, 0.02
 Invariant: TypeAlias = Callable[[Array, Array, float], tuple[Array, Array]]
@@ -128,7 +132,7 @@ def _low_words(tested: SystemUnderTest) -> Finding | None:
     whole = state.z + carry
     rest = (state.z - whole) + carry
     state, joined = (State(z[:m], z[m:], state.t, SHORTER * state.h) for z in (state.z, whole))
-    ways = ((state, COMPENSATED_STEPS, carry), (joined, COMPENSATED_STEPS, rest))
+    ways = ((state, CONSECUTIVE_STEPS, carry), (joined, CONSECUTIVE_STEPS, rest))
     (end, low), (other, other_low) = (_advanced(tested, tested.stepper, *way) for way in ways)
     scales = tested.scales(state)
     difference = np.abs((end - other) + (low - other_low)) / scales
@@ -149,7 +153,7 @@ def _ensemble(tested: SystemUnderTest) -> Finding | None:
     large = LARGE_IN_LANES / LARGE_COMPENSATION * _large_compensation(first, scales)
     rounding = ROUNDINGS * (tested.rounding(first) + LARGE_IN_LANES**2 * scales)
     for h, steps, carry, unit in (
-        (first.h, COMPENSATED_STEPS, large, rounding),
+        (first.h, CONSECUTIVE_STEPS, large, rounding),
         (first.h * SHORT, SHORT_STEPS, np.zeros_like(large), LOST * SHORT_STEPS * SHORT * scales),
     ):
         state = State(first.q, first.p, first.t, h)

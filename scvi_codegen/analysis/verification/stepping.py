@@ -12,7 +12,16 @@ from functools import partial
 import numpy as np
 
 from scvi_codegen.analysis.verification.certificate import Check, Finding, ViolationError, checked
-from scvi_codegen.analysis.verification.system_under_test import EPSILON, MAX_UNKNOWNS, WEIGHTS, State, SystemUnderTest
+from scvi_codegen.analysis.verification.system_under_test import (
+    EPSILON,
+    LARGEST_RATIO,
+    MAX_UNKNOWNS,
+    NOISE_OF_DIFFERENCES,
+    ROUNDINGS,
+    WEIGHTS,
+    State,
+    SystemUnderTest,
+)
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.common.precision import mp
@@ -22,13 +31,11 @@ from scvi_codegen.methods.exact.step import SolvedStep, compiled_equations
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
 
-ROUNDINGS = 16.0
-"""Bound on the error of a step, in roundings of the size of the state."""
 ANY_UPDATE = SolverOptions(tolerance=1e300)
 """Solver options that accept any update, so that a step makes one iteration."""
 LEAST_UPDATE = 1e6
 """Least size of the first update in units of rounding, for it to distinguish a wrong matrix."""
-STEP_DIVISOR, MAX_ITERATIONS = 256, 10
+MUCH_SHORTER, MAX_ITERATIONS = 256, 10
 """Divisor of h, and bound on iterations at h/256.
 
 There an error factor proportional to h is at most 2^-8 per iteration: 53 bits take 7, plus a few."""
@@ -38,7 +45,6 @@ RUN_STEPS, SAMPLED_STEPS = 12, (0, 1, 2, 5, 11)
 """Length of the run, and the steps of it that are checked; the first ones have no full predictor history."""
 STATIONARY = 1e-25
 TRANSFORM = 1e-11
-DERIVATIVE_BOUND = 1e-6
 DERIVATIVE_WIDTHS = (3e-2, 1e-2, 3e-3, 1e-3)
 
 
@@ -52,7 +58,7 @@ def step_checks(tested: SystemUnderTest) -> Iterator[Check]:
         ("fallback", "if the fixed-point iteration fails, Newton's method solves the same equations", _fallback),
         (
             "convergence rate",
-            f"error factor per iteration proportional to h or better (count at h/{STEP_DIVISOR})",
+            f"error factor per iteration proportional to h or better (count at h/{MUCH_SHORTER})",
             _convergence_rate,
         ),
         ("run", "each step of a run, with its predictor, equals a single step from the same state", _run),
@@ -146,7 +152,7 @@ def _counted(tested: SystemUnderTest, state: State, options: SolverOptions | Non
 def _convergence_rate(tested: SystemUnderTest) -> Finding:
     first = tested.states[0]
     try:
-        iterations, _ = _counted(tested, State(first.q, first.p, first.t, first.h / STEP_DIVISOR))
+        iterations, _ = _counted(tested, State(first.q, first.p, first.t, first.h / MUCH_SHORTER))
     except StepFailedError as failure:
         raise ViolationError(str(failure)) from failure
     return Finding(iterations, MAX_ITERATIONS)
@@ -216,7 +222,7 @@ def _discrete(tested: SystemUnderTest) -> Finding | None:
         raise ViolationError(f"a curve from q0 to q1 exists, but {failure}") from failure
     sizes = tested.scales(state)[len(q1) :]
     wrong = np.array([*(partials + np.concatenate([state.p, -p1])).reshape(2, -1), p0 - state.p, end - p1])
-    return Finding(float(np.max(np.abs(wrong) / sizes)), DERIVATIVE_BOUND, "relative")
+    return Finding(float(np.max(np.abs(wrong) / sizes)), NOISE_OF_DIFFERENCES, "relative")
 
 
 def _action_derivatives(tested: SystemUnderTest, state: State, q1: Array) -> Array:
@@ -241,8 +247,6 @@ LEAST_ERROR = 1e4 * EPSILON
 """Least error that one iteration from the straight line must leave, relative to the state, for a comparison."""
 STEPS = (1, 3, 4)
 """Numbers of steps before the predicted one; from the third on, two previous steps are available."""
-LARGEST_RATIO = 0.25
-"""Largest ratio of the errors left by the predictor and by the line; at small h it is 0.01 and less."""
 
 
 def predictor_checks(tested: SystemUnderTest) -> Iterator[Check]:

@@ -8,7 +8,12 @@ import numpy as np
 
 from scvi_codegen.analysis.verification.certificate import Check, Finding, checked, information
 from scvi_codegen.analysis.verification.system_under_test import (
+    BOUND,
+    CONSECUTIVE_STEPS,
     EPSILON,
+    NOISE_OF_DIFFERENCES,
+    ROUNDINGS,
+    SAMPLED_STATES,
     Jacobian,
     State,
     SystemUnderTest,
@@ -22,15 +27,10 @@ from scvi_codegen.runs.states.reduction import Reduction
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.trajectory import Trajectory
 
-ROUNDINGS = 16.0
 SPREAD = 10.0
 """Safety factor of the error of the finite-difference Jacobian over the disagreement of two widths."""
-TOO_ROUGH = 1e-6
-"""Noise of the differences above which symplecticity is not judged."""
-STEPS, SAMPLED_STATES = 1000, 20
-MULTIPLIER_BOUND = 1e-10
+STEPS = 1000
 DOUBLINGS, BISECTIONS = 24, 10
-CONSECUTIVE_STEPS = 3
 SPACES = {"rotation": "T*SO(3)", "direction": "T*S^2", "spin": "S^2"}
 LENGTH, PHASE = 1.7, complex(np.exp(0.7j))
 """Factors of quaternions and directions, and of spins, to which steps must be invariant."""
@@ -80,7 +80,7 @@ def _symplecticity(tested: SystemUnderTest) -> Finding:
         else:
             units = np.sqrt(np.outer(np.tile(areas, 2), np.tile(areas, 2)))
             defect, noise = _defect(around, np.eye(2 * m), units, shrunk, forms)
-        if noise.max() > TOO_ROUGH:
+        if noise.max() > NOISE_OF_DIFFERENCES:
             raise StateError(f"finite differences have noise {noise.max():.1g}: use a smaller step size")
         index = np.unravel_index(np.argmax(defect / noise), defect.shape)
         result = Finding(float(defect[index]), float(noise[index]), "the bound is the noise of the differences")
@@ -165,7 +165,7 @@ def _multipliers(tested: SystemUnderTest) -> Finding:
     result = tested.stepper.multipliers(state.q, state.p, state.t, tested.parameters)
     exact = motion.multipliers(q, v, t)
     size = max(float(max(map(abs, exact))), np.finfo(float).tiny)
-    return Finding(float(np.abs(result - exact.astype(float)).max() / size), MULTIPLIER_BOUND, "relative")
+    return Finding(float(np.abs(result - exact.astype(float)).max() / size), BOUND, "relative")
 
 
 def _reversal(tested: SystemUnderTest) -> Finding:

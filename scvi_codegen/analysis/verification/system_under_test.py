@@ -74,14 +74,19 @@ def canonical_form(m: int) -> Array:
     return np.asarray(np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(m)), dtype=float)
 
 
-EPSILON = 2.0**-52
+EPSILON, ROUNDINGS = 2.0**-52, 16.0
+"""Rounding error of doubles, and the bound on errors in units of the rounding of a state."""
+ROUND_OFF, BOUND, NOISE_OF_DIFFERENCES = 1e-12, 1e-10, 1e-6
+"""Sizes relative to their terms below which values are round-off, and bounds on relative errors of derivatives and
+products, and of finite differences."""
+STEP_DIVISOR, LARGEST_RATIO = 8, 0.25
+"""Ratio of two step sizes whose errors are compared, and largest ratio of the errors of a better and a worse one."""
+CONSECUTIVE_STEPS, SAMPLED_STATES = 3, 20
+"""Number of steps in a row, and of the states of a run, that are checked."""
 WIDTH = 1e-5
 """Width of differences of constraints, relative to the state."""
 PERTURBATION, PERTURBATIONS = 0.05, 6
 """Perturbation of the initial state relative to its size; divided by 4 up to six times until a step succeeds."""
-PARAMETER_PERTURBATION = 0.05
-AT_REST = 1e-12
-"""Displacement in a step, relative to the coordinates, below which velocities are taken as rounding errors."""
 STEPS_BETWEEN = 5
 """Number of steps from the first state to the second."""
 MAX_COORDINATES = 18
@@ -136,7 +141,7 @@ class SystemUnderTest:
         """Values slightly off the defaults, if steps succeed: equal masses would hide interchanged ones."""
         moved = {}
         for k, (name, value) in enumerate(self._defaults.items(), 1):
-            moved[name] = value * (1 + PARAMETER_PERTURBATION * np.sin(k)) or PARAMETER_PERTURBATION * np.cos(k)
+            moved[name] = value * (1 + PERTURBATION * np.sin(k)) or PERTURBATION * np.cos(k)
         moved |= {name: self._defaults[name] for name in self.stepper.interface.mode_names}
         at_zero = {name: moved[name] if value else 0.0 for name, value in self._defaults.items()}
         for values in (moved, at_zero):
@@ -280,7 +285,7 @@ class SystemUnderTest:
         try:
             v, after = (self.stepper.velocity(q, p, state.t) for q, p in ((state.q, state.p), (end[:m], end[m:])))
             speed = max(_rms(v), _rms(after - v))
-            moved = 0.1 * (speed if speed * abs(state.h) > AT_REST * length else 1.0) * np.eye(m)
+            moved = 0.1 * (speed if speed * abs(state.h) > ROUND_OFF * length else 1.0) * np.eye(m)
             changes = [self.stepper.momentum(state.q, v + unit, state.t) - state.p for unit in moved]
         except StateError:
             return np.full(m, size)

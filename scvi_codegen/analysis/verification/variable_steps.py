@@ -8,8 +8,14 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.analysis.verification.certificate import Check, Finding, checked
-from scvi_codegen.analysis.verification.structure import ROUNDINGS, momentum_error
-from scvi_codegen.analysis.verification.system_under_test import EPSILON, State, SystemUnderTest
+from scvi_codegen.analysis.verification.structure import momentum_error
+from scvi_codegen.analysis.verification.system_under_test import (
+    EPSILON,
+    ROUNDINGS,
+    STEP_DIVISOR,
+    State,
+    SystemUnderTest,
+)
 from scvi_codegen.common.precision import mp
 from scvi_codegen.methods.exact.solution import ExactMotion, exact_motion, numbers
 from scvi_codegen.runs.states.validation import Array
@@ -19,8 +25,6 @@ from scvi_codegen.systems.formulas.expressions import Tape
 from scvi_codegen.systems.system import MechanicalSystem
 from scvi_codegen.systems.time_transformation import time_rescaling_function
 
-STEP_DIVISOR = 8
-"""Ratio of the test's step size to the one at which times are measured, where the error is near round-off."""
 ERROR_RATIO = 100.0
 """Largest ratio of the error in t to that in tau: the quadrature of dt = g dtau has an error of the same order."""
 THERE_AND_BACK, SPAN = 20, 40
