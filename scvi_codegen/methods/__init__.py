@@ -27,6 +27,8 @@ from scvi_codegen.systems.contacts.dry_friction import with_dry_friction
 from scvi_codegen.systems.system import MechanicalSystem
 
 __all__ = [
+    "DEFAULT_NAME",
+    "LOOSE",
     "METHODS",
     "SCVI",
     "SVI",
@@ -89,6 +91,10 @@ SIZES = ("degree", "stages", "order")
 """Arguments that can follow the name of a method, as in ``svi:6``."""
 DEFAULT_SIZE = 8
 """Default of a required degree, number of stages or order."""
+DEFAULT_NAME = "svi:8"
+"""Name of the default method."""
+LOOSE = 1e-4
+"""Tolerance of adaptive steps from which on those of SVI(4) take less time than those of SVI(8) (docs/steps.md)."""
 
 
 def as_method(method: Method | str, system: MechanicalSystem | None = None) -> Method:
@@ -106,9 +112,13 @@ def as_method(method: Method | str, system: MechanicalSystem | None = None) -> M
     return method_from_specification(fitted(sized(specification_of(method)), system))
 
 
-def default_method(system: MechanicalSystem) -> Method:
-    """Return SVI(8); for a system with constraints with Gauss-Lobatto points, at which they are imposed."""
-    return as_method("svi:8", system)
+def default_method(system: MechanicalSystem, tolerance: float | None = None) -> Method:
+    """Return SVI(8), for adaptive steps of a tolerance from :data:`LOOSE` on SVI(4).
+
+    For a system with constraints, contacts or dry friction it is SVI(8) with Gauss-Lobatto points, which impose them.
+    """
+    method = as_method(DEFAULT_NAME, system)
+    return SVI(4) if tolerance is not None and tolerance >= LOOSE and method == SVI(8) else method
 
 
 def finer_method(method: Method, *, constrained: bool) -> str:

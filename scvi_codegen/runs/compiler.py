@@ -29,10 +29,19 @@ from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE, PRECISION
 from scvi_codegen.codegen.variants import SUMS, Derivatives, Sums, Variant
 from scvi_codegen.common.cache import cached_source, key_of
 from scvi_codegen.common.errors import MethodError, MethodWarning, SizesRequiredError
+from scvi_codegen.common.once import Once
 from scvi_codegen.common.validation import TEXTS, OfRunTimeSizes, check_kind, checks_arguments
-from scvi_codegen.methods import SVI, StoermerVerlet, as_method, finer_method, sliding
+from scvi_codegen.methods import (
+    DEFAULT_NAME,
+    LOOSE,
+    SVI,
+    StoermerVerlet,
+    as_method,
+    default_method,
+    finer_method,
+    sliding,
+)
 from scvi_codegen.methods.method import Method
-from scvi_codegen.runs.accuracy.run_error import FinerStepper
 from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
 from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.runs.stepping.features import warn_of_formulas
@@ -52,7 +61,7 @@ if TYPE_CHECKING:
 @checks_arguments(system=SYSTEM_OR_ARRAYS, flags=TEXTS)
 def compile_stepper(
     system: MechanicalSystem,
-    method: Method | str = "svi:8",
+    method: Method | str | None = None,
     *,
     solver: str = "auto",
     flags: tuple[str, ...] = TUNED_FLAGS,
@@ -71,7 +80,11 @@ def compile_stepper(
 
     Args:
         system: the mechanical system.
-        method: the discretisation, or a name as on the command line: ``"svi"``, ``"svi:6"``.
+        method: the discretisation, or a name as on the command line: ``"svi"``, ``"svi:6"``. By default the degree
+            follows the tolerance: adaptive runs of a tolerance of 1e-4 and more are by SVI(4), all others by SVI(8);
+            with constraints, contacts or dry friction all are by SVI(8) with Gauss-Lobatto points. ``run.method`` is
+            that of a run. The C of each degree is then compiled when a call first needs it, or by
+            :meth:`Stepper.prepare`.
         solver: solver of the stage equations. ``"fixed-point"`` is fast (stages are SIMD lanes) and available for
             methods with at most 32 stages, except variational SCVI with more than 8 coordinates and SVI with fewer
             points than its degree; ``"newton"`` is always available, also for stiff systems and large steps;
@@ -115,9 +128,10 @@ def compile_stepper(
     if sums not in SUMS:
         raise MethodError(f"unknown sums {sums!r}: use {' or '.join(map(repr, SUMS))}")
     of_finer = {"sizes": sizes, "tables": tables, "flags": flags, "precision": precision}
-    finer = FinerStepper(partial(_finer_stepper, system, method, tuple(contacts), of_finer))
+    finer = Once(partial(_finer_stepper, system, method, tuple(contacts), of_finer))
     others = {"precision": precision, "sizes": sizes, "tables": tables, "controller": controller}
-    system, rows = _with_contacts(system, method, contacts, **others, time_transformation=time_transformation)
+    named, stated = DEFAULT_NAME if method is None else method, system
+    system, rows = _with_contacts(system, named, contacts, **others, time_transformation=time_transformation)
     precision = "double" if rows else precision  # contacts have no second precision for "auto"
     common: dict[str, Any] = {
         "solver": solver,
@@ -127,8 +141,12 @@ def compile_stepper(
         "controller": controller,
     }
     _check_symmetries(symmetries)
+    further: Any = {"symmetries": symmetries, "sizes": sizes, "tables": tables, "sums": sums, **common}
+    looser = None
+    if method is None and not rows:
+        looser = _looser(stated, {**further, "precision": precision})
     if isinstance(system, OfRunTimeSizes) and sizes is None and tables is None:
-        of_arrays = _compile_arrays(system, method, symmetries, as_events(events), precision, common, sums)
+        of_arrays = _compile_arrays(system, method, symmetries, as_events(events), precision, common, sums, looser)
         of_arrays._finer = finer
         return of_arrays
     if sums == "plain":
@@ -137,21 +155,19 @@ def compile_stepper(
             "sums=, or declare arrays, q[N], whose sizes each run gives"
         )
     if precision == AUTO:
-        further: Any = {"symmetries": symmetries, "sizes": sizes, "tables": tables, **common}
         return _in_both_precisions(partial(compile_stepper, system, method, **further), events)
     shape: dict[str, Any] = {"mesh": system.mesh, "links": system.drawn_links}
     if sizes is not None or tables is not None:
         system, time_transformation = _at_sizes(system, time_transformation, sizes or {}, tables)
         others = {"precision": precision, "controller": controller, "time_transformation": time_transformation}
-        system, rows = _with_contacts(system, method, (), **others)
-    method = as_method(method, system)
-    settings = system, method, solver, prefix, symmetries, time_transformation, controller
+        system, rows = _with_contacts(system, named, (), **others)
+    settings = system, as_method(named, system), solver, prefix, symmetries, time_transformation, controller
 
     def made(precision: str, events: tuple[Event, ...] = (), *, locates: bool = False) -> Stepper:
         sources = CachedSources(*settings, precision, locates=locates)
         source, interface = sources.integrator()
         interface = replace(interface, layout=replace(interface.layout, **shape), contacts=rows)
-        return Stepper(source, interface, variants=sources.variants, flags=flags, events=events)
+        return Stepper(source, interface, variants=sources.variants, flags=flags, events=events, looser=looser)
 
     stepper = made(precision, as_events(events), locates=precision != DOUBLE_DOUBLE)
     if precision == DOUBLE_DOUBLE:
@@ -164,15 +180,27 @@ def compile_stepper(
 
 
 def _finer_stepper(
-    system: MechanicalSystem, method: Method | str, contacts: tuple[ContactLike, ...], options: Mapping[str, Any]
+    system: MechanicalSystem, method: Method | str | None, contacts: tuple[ContactLike, ...], options: Mapping[str, Any]
 ) -> Stepper:
     """Return the stepper of :func:`~scvi_codegen.methods.finer_method`, in physical time."""
     constrained = bool(contacts or system.constraints or system.has_contacts or system.rotations)
-    name = finer_method(as_method(method, system), constrained=constrained)
+    named = default_method(system) if method is None else as_method(method, system)
+    name = finer_method(named, constrained=constrained)
     precision = DOUBLE_DOUBLE if options["precision"] == DOUBLE_DOUBLE else "double"
-    with warnings.catch_warnings():  # of kinks: those of the run's own stepper were issued
+    return _compiled_silently(system, name, {**options, "precision": precision, "contacts": contacts})
+
+
+def _looser(system: MechanicalSystem, arguments: Mapping[str, Any]) -> Once[Stepper] | None:
+    """Return a function that compiles the stepper of loose adaptive runs; ``None`` if their method is no other one."""
+    method = default_method(system, LOOSE)
+    return None if method == default_method(system) else Once(partial(_compiled_silently, system, method, arguments))
+
+
+def _compiled_silently(system: MechanicalSystem, method: Method | str, arguments: Mapping[str, Any]) -> Stepper:
+    """Return a further stepper of a system, without the warnings of its formulas that the first one issued."""
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore", MethodWarning)
-        return compile_stepper(system, name, contacts=contacts, **{**options, "precision": precision})
+        return compile_stepper(system, method, **arguments)
 
 
 def _check_symmetries(symmetries: Any) -> None:
@@ -201,12 +229,13 @@ def _with_contacts(
 
 def _compile_arrays(
     system: MechanicalSystem,
-    method: Method | str,
+    method: Method | str | None,
     symmetries: Sequence[Symmetry],
     events: tuple[Event, ...],
     precision: str,
     common: Mapping[str, Any],
     sums: Sums,
+    looser: Once[Stepper] | None,
 ) -> Stepper:
     """Return the stepper of arrays whose sizes each run determines; ``common``: further arguments."""
     if precision == AUTO:
@@ -215,7 +244,7 @@ def _compile_arrays(
         raise MethodError(f"symmetries= is unavailable for '{system.name}': {SIZES_REQUIRED}")
     if precision == DOUBLE_DOUBLE:
         raise MethodError("precision='double-double' is not available with arrays of run-time sizes: pass sizes={..}")
-    discretisation = as_method(method, system)
+    discretisation = as_method(DEFAULT_NAME if method is None else method, system)
     solver, prefix, g, controller = (common[name] for name in ("solver", "prefix", "time_transformation", "controller"))
     sources = CachedArraySources(system, discretisation, solver, prefix, (), g, controller)
     sources.use_sums(sums)
@@ -227,6 +256,7 @@ def _compile_arrays(
     warn_of_formulas(interface, f"the stepper of '{interface.system}' with sizes of each run")
     of_sizes = partial(compile_stepper, system, method, **common)
     arguments: dict[str, Any] = {"variants": sources.variants, "flags": common["flags"], "events": events}
+    arguments["looser"] = looser
     return StepperOfRunTimeSizes(source, interface, **arguments, of_sizes=of_sizes, reason=reason)
 
 

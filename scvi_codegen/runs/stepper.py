@@ -19,17 +19,18 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.native.arguments import checked_number
-from scvi_codegen.codegen.native.binding import BY_VELOCITY, ON_CONSTRAINTS, with_calls
+from scvi_codegen.codegen.native.binding import BY_VELOCITY, ON_CONSTRAINTS, Binding, with_calls
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.codegen.variants import Variant
 from scvi_codegen.common.errors import MethodError, StateError
+from scvi_codegen.common.once import Once
 from scvi_codegen.common.validation import checked_count, checks_arguments, of
+from scvi_codegen.methods import LOOSE
 from scvi_codegen.runs.accuracy.global_error import Runs, checked_error, warn_of_unconfirmed, warn_of_unconfirmed_run
 from scvi_codegen.runs.accuracy.growth import measures_growth, warn_of_error_growth
 from scvi_codegen.runs.accuracy.local_error import warn_of_energy_errors, warn_of_inaccuracy
 from scvi_codegen.runs.accuracy.resolution import warn_of_unresolved_members
-from scvi_codegen.runs.accuracy.run_error import FinerStepper
 from scvi_codegen.runs.accuracy.warning_switch import warn_of_failed_check
 from scvi_codegen.runs.driver.bounded_motion import BoundedMotion
 from scvi_codegen.runs.driver.observation import Observe
@@ -88,7 +89,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
     _trajectory_type = Trajectory
     _precise: Callable[[], Stepper | None] | None = None
     """Function that returns the stepper in double-double if there is one, for ``error=`` with precision="auto"."""
-    _finer: FinerStepper | None = None
+    _finer: Callable[[], Any] | None = None
     """Function that returns the stepper of a finer method, for ``run.error``; ``None`` without the system."""
 
     def _copy(self, events: tuple[Event, ...], source: Source | None = None) -> Self:
@@ -100,7 +101,14 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         if self.origin is not None:
             return (_rebuild_bound, (self.origin, self.problem, self.events))
         variants = self._variants if self._reason is None else Variants()
-        made = partial(type(self), variants=variants, flags=self.flags, events=self.events, reason=self._reason)
+        made = partial(
+            type(self),
+            variants=variants,
+            flags=self.flags,
+            events=self.events,
+            reason=self._reason,
+            looser=self._looser,
+        )
         further: dict[str, Any] = {} if self._finer is None else {"_finer": self._finer}
         if self._doubles is not None and self.events:
             further["_doubles"] = constantly(self._doubles())
@@ -208,7 +216,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         """
         if type(save_every) is not int or save_every != 1:
             save_every = checked_count(save_every, "save_every", least=1)
-        stepper = self if events is None and not action else self._for_run(events, action=action)
+        stepper: Stepper = self if events is None and not action else self._for_run(events, action=action)
         interface = self.interface
         noise = Noise.checked(stepper, seed, metropolis, inputs=inputs) if seed or metropolis else DEFAULT_NOISE
         if not (inputs is None and t_eval is None and observe is None and tables is None and threads is None):
@@ -237,9 +245,9 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         begin = 0.0 if h is None or t_end is None else hashed(t)  # one plan for all times where they do not matter
         schedule = h, steps, t_end, tolerance, absolute_tolerance, max_step, first_step, save_every, begin
         try:
-            plan, count = stepper._planned(*schedule)
+            stepper, plan, count = stepper._planned(*schedule)
         except TypeError:  # of an argument that is not hashable, as an array
-            plan, count = stepper._planned.__wrapped__(*schedule)
+            stepper, plan, count = stepper._planned.__wrapped__(*schedule)
         if max_step is not None:
             check_max_step(plan, t, interface.words)
         segments, output = None, ALL_STATES
@@ -306,6 +314,15 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             return stepper.acting
         return stepper
 
+    def _at_tolerance(self, tolerance: float | None) -> Self:
+        """Return the stepper of adaptive runs of a tolerance, whose degree follows it unless the method was named."""
+        if self._looser is None or tolerance is None or tolerance < LOOSE:
+            return self
+        stepper = self._looser()
+        if self.events:
+            stepper = stepper.with_events(self.events)
+        return stepper.acting if self.sums_action else stepper
+
     def _bounded(self, motion: BoundedMotion) -> Trajectory:
         """Return the run whose relative global error is confirmed to be bounded, in double-double if double fails."""
         trajectory: Trajectory = Runs(motion).confirmed_run()
@@ -358,8 +375,9 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
 
     def _started(self, initial: InitialData, plan: StepPlan, noise: Noise = DEFAULT_NOISE) -> Run:
         """Return a run at its start, on the constraints."""
-        (q, p), (*_, t, parameters, options) = self._consistent_state(initial), initial
-        return Run.started(self, q, p, plan=plan, t=t, parameters=parameters, options=options, noise=noise)
+        stepper = self._at_tolerance(plan.tolerance) if isinstance(plan, Adaptive) else self
+        (q, p), (*_, t, parameters, options) = stepper._consistent_state(initial), initial
+        return Run.started(stepper, q, p, plan=plan, t=t, parameters=parameters, options=options, noise=noise)
 
     def _consistent_state(self, initial: InitialData) -> tuple[States, States]:
         """Return (q, p), or q and the momenta of a velocity, on the constraints."""
@@ -392,8 +410,13 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
 
     @cached_property
     def _planned(self) -> Any:
-        """Function of the arguments of :func:`planned_steps`, with the plans that it returned before."""
-        return lru_cache(maxsize=64, typed=True)(partial(planned_steps, self._kind_of_steps))
+        """Function :meth:`_with_plan`, with what it returned before."""
+        return lru_cache(maxsize=64, typed=True)(self._with_plan)
+
+    def _with_plan(self, *schedule: Any) -> tuple[Self, StepPlan, int | None]:
+        """Return the stepper, the plan and the number of steps of the arguments of :func:`planned_steps`."""
+        plan, count = planned_steps(self._kind_of_steps, *schedule)
+        return (self._at_tolerance(plan.tolerance) if isinstance(plan, Adaptive) else self), plan, count
 
     def _output_times(self, t_eval: ArrayLike, t: float, plan: StepPlan, steps: int | None) -> Array:
         require(self, "t_eval")
@@ -537,7 +560,10 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             require(self, "error")
             steps = {"h": settings.h, "steps": settings.steps, "tolerance": settings.tolerance}
             settings = replace(settings, error=checked_error(settings.error, steps, self))
-        return Ensemble.of(self._for_run(None, action=action), q, p, settings, velocity=velocity)
+        stepper = self._for_run(None, action=action)
+        if settings.h is None:
+            stepper = stepper._at_tolerance(settings.control.checked().get("tolerance"))
+        return Ensemble.of(stepper, q, p, settings, velocity=velocity)
 
     def project(
         self,
@@ -699,7 +725,8 @@ class StepperOfRunTimeSizes(Stepper):
                 return stepper._variants[variant]
 
             interface = interface_of_sizes(self.interface, problem.sizes)
-            further: dict[str, Any] = {"variants": Variants(make=make), "flags": self.flags}
+            looser = None if self._looser is None else Once(lambda: cast(Any, self._looser)()._bound_to(problem))
+            further: dict[str, Any] = {"variants": Variants(make=make), "flags": self.flags, "looser": looser}
             bound = Stepper(self._plain, interface, origin=self, problem=problem, **further)
             self._latest = problem.key, bound
         return self._latest[1]
@@ -708,12 +735,17 @@ class StepperOfRunTimeSizes(Stepper):
         """Load nothing: bound steppers load the library."""
 
     def __getattr__(self, name: str) -> Any:
-        if name in ("binding", "dimension"):
+        if name in ("binding", "dimension"):  # of which the properties raised this error
             raise self._unavailable(name)
         raise AttributeError(f"'{type(self).__name__}' has no attribute '{name}'")
 
     def _unavailable(self, name: str) -> UnavailableError:
         return UnavailableError(f"{name} is not available for {self!r}: {SIZES_REQUIRED}")
+
+    @property
+    def binding(self) -> Binding:
+        """Unavailable: bound steppers have one."""
+        raise self._unavailable("binding")
 
     @property
     def dimension(self) -> int:

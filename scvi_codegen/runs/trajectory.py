@@ -41,7 +41,7 @@ from scvi_codegen.runs.results.joining import (
 )
 from scvi_codegen.runs.results.quantities import describe_states, describe_step_size, quantities_in_modes, quantities_of
 from scvi_codegen.runs.results.recomputation import work_and_impulses_until, work_until
-from scvi_codegen.runs.results.recorded import WithUnsetAttributes, changed
+from scvi_codegen.runs.results.recorded import OfMethod, WithUnsetAttributes, changed
 from scvi_codegen.runs.results.saved_states import Array, ModeHistory, checked_row, in_modes
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.rotation_quantities import named_quantities
@@ -65,7 +65,15 @@ MOST_DRAWN, MOST_CURVES = 400, 6
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class Trajectory(
-    WithUnsetAttributes, TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, WithErrors, Pictured, TwoWords
+    WithUnsetAttributes,
+    TrajectoryDerivatives,
+    ChaosOfRun,
+    AttitudeHistory,
+    Confirmed,
+    WithErrors,
+    Pictured,
+    TwoWords,
+    OfMethod,
 ):
     """States along a run, the initial state first.
 

@@ -24,7 +24,7 @@ def stepper():
     return sc.compile_stepper(sc.problem("kepler").system, sc.SVI(8))
 
 
-@pytest.mark.parametrize("convert", [list, tuple, np.array])
+@pytest.mark.parametrize("convert", [list, np.array])
 @pytest.mark.parametrize(
     ("integrate", "plan", "calls"),
     [

@@ -10,7 +10,6 @@ from scvi_codegen.codegen.native.arguments import checked_number, real_array
 from scvi_codegen.common.errors import ArgumentError, StateError, StepFailedError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import SWITCH, ArgumentType, checks_arguments
-from scvi_codegen.methods import default_method
 from scvi_codegen.runs.compiler import compile_stepper
 from scvi_codegen.runs.results.dense_output import times_of_run
 from scvi_codegen.runs.states.validation import Array
@@ -57,7 +56,7 @@ def solve_ivp(system: Any, t_span: Any, y0: Any, *, velocity: Any = None, method
     absolute = None if atol is None else checked_number(atol, "atol") / checked_number(rtol, "rtol")
     if velocity is None and (isinstance(y0, dict) or np.ndim(y0) != 1 or len(y0) % 2):
         raise StateError(f"y0 must be 2 m numbers, positions and then momenta, or give velocity, too: not {y0!r}")
-    stepper = system if isinstance(system, Stepper) else compile_stepper(system, method or default_method(system))
+    stepper = system if isinstance(system, Stepper) else compile_stepper(system, method)
     q, p = (y0, None) if velocity is not None else np.split(real_array(y0, "y0"), 2)
     times = None if t_eval is None else times_of_run(t_eval, *span)
     plan: Any = {"t": span[0], "t_end": span[1], "tolerance": rtol, "absolute_tolerance": absolute,

@@ -92,7 +92,7 @@ def ensemble_summary(model: Model, outcome: EnsembleOutcome, balance: float | No
     counts = Counter(result.status.tolist())
     lines = [
         model.system.name,
-        model.method.title,
+        model.method_of_runs.title,
         f"{counted(len(result), 'trajectory').replace('trajectorys', 'trajectories')} of "
         f"{_describe_steps(model, result)} saved of each",
         f"{outcome.seconds:.3g} s, {duration(outcome.seconds / max(steps, 1))} per step of a trajectory; "

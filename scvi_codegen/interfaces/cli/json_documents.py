@@ -129,7 +129,7 @@ def ensemble_numbers(model: Model, outcome: EnsembleOutcome, balance: float | No
 
 
 def _about(model: Model) -> dict[str, Any]:
-    method = {"method": model.method.name, "order": model.method.order}
+    method = {"method": model.method_of_runs.name, "order": model.method_of_runs.order}
     return {"system": model.system.name, **method, "run": model._run_section()}
 
 

@@ -116,7 +116,7 @@ def summary(
     model: Model, outcome: RunOutcome, final_error: RunError | None, account: EnergyAccount | None = None
 ) -> str:
     """Return a summary of a run in a few lines; shorter if no step was completed."""
-    run, trajectory, method, arrays = outcome.run, outcome.trajectory, model.method, model.array_system
+    run, trajectory, method, arrays = outcome.run, outcome.trajectory, model.method_of_runs, model.array_system
     order = "no order claimed" if method.order is None else f"order {method.order}"
     sizes = [counted(model.dimension, "coordinate"), *(f"{name} = {size}" for name, size in model.sizes.items())]
     lines = [
@@ -146,7 +146,7 @@ def event_counts(events: Iterable[Crossings]) -> Iterator[str]:
 
 def _geometry(model: Model, run: Run) -> str:
     """Return whether the map is symplectic; adaptive steps destroy this property."""
-    if not is_symplectic(model.method, model.system):
+    if not is_symplectic(model.method_of_runs, model.system):
         return "not symplectic"
     return "symplectic" if isinstance(run.plan, FixedSteps) else "symplectic only at fixed step size"
 

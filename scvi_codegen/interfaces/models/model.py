@@ -27,7 +27,7 @@ from scvi_codegen.interfaces.models.options import (
 )
 from scvi_codegen.interfaces.models.problems import Problem
 from scvi_codegen.interfaces.models.time_span import TimeSpan, check_length
-from scvi_codegen.methods import Method, as_method
+from scvi_codegen.methods import Method, as_method, default_method
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.systems.arrays.system import ArraySystem
 from scvi_codegen.systems.first_order import FirstOrderSystem
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from scvi_codegen.systems.event import Event
 
 DEFAULT_METHOD = SVI(8)
-"""Default method for the problems of the catalogue."""
+"""Default method; this object, unlike an equal one, says that none was named."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -59,7 +59,9 @@ class Model(TimeSpan):
 
     Attributes:
         system: the mechanical system, with the parameter values of the run as its defaults.
-        method: its discretisation; a name, ``"svi:8"``, is converted to the method.
+        method: its discretisation; a name, ``"svi:8"``, is converted to the method. Of models without a named method it
+            is the object :data:`DEFAULT_METHOD`, and adaptive runs have that of their tolerance, as of
+            :func:`~scvi_codegen.compile_stepper`.
         solver: of the stage equations, as of :func:`~scvi_codegen.compile_stepper`.
         q: (m,) initial coordinates, or all variables of a first-order system, by name or in order, without p; with
             rotations also by name, as of :meth:`Stepper.integrate`: attitudes as quaternions, matrices, Euler angles,
@@ -208,6 +210,13 @@ class Model(TimeSpan):
         )
 
     @property
+    def method_of_runs(self) -> Method:
+        """Method of runs with the steps of this model: that of their tolerance if no method was named."""
+        if self.method is not DEFAULT_METHOD or self.h is not None or self.has_time_transformation:
+            return self.method
+        return default_method(self.system, self.tolerance)
+
+    @property
     def array_system(self) -> ArraySystem | None:
         """The system if it has arrays whose sizes are known at run time only, else ``None``."""
         return self.system if isinstance(self.system, ArraySystem) else None
@@ -244,6 +253,8 @@ class Model(TimeSpan):
         if len(state) == 1 and not has_spins:  # at rest
             state["p" if unrolled.auxiliaries else "velocity"] = (0.0,) * unrolled.dimension
         changed: dict[str, Any] = {"fields": {}, "tables": {}, **state}
+        if system.mesh is not None and self.method is DEFAULT_METHOD:
+            changed["method"] = SVI(8)  # runs by another method would lack the mesh, which unrolled systems do not have
         return replace(self, system=unrolled, mesh=system.mesh, **changed)
 
     @property
@@ -287,7 +298,7 @@ class Model(TimeSpan):
         self._check_controller()
         stepper = compile_stepper(
             self.system,
-            self.method,
+            None if self.method is DEFAULT_METHOD else self.method,
             solver=self.solver,
             time_transformation=self.time_transformation,
             controller=self.controller,

@@ -231,7 +231,8 @@ class RunOptions:
 _TABLE: dict[str, Option] = {
     "method": Option(
         *("method", METHOD, "NAME"),
-        "Method, with its degree or number of stages: svi:6, gauss:3, .. (see 'scvi-codegen methods').",
+        "Method, with its degree or number of stages: svi:6, gauss:3, .. (see 'scvi-codegen methods'). By default "
+        "svi:8, in runs of a tolerance from 1e-4 on svi:4.",
     ),
     "degree": Option("method", COUNT, "N", "Degree of the trial curve (svi, scvi, sc), as in svi:N."),
     "stages": Option("method", COUNT, "N", "Number of stages (gauss, radau-iia, ..), as in gauss:N."),

@@ -192,27 +192,6 @@ class WithErrors:
         return corrected_states(self, self.error)
 
 
-class FinerStepper:
-    """Function that compiles the stepper of a finer method for the same system, once.
-
-    Attributes:
-        compiled: function without arguments that compiles it.
-    """
-
-    def __init__(self, compiled: Callable[[], Any]) -> None:
-        self.compiled = compiled
-        self._result: Any = None
-
-    def __call__(self) -> Any:
-        """Return the stepper."""
-        if self._result is None:
-            self._result = self.compiled()
-        return self._result
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return FinerStepper, (self.compiled,)
-
-
 @without_accuracy_warnings()
 def error_of(run: Any) -> RunError:
     """Return the global error of a run; raises as :attr:`WithErrors.error`."""

@@ -15,6 +15,7 @@ from scvi_codegen.runs.driver.observation import Observation, Saver, saver_of
 from scvi_codegen.runs.driver.run_loop import ShortRuns, plain_trajectory, record
 from scvi_codegen.runs.results.output import ALL_STATES, Output
 from scvi_codegen.runs.results.quantities import describe_run
+from scvi_codegen.runs.results.recorded import OfMethod
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.layout import InitialData
 from scvi_codegen.runs.states.validation import Array, Parameters, States
@@ -30,7 +31,7 @@ MOST_KEPT = 2**16
 """Largest number of doubles of workspace of a run that is kept for later calls."""
 
 
-class Run(Memory, AttitudeHistory):
+class Run(Memory, AttitudeHistory, OfMethod):
     """Run in progress: :class:`Memory` with recording of states."""
 
     def __init__(self, stepper: Integrator) -> None:

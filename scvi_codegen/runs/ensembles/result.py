@@ -25,7 +25,7 @@ from scvi_codegen.runs.forwarding import Pictured
 from scvi_codegen.runs.results.export import FORMATS, LABELLED, check_format, write_whole
 from scvi_codegen.runs.results.joining import joined, relative_changes
 from scvi_codegen.runs.results.quantities import quantities, short_title
-from scvi_codegen.runs.results.recorded import changed, not_recorded, without
+from scvi_codegen.runs.results.recorded import OfMethod, changed, not_recorded, without
 from scvi_codegen.runs.results.saved_states import ModeHistory, checked_row
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.rotation_quantities import named_quantities
@@ -52,7 +52,7 @@ Span: TypeAlias = tuple[slice, slice, Callable[[slice], Array]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, Pictured, TwoWords):
+class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, Pictured, TwoWords, OfMethod):
     """States of k trajectories, the initial state first.
 
     Attributes:

@@ -21,6 +21,7 @@ from scvi_codegen.runs.driver.run_loop import first_step_size, trajectory_of
 from scvi_codegen.runs.recording.manifest import Chunk, chunk_paths, no_states, read_chunk, read_manifest
 from scvi_codegen.runs.results.export import COLUMNS, Piece, States, write_states
 from scvi_codegen.runs.results.quantities import quantities_of
+from scvi_codegen.runs.results.recorded import OfMethod
 from scvi_codegen.runs.results.saved_states import checked_row
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.rotation_quantities import named_quantities
@@ -48,7 +49,7 @@ def load_run(folder: str | os.PathLike[str]) -> RecordedRun:
     return RecordedRun(Path(folder))
 
 
-class RecordedRun(AttitudeHistory):
+class RecordedRun(AttitudeHistory, OfMethod):
     """Run recorded in a folder; states are read on access.
 
     Indexing returns a :class:`Trajectory`: ``run[-1000:]``, ``run[::100]``; ``run.pieces()`` iterates over parts that

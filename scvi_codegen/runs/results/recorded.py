@@ -10,6 +10,17 @@ from scvi_codegen.common.errors import StateError
 Run = TypeVar("Run")
 
 
+class OfMethod:
+    """Mixin of runs, trajectories and ensembles: their method."""
+
+    __slots__ = ()
+
+    @property
+    def method(self: Any) -> str:
+        """Name of the method whose steps these are, ``"svi-8-gauss-legendre-8"``; by default by tolerance."""
+        return str(self.stepper.interface.method)
+
+
 class NotRecordedError(StateError, AttributeError):
     """An attribute of a run that its computation did not record."""
 

@@ -107,6 +107,7 @@ class CompiledMethod:
         reason: str | None = None,
         origin: Self | None = None,
         problem: RunSizes | None = None,
+        looser: Callable[[], Self] | None = None,
     ) -> None:
         self.interface, self.flags, self.events = interface, flags, events
         self.in_tau = interface.in_tau
@@ -116,7 +117,7 @@ class CompiledMethod:
         self.changes_states = any(event.changes_state for event in events)
         self.divides_steps = self.changes_states or bool(interface.mode_names)
         self.origin, self.problem, self._of_sizes, self._reason = origin, problem, of_sizes, reason
-        self._variants = Variants() if variants is None else variants
+        self._variants, self._looser = Variants() if variants is None else variants, looser
         self._event_variants: dict[tuple[Event, ...], Self] = {}
         self._released_runs: list[Any] = []
         self.warned_of_kinks = False
@@ -127,23 +128,38 @@ class CompiledMethod:
         self._plain = cast(Source, source)
         self._states = layout_of(interface)
         self.shapes = self._states.shapes
-        self.source = self._plain
-        self._load()
+        self.source = self._with_search()
+        if looser is None:
+            self._load()
+
+    def _with_search(self) -> Source:
+        """Return the source, with the search for zeros of events."""
+        interface, events = self.interface if self.origin is None else self.origin.interface, self._located
+        if not self.searched or self.run_time_sizes:
+            return self._plain
+        if interface.temperature is not None:
+            require(self, "events")
+        if not events:
+            return self._plain
+        return self._variants.with_events(events) or self._derived_with_events(interface, events)
+
+    @property
+    def _located(self) -> tuple[Event, ...]:
+        """The functions whose zeros C locates; those of runs in double-double by the integrator in double."""
+        return () if self.interface.words > 1 else self.searched
 
     def _load(self) -> None:
-        interface, events = self.interface if self.origin is None else self.origin.interface, self.searched
-        if events and interface.temperature is not None:
-            require(self, "events")
-        if interface.words > 1:
-            events = ()  # located by the integrator in double
-        if events:
-            self.source = self._variants.with_events(events) or self._derived_with_events(interface, events)
+        _ = self.binding
+
+    @cached_property
+    def binding(self) -> Binding:
+        """The library, compiled at once, or on first use if loose runs have a method of their own."""
         library = building.load(with_calls(self.source), flags=self.flags)
-        if self.problem is not None:
-            arrays = library, interface, self.problem
-            self.binding: Binding = EventBinding(*arrays, events) if events else ArrayBinding(*arrays)
-        else:
-            self.binding = Binding(library, interface.prefix, interface.workspace, fallback=self._load_fallback)
+        if self.problem is None or self.origin is None:
+            interface = self.interface
+            return Binding(library, interface.prefix, interface.workspace, fallback=self._load_fallback)
+        arrays = library, self.origin.interface, self.problem
+        return EventBinding(*arrays, self._located) if self._located else ArrayBinding(*arrays)
 
     def _derived_with_events(self, interface: Interface, events: tuple[Event, ...]) -> Source:
         """Return the source with the search for zeros, from the cache if the formulas are text and were read before."""
@@ -180,6 +196,7 @@ class CompiledMethod:
             reason=self._reason,
             origin=self.origin,
             problem=self.problem,
+            looser=self._looser,
         )
 
     def bind(
@@ -303,6 +320,8 @@ class CompiledMethod:
         """
         for stepper in (self,) if events is None else (self, self.with_events(events)):
             stepper._compile()
+        if self._looser is not None:
+            self._looser().prepare(tangent=tangent, second=second, ensemble=ensemble, events=events)
         requested = {Derivatives(): tangent, Derivatives(order=2): second, Lanes(): ensemble}
         for variant in [variant for variant, is_requested in requested.items() if is_requested]:
             if (source := self._variants[variant]) is not None:
@@ -351,6 +370,11 @@ class CompiledMethod:
     def title(self) -> str:
         """System and method, in one line."""
         return self.interface.title
+
+    @property
+    def method(self) -> str:
+        """Name of the method, ``"svi-8-gauss-legendre-8"``; :attr:`Trajectory.method` is that of a run."""
+        return self.interface.method
 
     @property
     def coordinates(self) -> tuple[str, ...]:
@@ -430,4 +454,4 @@ class CompiledMethod:
     @property
     def _has_error_estimate(self) -> bool:
         """True if the method has adaptive steps for this system; also if that follows from sizes at run time."""
-        return self.binding.has("advance_to")
+        return "advance_to" in self.source.contents.functions

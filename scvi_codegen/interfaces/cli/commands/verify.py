@@ -1,6 +1,7 @@
 """Command ``scvi-codegen verify``: the certificate of a model, or of the C code in a generated folder."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,11 @@ from scvi_codegen.interfaces.cli.model_options import (
     sections_of,
     with_known_sizes,
 )
-from scvi_codegen.interfaces.models.model import Model
+from scvi_codegen.interfaces.models.model import DEFAULT_METHOD, Model
 from scvi_codegen.interfaces.models.model_files.model_file import load_model
 from scvi_codegen.interfaces.models.options import METHOD_KEYS
 from scvi_codegen.interfaces.models.packages.package import CERTIFICATE_FILE, MODEL_FILE, load_package
+from scvi_codegen.methods import SVI
 from scvi_codegen.runs.stepper import Stepper
 
 
@@ -65,6 +67,8 @@ def _verified(name: str, choices: Choices) -> Certificate:
         if model.array_system is not None and (model.h is None or model.array_system.constraints):
             model = with_known_sizes(model, "verify (adaptive steps, constraints)")
         model._check_double("a certificate")
+        if model.method is DEFAULT_METHOD:  # of this one
+            model = replace(model, method=SVI(8))
         return _certificate(model, model.stepper())
     if choices["solver"] != "auto" or any(choices[choice] is not None for choice in METHOD_KEYS):
         raise click.UsageError(f"'{name}' is a generated folder: its method and solver are those it was generated with")

@@ -21,7 +21,7 @@ from scvi_codegen.common.errors import ModelFileError, SystemDefinitionWarning
 from scvi_codegen.common.toml_text import read_toml
 from scvi_codegen.common.validation import ExactNumber, checks_arguments, of
 from scvi_codegen.interfaces.models.input_tables import InputTable
-from scvi_codegen.interfaces.models.model import Model
+from scvi_codegen.interfaces.models.model import DEFAULT_METHOD, Model
 from scvi_codegen.interfaces.models.model_files.document import document_of, with_files
 from scvi_codegen.interfaces.models.model_files.entries import FORMAT_KEYS, ROBOT_KEYS, Entry, is_robot, read_entry
 from scvi_codegen.interfaces.models.model_files.page_section import PAGE_KEYS, PICTURE_KEYS, check_page, check_picture
@@ -192,6 +192,7 @@ def _read_model(document: Document, changes: Document, folder: str | os.PathLike
     if "error" not in document.get("run", {}):
         changes = _without_inherited_step(changes)
     document = _without_inherited_step(document)
+    is_named = any(_without_solver(layer).get("method") for layer in (document, changes))
     document, specification, solver = _merged(document, changes, entry)
     numbers = {name: document[name] for name in ("parameters", "initial") if name in document}
     document = {**document, **with_exact_numbers(numbers, exact=_precision(document) == DOUBLE_DOUBLE)}
@@ -210,6 +211,7 @@ def _read_model(document: Document, changes: Document, folder: str | os.PathLike
     values |= {"inputs": _read_inputs(document.get("inputs", {}), folder), "solver": solver}
     events = read_events(document.get("events", []))
     values |= {name: document.get(name, {}) for name in FURTHER} | read_run(document["run"])
+    method = DEFAULT_METHOD if not is_named and method == DEFAULT_METHOD else method
     model = Model(system=system, method=method, events=events, **values)
     check_page(model.page, model)
     check_picture(model)
@@ -251,7 +253,9 @@ def _with_time_transformation(model: Model, document: Document, specification: S
         )
         default = default_controller(in_tau=g is not None)
         controller = None if controller in (SYMPLECTIC, default) else controller
-        method = read_method(fitted(specification, system))
+        method = model.method
+        if method is not DEFAULT_METHOD:
+            method = read_method(fitted(specification, system))
         model = replace(model, system=system, method=method, time_transformation=g, controller=controller)
     others = map(symbol, words_of(document))
     rescaling = [] if g is None else [time_rescaling_function(model.system, g, in_time=True)]
