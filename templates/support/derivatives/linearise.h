@@ -114,7 +114,7 @@ static int propagate_by_iteration(propagation *over, long long k, const double *
   for (int j = 0; j < over->count; j++) {
     double v[STEP_INPUTS];
     int *look = over->defects && j ? &over->look_at_rounding : &over->look;
-    at.accepted = !over->defects ? LEFT_TO_COME : j ? LEFT_IN_ROUNDING : LEFT_IN_ERRORS;
+    at.accepted = over->defects ? LEFT_IN_ERRORS : LEFT_TO_COME;
     memcpy(v, from + j * STEP_INPUTS, sizeof v);
     if ((over->back ? vjp_by_iteration : jvp_by_iteration)(&at, v, look) != OK)
       return j;
