@@ -103,9 +103,6 @@ typedef struct {
   real pilots_above, pilot_error; /* longer trials than the former are pilots; estimate of the largest one solved */
 #endif
   int status; /* other than OK if no smaller step can succeed */
-#ifdef COSTLY_POINTS
-  real half_length, half[2 * M]; /* largest pilot but one, or 0: increments */
-#endif
   real length; /* step size; 0 before the first trial */
   real pilot; /* that of the largest trial so far, in the search for the first step, that was solved */
   int last; /* 1 if the step ends at t_end */
@@ -155,6 +152,22 @@ static real attempt(run_memory *run, trial *now, real least, const solver_option
 #define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */
 
 #ifdef COSTLY_POINTS
+/* Table by Lagrange's formula, from the curve of a step to the points of another one, which begins at `begin` and takes
+ * `ratio`, both in units of the former. */
+static SELDOM void tabulate(double begin, double ratio, lanes *table)
+{
+  memset(table, 0, sizeof(lanes) * POINTS * GROUPS);
+  for (int j = 0; j < KEPT; j++)
+    for (int g = 0; g < GROUPS; g++) {
+      lanes product = lanes_of(1.0);
+      for (int k = 0; k < KEPT; k++)
+        if (k != j)
+          product *= (begin + ratio * ABSCISSA[g] - VECTOR_ENTRY(ABSCISSA, k)) /
+              (VECTOR_ENTRY(ABSCISSA, j) - VECTOR_ENTRY(ABSCISSA, k));
+      TABLE_ENTRY(table, g, j) = product;
+    }
+}
+
 /* Table of the last step of a run, whose size is not on the grid, from the curve of the step before; or, if inside < 0,
  * of a trial in the search for the first step, from that of one that was shorter by -inside levels, of a much shorter
  * one from the velocity at the start. Returns 0 without a curve. */
@@ -352,18 +365,32 @@ static SELDOM int moves_little(const run_memory *run, const trial *now)
   return moved < SHORT_MOTION * run->path && moved < SHORT_BY_TOLERANCE * tolerance * run->path;
 }
 
-/* Compares a trial with two half steps, in momenta too if requested. The first one may be a pilot. */
-static inline int compare_trial(const run_memory *run, const trial *now, int momenta, const solver_options *options,
-    real *apart)
+/* Compares a trial with two half steps, in momenta too if requested: integrals of its defect where they begin at its
+ * curve and end at once. Their equations are solved to the tolerance of the step, which differences are compared with.
+ * Returns SPURIOUS_SOLUTION if the half steps have no solution or differ by far more than the motion. */
+static SELDOM int compare_trial(const trial *now, int momenta, const solver_options *options, real *apart)
 {
-  const real *half = NULL, *curve = NULL;
-#ifdef COSTLY_POINTS
-  if (!by_newton(now))
-    curve = run->memory;
-  if (curve && run->error_before == 0 && MATH(fabs)(now->step.h) == 2 * now->half_length)
-    half = now->half;
+  const step_data *step = &now->step;
+  solver_options few = *options;
+  real far = 0;
+  VECTORS(halves, 1, step);
+  VECTORS(changes, 1, step);
+  VECTORS(first, 1, step);
+  few.tolerance = larger(few.tolerance, now->control->tolerance);
+#ifdef NEWTON_ALONE
+  const half_tables *tables = NULL;
+#else
+  const struct predictor_tables_of to_first = {PREDICTOR_INSIDE[LEVELS_PER_BINADE - 1], NULL, NULL};
+  const struct predictor_tables_of to_second = {PREDICTOR_SECOND_HALF, NULL, NULL};
+  const half_tables of_curve = {&to_first, &to_second}, *tables = by_newton(now) ? NULL : &of_curve;
 #endif
-  return compare_with_halves(&now->step, now->dq, momenta ? now->dp : NULL, half, curve, options, apart);
+  const int status = solve_halves(step, step->h, tables, &few, halves, changes, first);
+  if (status != OK)
+    return status > STATUS(SPURIOUS_SOLUTION) ? status : STATUS(SPURIOUS_SOLUTION);
+  *apart = difference(step, step->h, step->q0, now->dq, halves, &far);
+  if (momenta)
+    *apart = larger(*apart, difference(step, step->h, step->p0, now->dp, changes, &far));
+  return *apart <= GROSS_DIFFERENCE ? OK : STATUS(SPURIOUS_SOLUTION);
 }
 
 /* Number of levels, at most `most`, by which the step size may be increased without exceeding the largest one. */
@@ -414,11 +441,6 @@ static SELDOM int levels_of_first(const trial *now, real h, real span)
 static inline void try_pilot(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const int inside = now->inside;
-#ifdef COSTLY_POINTS
-  now->half_length = now->length == now->pilot && !by_newton(now) ? now->pilot : 0;
-  memcpy(now->half, now->dq, sizeof(real) * M);
-  memcpy(now->half + M, now->dp, sizeof(real) * M);
-#endif
   try_step(run, now, 0, options, report);
   now->inside = 0;
   if (!(now->error < INFINITY) && (inside == AT_START || (inside < 0 && inside >= -LEVELS_OUTSIDE)))
@@ -494,7 +516,7 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
     up = small ? levels_up(run, now) : 0;
     if (LEVELS_OUTSIDE && up > 0 && up < LEVELS_PER_BINADE)
       return;
-    up -= LEVELS_OUTSIDE ? up % LEVELS_PER_BINADE : 0; /* then the last pilot but one is the first half of the last */
+    up -= LEVELS_OUTSIDE ? up % LEVELS_PER_BINADE : 0;
     if (up == 0)
       up = found && rises ? levels_from_rest(run, now, v, (int)(highest - run->grid_level))
                           : levels_within(run, now, MOST_UP);
@@ -834,7 +856,7 @@ static SELDOM real transient_error(const trial *now, const solver_options *optio
     step_data part = part_of_step(step, h);
     set_zero(step, whole), set_zero(step, impulse);
     if (add_part(&part, options, whole, impulse) != OK ||
-        solve_halves(step, h, NULL, NULL, options, halves, changes, first) != OK)
+        solve_halves(step, h, NULL, options, halves, changes, first) != OK)
       break;
     apart = difference(step, h, step->q0, whole, halves, &far) * (h / step->h);
     if (largest > 0 && apart <= largest)
@@ -863,7 +885,7 @@ static SELDOM int compare_step(run_memory *run, trial *now, int steps_to_compare
       ONE_COEFFICIENT || steps_to_compare ? ROUNDOFF_LEVEL : SPURIOUS);
   for (;;) {
     real apart;
-    const int status = compare_trial(run, now, steps_to_compare, options, &apart);
+    const int status = compare_trial(now, steps_to_compare, options, &apart);
     if (status > STATUS(SPURIOUS_SOLUTION))
       return status;
     if (begins)
