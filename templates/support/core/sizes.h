@@ -102,12 +102,7 @@ static inline void begin_motion(run_memory *run)
   memset(run->largest_dq, 0, sizeof run->largest_dq), memset(run->largest_bend, 0, sizeof run->largest_bend);
 }
 
-/* The largest V, and the largest mu_i of a step of h of the run so far. */
-static inline real largest_velocity(const run_memory *run)
-{
-  return largest_magnitude(run->largest_v, MOTIONS);
-}
-
+/* The largest mu_i of a step of h of the run so far. */
 static inline real motion_of_run(const run_memory *run, real h)
 {
   real largest = 0;

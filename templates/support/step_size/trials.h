@@ -13,7 +13,6 @@
 #define MANY_ITERATIONS 10 /* of a step, after which the next one is not larger */
 #define TOO_MANY_ITERATIONS 13 /* the next one is smaller: about ten iterations take the least time per unit of time */
 #define TRUSTED_DECREASE (ONE_COEFFICIENT ? REAL(0.97) : 0) /* of the error by a step */
-#define SMALL_PART REAL(0.1) /* of the largest momentum: smaller changes count as little */
 #define NEVER_FAILED (1 << 16) /* level beyond all exponents of a number: the iteration failed at no size yet */
 #define SHORT_PART REAL(0.125) /* of the time in which a state changes by its size, or of the span: early trial */
 #ifdef COSTLY_POINTS
@@ -33,9 +32,6 @@
 #define FAILURES_BEFORE_NEWTON 3 /* trials of a step in which the iteration of the multipliers fails */
 #define TRIED_AGAIN (-1) /* run->avoiding of the step after those by Newton's method */
 #define GAIN_OF_NEWTON (3 * LEVELS_PER_BINADE) /* levels by which its steps are larger, so that they take less time */
-#define SHORT_MOTION REAL(0.01) /* relative to the path of recent steps: a change so small .. */
-#define SHORT_BY_TOLERANCE 1000 /* .. and less than so many times the tolerance does not show errors of the forces */
-#define FORMER_PATH REAL(0.9) /* part of the path of former steps that counts with a step: that of about ten */
 #define LEAP 2 /* levels by which a step is larger than the one before, whose end is then examined */
 #define MOST_EXAMINED 8 /* trials, each up to four times shorter, until no force sets in at the end of a step */
 #define BEYOND_END REAL(0.125) /* of the step: part behind its end whose forces are examined */
@@ -347,24 +343,6 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
 #endif
 }
 
-/* Returns 1 if the momenta change by a small part of the largest one, as they do where nonsmooth forces shorten a
- * step. */
-static SELDOM int changes_little(const trial *now)
-{
-  real size;
-  return largest_change(&now->step, now->at.p, now->dp, &size) < SMALL_PART * size;
-}
-
-/* Returns 1 if the positions change by little more than the tolerance relative to the path so far, so that their errors
- * meet it whatever the forces are, as near a pole in time. */
-static SELDOM int moves_little(const run_memory *run, const trial *now)
-{
-  const real tolerance = MATH(pow)(now->limits.most, ERROR_POWER);
-  real size;
-  const real moved = largest_change(&now->step, now->at.q, now->dq, &size);
-  return moved < SHORT_MOTION * run->path && moved < SHORT_BY_TOLERANCE * tolerance * run->path;
-}
-
 /* Compares a trial with two half steps, in momenta too if requested: integrals of its defect where they begin at its
  * curve and end at once. Their equations are solved to the tolerance of the step, which differences are compared with.
  * Returns SPURIOUS_SOLUTION if the half steps have no solution or differ by far more than the motion. */
@@ -376,6 +354,7 @@ static SELDOM int compare_trial(const trial *now, int momenta, const solver_opti
   VECTORS(halves, 1, step);
   VECTORS(changes, 1, step);
   VECTORS(first, 1, step);
+  *apart = 0;
   few.tolerance = larger(few.tolerance, now->control->tolerance);
 #ifdef NEWTON_ALONE
   const half_tables *tables = NULL;
@@ -737,15 +716,12 @@ static inline int is_leap(const run_memory *run, const trial *now)
 }
 
 /* Returns 1 if the momenta of a step are compared, too: after a step that was wrong, and where the step size fell by a
- * factor of two or more although the momenta change little. Near a singular time or a nonsmooth force the coefficients
- * of the curve do not decay and do not show its error; steps are then so short that the error is in the momenta. Not
- * for Newton's method, whose steps may leave vibrations of stiff systems unresolved. */
-static inline int needs_momenta(run_memory *run, const trial *now)
+ * factor of two or more. Near a singular time or a nonsmooth force the coefficients of the curve do not decay and do not
+ * show its error; steps are then so short that the error is in the momenta. Not for Newton's method, whose steps may
+ * leave vibrations of stiff systems unresolved. */
+static inline int needs_momenta(const run_memory *run, const trial *now)
 {
-  const int shorter = DOUBTS && !by_newton(now) && now->change <= -LEVELS_PER_BINADE;
-  if (shorter && moves_little(run, now))
-    run->steps_to_compare = STEPS_COMPARED_AFTER_DOUBT;
-  return DOUBTS && !by_newton(now) && (run->steps_to_compare > 0 || (shorter && changes_little(now)));
+  return DOUBTS && !by_newton(now) && (run->steps_to_compare > 0 || now->change <= -LEVELS_PER_BINADE);
 }
 
 /* Solves a part of a step without a predictor, and adds its increments. */
@@ -1061,7 +1037,6 @@ static inline void accept_trial(run_memory *run, trial *now)
 #endif
   forget_motion(run, now->step.h);
   note_trial(run, now);
-  run->path = FORMER_PATH * run->path + MATH(fabs)(now->step.h) * largest_velocity(run);
   if (larger(now->error, now->apart) > run->error) {
     run->error = larger(now->error, now->apart);
     run->error_t = now->at.t;
