@@ -26,12 +26,10 @@
 #define LEAST_RISE 2
 #endif
 #define AT_START (-NEVER_FAILED) /* trial->inside of the shortest one, whose increments are the rates at its start */
-#define RISING REAL(4.0) /* velocities from rest are larger by this factor in a trial that is much longer */
-#define FEW_ITERATIONS 3 /* of a trial that is much shorter than the time in which forces change */
-#define SUSPENDED 8 /* steps without this rule after one that needed as many iterations as a larger one */
 #define FAILURES_BEFORE_NEWTON 3 /* trials of a step in which the iteration of the multipliers fails */
 #define TRIED_AGAIN (-1) /* run->avoiding of the step after those by Newton's method */
 #define GAIN_OF_NEWTON (3 * LEVELS_PER_BINADE) /* levels by which its steps are larger, so that they take less time */
+#define UNBENT REAL(1e-11) /* leading coefficients of the velocities of a free flight relative to their change */
 #define LEAP 2 /* levels by which a step is larger than the one before, whose end is then examined */
 #define MOST_EXAMINED 8 /* trials, each up to four times shorter, until no force sets in at the end of a step */
 #define BEYOND_END REAL(0.125) /* of the step: part behind its end whose forces are examined */
@@ -42,7 +40,6 @@
 #define LEAST_PIECES 4 /* .. and least number of others, shorter ones are not examined */
 #define UNEVEN REAL(0.5) /* of a piece: range of its irregular end, as forces may be periodic in time */
 #define GOLDEN REAL(0.6180339887498949)
-#define STEPS_COMPARED_AFTER_DOUBT 16 /* steps that are compared after one that was shortened by a comparison */
 
 #ifdef ARRAYS
 /* State of a run: vectors of the caller. */
@@ -434,26 +431,13 @@ static inline void try_pilot(run_memory *run, trial *now, const solver_options *
   }
 }
 
-/* Levels by which a trial with an inadmissible error, in which some velocity rises from rest, is increased: sizes of
- * the state, which may be zero, made it too short for a pilot. v: velocities of the trial before. At most `most`. */
-static SELDOM int levels_from_rest(const run_memory *run, const trial *now, const real *v, int most)
-{
-  int rises = 0;
-  for (int k = 0; k < MOTIONS; k++)
-    rises |= run->largest_v[k] > RISING * v[k];
-  if (!rises || now->iterations > FEW_ITERATIONS || now->error <= now->limits.most || most <= 0)
-    return 0;
-  return most < MOST_UP ? most : MOST_UP;
-}
-
 /* Determines the first step size by increasing one that is certainly too small. The smallest trials may fail, with
  * fixed-point iteration larger ones, too: if some velocities are zero, rounding dominates them. Or their error estimate
  * is only rounding, of any size; the estimate of a curve grows as expected. */
 static SELDOM void try_first_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const real span = MATH(fabs)(now->t_end - now->at.t);
-  real shorter = INFINITY, v[MOTIONS] = {0};
-  long long highest;
+  real shorter = INFINITY;
   int found = 0, up = 1, early;
   now->pilot = 0;
   if (run->avoiding == 0)
@@ -470,19 +454,14 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
   now->inside = LEVELS_OUTSIDE ? AT_START : 0;
   try_pilot(run, now, options, report);
   early = levels_within(run, now, levels_of_first(now, now->length, span));
-  highest = run->grid_level + levels_within(run, now, (int)(level_below(SHORT_PART * span) - run->grid_level));
   now->inside = LEVELS_OUTSIDE && now->error < INFINITY ? -early : 0;
   while (early > 0) {
-    int more;
-    memcpy(v, run->largest_v, sizeof v);
     run->grid_level += early;
     try_pilot(run, now, options, report);
     if (levels_up(run, now) >= LEVELS_PER_BINADE)
       break;
-    more = levels_from_rest(run, now, v, (int)(highest - run->grid_level));
     run->grid_level -= early;
-    early = more > 0 ? early + more : early < 2 * MOST_UP ? 0
-                                                          : early - MOST_UP;
+    early -= early < 2 * MOST_UP ? early : MOST_UP;
     if (early == 0)
       try_pilot(run, now, options, report);
   }
@@ -497,10 +476,8 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
       return;
     up -= LEVELS_OUTSIDE ? up % LEVELS_PER_BINADE : 0;
     if (up == 0)
-      up = found && rises ? levels_from_rest(run, now, v, (int)(highest - run->grid_level))
-                          : levels_within(run, now, MOST_UP);
+      up = found && rises ? 0 : levels_within(run, now, MOST_UP);
     shorter = now->error;
-    memcpy(v, run->largest_v, sizeof v);
     run->grid_level += up;
     now->inside = up <= LEVELS_OUTSIDE && now->error < INFINITY ? -up : 0;
     if (up > 0)
@@ -662,8 +639,6 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
 }
 
 #ifdef NEWTON_ALONE
-#define UNBENT REAL(1e-11) /* leading coefficients of the velocities of a free flight relative to their change */
-
 /* Returns 1 if the force on some coordinate is nearly constant along the stages, as in free flight. */
 static SELDOM int stages_fly(const real *z)
 {
@@ -680,7 +655,6 @@ static SELDOM int stages_fly(const real *z)
 }
 #else
 #define NEARLY_CONSTANT REAL(1e-3) /* relative change of the force of a free flight along a step */
-#define UNBENT REAL(1e-11) /* leading coefficients of its velocities relative to their change */
 
 /* Returns 1 if the force on some coordinate is nearly constant along the curve, as in free flight. */
 static SELDOM int is_free_flight(const step_data *step, stored_values of)
@@ -873,7 +847,7 @@ static SELDOM int compare_step(run_memory *run, trial *now, int steps_to_compare
       run->steps_to_compare -= run->steps_to_compare > 0;
       return OK;
     }
-    run->steps_to_compare = STEPS_COMPARED_AFTER_DOUBT;
+    run->steps_to_compare = AVOIDED;
     now->error = INFINITY;
     now->inside = 0;
     if (!shorten(run, now, MOST_DOWN))
@@ -909,7 +883,7 @@ static inline int limit_by_iterations(run_memory *run, const trial *now)
     run->suspended--;
   } else if (run->many > 0 && iterations >= run->many) {
     run->many = 0;
-    run->suspended = SUSPENDED;
+    run->suspended = AVOIDED;
   } else {
     run->many = iterations > TOO_MANY_ITERATIONS ? iterations : 0;
     most = run->many > 0 ? -1 : iterations > MANY_ITERATIONS ? 0
