@@ -3,7 +3,7 @@
 A program prints twenty states. Two judges read them: their bits are those of the recorded source (``golden_cells.py``),
 and those of contacts and robots are near the states in ``golden/states.npz``. These were recorded once, before the
 machinery of contacts was replaced; do not record them again where bits change. The motions are insensitive: changes of
-1e-12 of the initial state, and steps of half the size, move no state by a tenth of the tolerance.
+1e-12 of the initial state, and fixed steps of half the size, move no state by a tenth of the tolerance.
 """
 
 import hashlib
@@ -64,7 +64,6 @@ class Scene:
             prefix=name,
             controlled=not self.steps,
             time_transformation=self.tau,
-            kinks="as formulas" if self.tau or system.bath else "located",
         )
         events = interface.searched(())
         parameters = [0.0] * len(interface.parameters)
