@@ -11,7 +11,7 @@ from programs import needs
 
 import scvi_codegen as sc
 
-STRICT = "-O0 -std=c99 -Wall -Wextra -Wconversion -Wpedantic -Wshadow -Wno-psabi -Werror -Wno-sizeof-pointer-memaccess"
+STRICT = "-O0 -std=c99 -Wall -Wextra -Wconversion -Wpedantic -Wshadow -Wno-psabi -Werror"
 SYSTEM = sc.LagrangianSystem.from_text
 SPAN, H, STEPS = 1.5, 0.03, 50
 INPUT = {"u": ([0.0, 0.37, 0.9, 2.0], [0.0, 1.2, -0.7, 0.4])}

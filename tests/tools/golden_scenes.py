@@ -58,12 +58,7 @@ class Scene:
         system, tables = self.system(), dict(self.inputs or {})
         method = as_method(self.method, system)
         source, interface = generate_source(
-            system,
-            method,
-            solver=self.solver,
-            prefix=name,
-            controlled=not self.steps,
-            time_transformation=self.tau,
+            system, method, solver=self.solver, prefix=name, controlled=not self.steps, time_transformation=self.tau
         )
         events = interface.searched(())
         parameters = [0.0] * len(interface.parameters)
