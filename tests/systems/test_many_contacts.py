@@ -602,9 +602,28 @@ def comes_to_rest_on_feet(run: Any, gaps: NDArray[Any], weight: float, mu: float
     )
 
 
+WORKS_WITHOUT_ACCOUNT = pytest.mark.xfail(
+    reason="feet bounce while others slide: the work of friction between their impacts is unknown",
+    raises=sc.StateError,
+    strict=True,
+)
+PASSES_A_TOUCH = pytest.mark.xfail(
+    reason="a foot touches and leaves within one step beside feet that slide: its impact is passed over",
+    raises=sc.EventError,
+    strict=True,
+)
+
+
 @pytest.mark.filterwarnings("ignore:a transition has several motions")
-@pytest.mark.parametrize("e", [0.0, 0.3])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("seed", "e"),
+    [
+        *((seed, 0.0) for seed in range(3)),
+        (0, 0.3),
+        pytest.param(1, 0.3, marks=WORKS_WITHOUT_ACCOUNT),
+        pytest.param(2, 0.3, marks=PASSES_A_TOUCH),
+    ],
+)
 def test_a_table_falls_on_four_feet_in_space_and_rests(e: float, seed: int) -> None:
     velocity = np.random.default_rng(seed).normal(size=6) * [0.3, 0.3, 0, 0.5, 0.5, 0.5]
     run = dining_table(e).integrate([0, 0, 0.3, 0, 0, 0], velocity=velocity, h=0.005, t_end=1.5)
