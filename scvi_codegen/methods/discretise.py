@@ -25,7 +25,7 @@ from scvi_codegen.methods.tables.basis import identity_matrix, next_step
 from scvi_codegen.systems.derived_expressions import auxiliary_multipliers, forms_of
 from scvi_codegen.systems.first_order import FirstOrderSystem
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
-from scvi_codegen.systems.formulas.intermediates import intermediate
+from scvi_codegen.systems.formulas.intermediates import intermediate, symbols_of
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
 from scvi_codegen.systems.kinks import check_continuity
 from scvi_codegen.systems.lagrangian import LagrangianSystem
@@ -292,8 +292,7 @@ def with_auxiliaries(system: MechanicalSystem, stages: StageSystem) -> StageSyst
 
 def _groups(system: MechanicalSystem, f: int, stage_group: StageGroup) -> Iterator[_Group]:
     """Yield the auxiliary variables that occur in a stage group, and the multipliers of their equations."""
-    free = set().union(*(result.free_symbols for result in stage_group.results))
-    free |= stage_group.scalar.free_symbols if stage_group.scalar is not None else set()
+    free = symbols_of(*stage_group.results, *([] if stage_group.scalar is None else [stage_group.scalar]))
     points = stage_group.abscissae
     guesses = {
         system.auxiliaries: identity_matrix(len(points)) if stage_group.name == "drift" else next_step(points),

@@ -410,6 +410,7 @@ class _Accumulation:
         self.variables = frozenset(variables)
         self.gradients: dict[Expr, Gradient] = {variable: {index: S.One} for index, variable in enumerate(variables)}
         self.totals: dict[Expr, dict[int, Expr]] = {}
+        self.products: dict[tuple[Expr, Expr], Expr] = {}
         self.jacobians: dict[tuple[tuple[Expr, ...], bool], dict[tuple[int, int], Expr]] = {}
 
     def total(self, expression: Expr) -> dict[int, Expr]:
@@ -441,7 +442,7 @@ class _Accumulation:
         if isinstance(node, Intermediate):
             return {} if self.variables.isdisjoint(node.varies_with) else {node: S.One}
         inner = [self.of(argument) for argument in node.args]
-        return _combined(
+        return self._combined(
             [
                 (factor, derivatives)
                 for position, derivatives in enumerate(inner)
@@ -449,15 +450,26 @@ class _Accumulation:
             ]
         )
 
+    def _combined(self, pairs: Sequence[tuple[Expr, Gradient]]) -> Gradient:
+        """Return the sum of factor times gradient: the chain rule, in which equal terms occur once with their number.
 
-def _combined(pairs: Sequence[tuple[Expr, Gradient]]) -> Gradient:
-    """Return the sum of factor times gradient: the chain rule."""
-    parts: dict[int, list[Expr]] = {}
-    for factor, derivatives in pairs:
-        for index, derivative in derivatives.items():
-            parts.setdefault(index, []).append(derivative if factor is S.One else product(factor, derivative))
-    entries = {index: total(terms) for index, terms in parts.items()}
-    return {index: entry for index, entry in entries.items() if entry is not S.Zero}
+        Second derivatives of ``sum_k x_k^2`` with n terms in each x_k are n^3 products, of which n^2 are different.
+        """
+        parts: dict[Any, dict[Expr, int]] = {}
+        for factor, derivatives in pairs:
+            for index, derivative in derivatives.items():
+                term = derivative if factor is S.One else self._product(factor, derivative)
+                terms = parts.setdefault(index, {})
+                terms[term] = terms.get(term, 0) + 1
+        entries = {
+            index: total([n * term if n > 1 else term for term, n in terms.items()]) for index, terms in parts.items()
+        }
+        return {index: entry for index, entry in entries.items() if entry is not S.Zero}
+
+    def _product(self, factor: Expr, derivative: Expr) -> Expr:
+        if (factor, derivative) not in self.products:
+            self.products[factor, derivative] = product(factor, derivative)
+        return self.products[factor, derivative]
 
 
 def node_derivative(node: Expr, position: int) -> Expr:

@@ -55,9 +55,9 @@ class Intermediate(Expr):  # type: ignore[misc]  # SymPy is untyped
         if quantity is None:
             quantity = Expr.__new__(cls, definition)
             quantity.number = next(_NUMBERS)
-            quantity.inner, symbols, has_steps = _contents(definition)
+            quantity.inner, symbols, has_steps = _contents([definition])
             quantity._free = symbols.union(*(inner._free for inner in quantity.inner))
-            varying, symbols, _ = _contents(definition, *STEPS) if has_steps else (quantity.inner, symbols, False)
+            varying, symbols, _ = _contents([definition], *STEPS) if has_steps else (quantity.inner, symbols, False)
             quantity.varies_with = symbols.union(*(inner.varies_with for inner in varying))
             _KNOWN[definition] = quantity
         return quantity
@@ -114,20 +114,25 @@ STEPS = (unit_step, rint)
 """Functions that are constant but for jumps."""
 
 
-def _contents(definition: Expr, *without: type) -> tuple[tuple[Intermediate, ...], frozenset[Symbol], bool]:
-    """Return quantities and symbols in an expression, outside of some functions, and whether it has ``STEPS``.
+def _contents(
+    expressions: Iterable[Expr], *types: type, without: Container[Any] = ()
+) -> tuple[tuple[Intermediate, ...], frozenset[Symbol], bool]:
+    """Return quantities and symbols in expressions, outside of some functions, and whether these have ``STEPS``.
 
-    Each subexpression is visited once, unlike by SymPy's ``free_symbols``.
+    Each subexpression that they share is visited once, unlike by SymPy's ``free_symbols``, and none of ``without``.
     """
-    seen, pending, has_steps = {definition}, [definition], False
+    seen, has_steps = {*expressions}, False
+    pending = [*seen]
     quantities, symbols = list[Intermediate](), list[Symbol]()
     while pending:
         node = pending.pop()
+        if node in without:
+            continue
         if isinstance(node, Intermediate):
             quantities.append(node)
         elif isinstance(node, Symbol):
             symbols.append(node)
-        elif not isinstance(node, without):
+        elif not isinstance(node, types):
             has_steps = has_steps or isinstance(node, STEPS)
             new = [argument for argument in node.args if argument not in seen]
             seen.update(new)
@@ -135,9 +140,9 @@ def _contents(definition: Expr, *without: type) -> tuple[tuple[Intermediate, ...
     return tuple(quantities), frozenset(symbols), has_steps
 
 
-def symbols_of(expression: Expr) -> frozenset[Symbol]:
-    """Return the symbols of an expression and of all quantities in it, of each subexpression once."""
-    quantities, symbols, _ = _contents(expression)
+def symbols_of(*expressions: Expr) -> frozenset[Symbol]:
+    """Return the symbols of expressions and of all quantities in them, of each subexpression once."""
+    quantities, symbols, _ = _contents(expressions)
     return symbols.union(*(quantity._free for quantity in quantities))
 
 
@@ -302,18 +307,18 @@ def written_size(expression: Expr) -> int:
     return size(expression)
 
 
-def inner_of(expression: Expr) -> tuple[Intermediate, ...]:
-    """Return the quantities in an expression, without those in their definitions."""
-    return _contents(expression)[0]
+def inner_of(*expressions: Expr, without: Container[Any] = ()) -> tuple[Intermediate, ...]:
+    """Return the quantities in expressions, without those in their definitions."""
+    return _contents(expressions, without=without)[0]
 
 
-def intermediates(*expressions: Expr, without: Container[Intermediate] = ()) -> list[Intermediate]:
+def intermediates(*expressions: Expr, without: Container[Any] = ()) -> list[Intermediate]:
     """Return all quantities in expressions and in their definitions, each after those that it depends on.
 
-    Those of ``without`` are left out, and so are those that occur in their definitions alone.
+    Parts of ``without`` are left out, and so are quantities that occur in these alone.
     """
     seen: set[Intermediate] = set()
-    pending = [node for expression in expressions for node in inner_of(expression)]
+    pending = [*inner_of(*expressions, without=without)]
     while pending:
         node = pending.pop()
         if node not in seen and node not in without:
