@@ -91,7 +91,7 @@ static int solve(const step_data *step, const solver_data *way, real *memory, lo
     status = rattle(step, &way->rattle, *guess ? memory : NULL, data, dp, options, report);
   keep = 0;
   falls_back = status != OK;
-  if (falls_back && way->rattle_alone && (status != LOST_DIGITS || way->is_pilot))
+  if (falls_back && status != LOST_DIGITS && way->rattle_alone)
     return status;
 #endif
   if (status != OK && *guess) {
