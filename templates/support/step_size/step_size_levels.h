@@ -15,8 +15,8 @@ enum {
 #define USED_PART REAL(0.5) /* of the admissible error: predicted error of an increased step */
 #define FEW_POWERS REAL(4.5) /* growth of the error estimate over a factor of two, in powers of 2, for a curve of two
                               * coefficients or one */
-#define LITTLE REAL(0.5) /* of the error with which a step may be two levels larger, or three at a tolerance above
-                          * round-off, where errors vary more: smaller errors are not distinguished */
+#define LITTLE REAL(0.5) /* of the error with which a step may be three levels larger: smaller ones are not
+                          * distinguished */
 #define LAST_STEP REAL(1e-6) /* relative to the step: a step that ends so near t_end ends at t_end */
 #define FIRST_STEP REAL_EPSILON /* of the whole span: first trial step size */
 #ifdef DOUBLE_DOUBLE
@@ -52,7 +52,7 @@ static error_limits limits_of(real tolerance)
   const real most = larger(MATH(pow)(tolerance, 1 / ERROR_POWER), LEAST_UNRESOLVED);
   const real power = (real)LEVELS_PER_BINADE * MATH(log2)(GROWTH);
   const real few = most * USED_PART / GROWTH, fewer = few / GROWTH;
-  return (error_limits){most, few, fewer, LITTLE * (tolerance > REAL_EPSILON ? fewer / GROWTH : fewer),
+  return (error_limits){most, few, fewer, LITTLE * fewer / GROWTH,
       MATH(exp2)(MATH(log2)(most) / (power > FEW_POWERS ? power - 2 : power))};
 }
 

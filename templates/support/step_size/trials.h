@@ -341,17 +341,12 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
 }
 
 /* Compares a trial with two half steps, in momenta too if requested: integrals of its defect where they begin at its
- * curve and end at once. Their equations are solved to the tolerance of the step, which differences are compared with.
- * Returns SPURIOUS_SOLUTION if the half steps have no solution or differ by far more than the motion. */
+ * curve and end at once. Their equations are solved to the tolerance of the step, which differences are compared with. */
 static SELDOM int compare_trial(const trial *now, int momenta, const solver_options *options, real *apart)
 {
   const step_data *step = &now->step;
   solver_options few = *options;
-  real far = 0;
-  VECTORS(halves, 1, step);
-  VECTORS(changes, 1, step);
   VECTORS(first, 1, step);
-  *apart = 0;
   few.tolerance = larger(few.tolerance, now->control->tolerance);
 #ifdef NEWTON_ALONE
   const half_tables *tables = NULL;
@@ -360,13 +355,7 @@ static SELDOM int compare_trial(const trial *now, int momenta, const solver_opti
   const struct predictor_tables_of to_second = {PREDICTOR_SECOND_HALF, NULL, NULL};
   const half_tables of_curve = {&to_first, &to_second}, *tables = by_newton(now) ? NULL : &of_curve;
 #endif
-  const int status = solve_halves(step, step->h, tables, &few, halves, changes, first);
-  if (status != OK)
-    return status > STATUS(SPURIOUS_SOLUTION) ? status : STATUS(SPURIOUS_SOLUTION);
-  *apart = difference(step, step->h, step->q0, now->dq, halves, &far);
-  if (momenta)
-    *apart = larger(*apart, difference(step, step->h, step->p0, now->dp, changes, &far));
-  return *apart <= GROSS_DIFFERENCE ? OK : STATUS(SPURIOUS_SOLUTION);
+  return compare_with_halves(step, step->h, now->dq, momenta ? now->dp : NULL, tables, &few, first, apart);
 }
 
 /* Number of levels, at most `most`, by which the step size may be increased without exceeding the largest one. */
