@@ -341,7 +341,7 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
 }
 
 /* Compares a trial with two half steps, in momenta too if requested: integrals of its defect where they begin at its
- * curve and end at once. Their equations are solved to the tolerance of the step, which differences are compared with. */
+ * curve and end at once. Their equations are solved to the tolerance of the step, as differences count beside it. */
 static SELDOM int compare_trial(const trial *now, int momenta, const solver_options *options, real *apart)
 {
   const step_data *step = &now->step;
@@ -401,8 +401,8 @@ static SELDOM int levels_of_first(const trial *now, real h, real span)
 /* A trial of the search for the first step size. V and A are those of the largest one that is solved: from rest a
  * displacement t^k with k above what the curve represents has a large error relative to itself at any step size, and
  * relative to V and A of a trial a little larger, so that each smaller one would be rejected, too. Where masses grow by
- * e^x in a step the weights of forces, relative to the momentum of an early point, do so, too: a trial of x >> 1 ends far
- * from any motion, and V of it would admit every error. */
+ * e^x in a step the weights of forces, relative to the momentum of an early point, do so, too: a trial of x >> 1 ends
+ * far from any motion, and V of it would admit every error. */
 static inline void try_pilot(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const int inside = now->inside;
@@ -580,7 +580,7 @@ static inline int try_by_newton(run_memory *run, trial *now, const solver_option
 
 #ifdef CONSTRAINED
 /* Ends the search for the first step: trials up to the largest pilot that was solved are steps. Errors grow with the
- * step size, so where that pilot's is inadmissible, shorter ones are tried at once, none between it and a failed one. */
+ * step size, so where that pilot's is inadmissible, shorter ones are tried at once, none between it and a failure. */
 static SELDOM void end_pilots(run_memory *run, trial *now)
 {
   now->pilots_above = now->pilot > 0 ? now->pilot : (real)INFINITY;
@@ -679,9 +679,9 @@ static inline int is_leap(const run_memory *run, const trial *now)
 }
 
 /* Returns 1 if the momenta of a step are compared, too: after a step that was wrong, and where the step size fell by a
- * factor of two or more. Near a singular time or a nonsmooth force the coefficients of the curve do not decay and do not
- * show its error; steps are then so short that the error is in the momenta. Not for Newton's method, whose steps may
- * leave vibrations of stiff systems unresolved. */
+ * factor of two or more. Near a singular time or a nonsmooth force the coefficients of the curve do not decay and do
+ * not show its error; steps are then so short that the error is in the momenta. Not for Newton's method, whose steps
+ * may leave vibrations of stiff systems unresolved. */
 static inline int needs_momenta(const run_memory *run, const trial *now)
 {
   return DOUBTS && !by_newton(now) && (run->steps_to_compare > 0 || now->change <= -LEVELS_PER_BINADE);
@@ -778,8 +778,8 @@ static SELDOM int passes_over_force(const trial *now, real allowed, const solver
 #define PART_OF_TRANSIENT 16 /* ratio of the parts of a step in which its transient is sought */
 #define UNSEEN_PARTS 2 /* successive ones whose differences are rounding: then there is none */
 
-/* Error by the transient at the start of a step: of positions relative to the motion of the step, of momenta relative to
- * their size. Friction at a rate c ends
+/* Error by the transient at the start of a step: of positions relative to the motion of the step, of momenta relative
+ * to their size. Friction at a rate c ends
  * the transient of a start at another velocity, by d, than the slow motion has, within 1/c, and displaces by d/c. Gauss
  * stages of h >> 1/c are those of the slow motion, and a step and its halves differ by only about 12 d/(c^2 h), but
  * parts of about 1/c differ by d/c (Hairer & Wanner, Solving ODEs II, sec. IV.15). So parts of h/16, h/256, .. are
