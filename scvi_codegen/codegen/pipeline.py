@@ -416,7 +416,8 @@ class Sources:
         if not program.quantities.integrates or self.g is not None or self.system.integrands:
             return None
         if program.splitting:
-            return replace(program, splitting=summing_splitting(program.splitting, self.system), acts_along=True)
+            summing = summing_splitting(program.splitting, self.system)
+            return replace(program, splitting=summing, acts_along=True) if summing else None
         if program.fixed_point is None:
             return replace(program, summed=True, acts_along=True)
         shape = discretise(self.system, self.method).shape

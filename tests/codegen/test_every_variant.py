@@ -19,6 +19,8 @@ from scvi_codegen.codegen.pipeline import Sources
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE, Source
 from scvi_codegen.codegen.variants import Acting, Derivatives, Energies, Lanes, NewtonFallback, TangentVectors
 from scvi_codegen.common.errors import ScviCodegenError
+from scvi_codegen.methods import sliding
+from scvi_codegen.systems.contacts.modes import bound_contacts
 
 STEPS = {
     "fixed-point": ("svi:2", "auto"),
@@ -79,9 +81,14 @@ class Case:
         (method, solver), system = STEPS[self.steps], SYSTEMS[self.acts]()
         g = f"1/(2 + {system.coordinates[0].name}**2)" if self.tau else None
         if self.form in SEPARATE:
+            if system.has_contacts and self.form != "two words":
+                system = bound_contacts(sliding(system, method), system.contacts)[0]
             precision = DOUBLE_DOUBLE if self.form == "two words" else "double"
             sources = Sources(system, sc.as_method(method, system), solver, g=g, precision=precision)
-            return sources.variant(self.kind) if self.kind else sources.integrator()[0]
+            if not self.kind:
+                return sources.integrator()[0]
+            sources.program()  # a method that is refused has no further source
+            return sources.variant(self.kind)
         return sc.generate_source(
             system,
             method,
@@ -95,14 +102,26 @@ class Case:
 
 TOUCHING = ("contact", "contact in space", "dry friction")
 REFUSED: tuple[tuple[str, Callable[[Case], bool]], ...] = (
+    ("contacts of 'point' require compile_stepper", lambda of: of.acts in TOUCHING and of.form == "two words"),
     ("not available with contacts", lambda of: of.tau and of.acts in TOUCHING),
-    ("not available with a heat bath", lambda of: of.tau and of.acts == "bath"),
+    (
+        "events require double precision",
+        lambda of: of.form == "embedded single" and (of.acts in TOUCHING or bool(of.kind)),
+    ),
     (
         "does not support the (nonholonomic )?constraints",
         lambda of: of.acts in ("constraint", *TOUCHING) and of.steps not in ("fixed-point", "newton"),
     ),
     ("not explicit|requires a separable system", lambda of: of.acts == "mass" and of.steps in EXPLICIT),
     ("does not support the damping", lambda of: of.acts == "mass" and of.steps in ("collocation", "shooting")),
+    (
+        "not available with a heat bath",
+        lambda of: of.acts == "bath" and (of.tau or of.form in ("embedded single", "two words")),
+    ),
+    (
+        "solver='explicit' requires constant diagonal masses and fixed steps",
+        lambda of: of.form == "two words" and of.steps == "explicit" and (of.tau or of.acts == "rotation"),
+    ),
 )
 """Words of a refusal, and which variants it refuses; the first one that applies is raised."""
 
@@ -113,9 +132,13 @@ def refusal(of: Case) -> str | None:
 
 
 def cases(steps: str, acts: str, form: str) -> Iterator[Case]:
-    """Return those of one combination: in both kinds of time, with each kind of events, or each further source."""
+    """Return those of one combination: in both kinds of time, with each kind of events, or each further source.
+
+    Events of runs in two words are located by an integrator in double: in two words there is no search.
+    """
     kinds: Any = {"two words": [()], "further sources": FURTHER}.get(form) or events_of(acts)
-    return (Case(steps, acts, form, tau, kind) for tau in (False, True) for kind in kinds)
+    times = (False,) if form in SEPARATE and acts in TOUCHING else (False, True)
+    return (Case(steps, acts, form, tau, kind) for tau in times for kind in kinds)
 
 
 def check(sources: Sequence[Source], folder: Path) -> None:

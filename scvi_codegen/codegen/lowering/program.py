@@ -150,12 +150,16 @@ def step_texts(system: MechanicalSystem, method: Method) -> Mapping[str, str]:
     return (rattle_texts(rattle) if rattle else {}) | bath
 
 
-def summing_splitting(splitting: Splitting, system: MechanicalSystem) -> Splitting:
-    """Return a splitting with the kernel of L at rest, whose sum with the kinetic energies is the action of a run."""
+def summing_splitting(splitting: Splitting, system: MechanicalSystem) -> Splitting | None:
+    """Return a splitting with the kernel of L at rest, whose sum with the kinetic energies is the action of a run.
+
+    ``None`` for rotations, whose splitting is of H.
+    """
     split = kinetic_splitting(system)
     assert not isinstance(split, str)  # since there is a splitting
-    assert isinstance(split.system, LagrangianSystem)
     moved = split.system
+    if not isinstance(moved, LagrangianSystem):
+        return None
     value = moved.lagrangian.xreplace(dict.fromkeys(moved.velocities, sympy.S.Zero))
     kernel = system_kernel(moved, "at_rest", (value,), u=moved.coordinates, purpose="L at v = 0, u = q.")
     return replace(splitting, at_rest=kernel)

@@ -33,6 +33,12 @@ static inline void phase_of(lanes angle, lanes *cosine, lanes *sine)
 #endif
 #define OVER(n) (1 / (real)(n)) /* reciprocal of a factorial */
 
+#ifdef __GNUC__
+#define APART __attribute__((noinline)) /* inlined it takes registers from the code of symmetric bodies */
+#else
+#define APART
+#endif
+
 /* Computes cos(x) - 1 and sin(x)/x from x^2, by their series for small x. */
 static inline void half_turn(number x2, number *cosine, number *sine)
 {
@@ -245,10 +251,7 @@ enum { DOUBLINGS = 6 };
  *   (C cn - S U sigma dn,  (S cn dn + C (a_l - a_s) sigma) P_l,  (S dn + C (a_m - a_s) sigma cn) P_m,
  *    S (1 + N sigma^2) P_s):
  * the scalar part depends on the invariants only, the vector part is linear in P, as the motion is reversible. */
-#ifdef __GNUC__
-__attribute__((noinline)) /* inlined it takes registers from the code of symmetric bodies */
-#endif
-static void turn_asymmetric(const free_body *body, real t, const number *restrict Pi, number *restrict g)
+static APART void turn_asymmetric(const free_body *body, real t, const number *restrict Pi, number *restrict g)
 {
   number sorted[3], turned[3];
   cycle(body->m == 0, body->m == 2, Pi, sorted);
