@@ -29,7 +29,7 @@ from sympy import Expr, Symbol
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.representation import counted, summary
 from scvi_codegen.systems.checks.continuity import irregularity
-from scvi_codegen.systems.formulas.expressions import SAMPLES, dot, hessian, samples, sums_to_zero
+from scvi_codegen.systems.formulas.expressions import SAMPLES, dot, gradient, samples, sums_to_zero
 from scvi_codegen.systems.formulas.intermediates import written_out
 from scvi_codegen.systems.formulas.symbols import DOT, inputs_by_name, symbol
 from scvi_codegen.systems.formulas.translation import format_expression
@@ -122,7 +122,9 @@ class FirstOrderSystem(HamiltonianSystem):
 def is_first_order(lagrangian: Expr, velocities: Sequence[Symbol]) -> bool:
     """Return whether L is linear in the velocities, contains some of them, and has several coordinates."""
     occurring = lagrangian.free_symbols & set(velocities)
-    return len(velocities) > 1 and bool(occurring) and not hessian(lagrangian, velocities)
+    if len(velocities) == 1 or not occurring:
+        return False
+    return not any(gradient(momentum, velocities) for momentum in gradient(lagrangian, velocities).values())
 
 
 @dataclass(frozen=True)

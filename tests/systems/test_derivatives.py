@@ -54,3 +54,19 @@ def test_long_lattice_is_fast_and_sparse() -> None:
     with at_most(5_000_000):
         entries = hessian(energy, q)
     assert len(entries) == 257 + 2 * 256
+
+
+def test_equal_products_of_dense_second_derivatives_are_made_once() -> None:
+    velocities = [Symbol(f"v{k}", real=True) for k in range(24)]
+    angles = [Symbol(f"a{k}", real=True) for k in range(24)]
+    rates = [
+        sympy.Add(*(v * f(a) for v, a in zip(velocities[: k + 1], angles, strict=False)))
+        for k in range(24)
+        for f in (cos, sin)
+    ]
+    energy = sympy.Add(*(rate**2 / 2 for rate in rates))
+    with at_most(900_000):  # 1,400,000 if each of the n^3 products is made
+        entries = hessian(energy, velocities)
+    v, w = angles[3], angles[17]
+    assert len(entries) == 24**2
+    assert sympy.expand(entries[3, 17] - 7 * (cos(v) * cos(w) + sin(v) * sin(w))) == 0

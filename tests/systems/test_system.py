@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import pickle
+import warnings
 from itertools import pairwise
 from typing import Any
 
@@ -13,7 +14,8 @@ from notation import lagrange
 from sympy import Rational, Symbol, cos, sin
 from sympy.physics.mechanics import LagrangesMethod, dynamicsymbols
 
-from scvi_codegen import ExpressionError, LagrangianSystem, SystemDefinitionError
+from scvi_codegen import ExpressionError, LagrangianSystem, SystemDefinitionError, SystemDefinitionWarning
+from scvi_codegen.systems.checks import definition
 from scvi_codegen.systems.derived_expressions import curve_rates, forms_of
 
 T = dynamicsymbols._t
@@ -284,6 +286,17 @@ def test_large_coupled_mass_matrix_is_accepted() -> None:
     with pytest.raises(SystemDefinitionError, match="singular"):
         from_text(" ".join(names), coupled)
     assert from_text(" ".join(names), coupled + " + x0_dot**2").dimension == 40
+
+
+def test_products_of_many_velocities_name_the_better_statement(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(definition, "MOST_PRODUCTS", 8)
+    names = ["a", "b", "c", "d"]
+    with pytest.warns(SystemDefinitionWarning, match=r"couples 10 pairs of velocities.*from_mjcf.*q\[N\].*constraints"):
+        from_text(" ".join(names), "(a_dot + b_dot + c_dot + d_dot)**2 + a_dot**2 + b_dot**2 + c_dot**2")
+    neighbours = " + ".join(f"({a}_dot - {b}_dot)**2" for a, b in pairwise(names))  # 7 entries of the lower triangle
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        from_text(" ".join(names), f"{neighbours} + a_dot**2")
 
 
 @pytest.mark.second

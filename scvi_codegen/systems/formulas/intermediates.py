@@ -197,6 +197,8 @@ def total(terms: Iterable[Expr]) -> Expr:
     (True, 3*x)
     """
     terms = [term for term in terms if term is not S.Zero]
+    if len(terms) == 1:
+        return terms[0]
     alike = {_factors_of(term)[1] for term in terms}
     numbers = tuple(term for term in terms if isinstance(term, Rational))
     written = all(term.is_Mul or isinstance(term, (*_FACTORS, Rational)) for term in terms)
