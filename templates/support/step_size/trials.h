@@ -816,7 +816,7 @@ static SELDOM real transient_error(const trial *now, const solver_options *optio
 static SELDOM int compare_step(run_memory *run, trial *now, int steps_to_compare, const solver_options *options,
     solver_report *report)
 {
-  int examined = steps_to_compare || is_leap(run, now) ? MOST_EXAMINED : 0;
+  int examined = run->steps_to_compare > 0 || is_leap(run, now) ? MOST_EXAMINED : 0;
   const int begins = run->error_before == 0;
   const real tolerance = larger(MATH(pow)(now->limits.most, ERROR_POWER), ROUNDOFF_LEVEL);
   const real allowed = larger(
