@@ -13,6 +13,7 @@
 #define MANY_ITERATIONS 10 /* of a step, after which the next one is not larger */
 #define TOO_MANY_ITERATIONS 13 /* the next one is smaller: about ten iterations take the least time per unit of time */
 #define TRUSTED_DECREASE (ONE_COEFFICIENT ? REAL(0.97) : 0) /* of the error by a step */
+#define SMALL_PART REAL(0.1) /* of the largest momentum: smaller changes count as little */
 #define NEVER_FAILED (1 << 16) /* level beyond all exponents of a number: the iteration failed at no size yet */
 #define SHORT_PART REAL(0.125) /* of the time in which a state changes by its size, or of the span: early trial */
 #ifdef COSTLY_POINTS
@@ -338,6 +339,14 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
 #ifdef RATTLE
   now->fallbacks = report->fallback_steps - now->fallbacks;
 #endif
+}
+
+/* Returns 1 if the momenta change by a small part of the largest one, as they do where nonsmooth forces shorten a
+ * step. */
+static SELDOM int changes_little(const trial *now)
+{
+  real size;
+  return largest_change(&now->step, now->at.p, now->dp, &size) < SMALL_PART * size;
 }
 
 /* Compares a trial with two half steps, in momenta too if requested: integrals of its defect where they begin at its
@@ -679,12 +688,13 @@ static inline int is_leap(const run_memory *run, const trial *now)
 }
 
 /* Returns 1 if the momenta of a step are compared, too: after a step that was wrong, and where the step size fell by a
- * factor of two or more. Near a singular time or a nonsmooth force the coefficients of the curve do not decay and do
- * not show its error; steps are then so short that the error is in the momenta. Not for Newton's method, whose steps
- * may leave vibrations of stiff systems unresolved. */
+ * factor of two or more although the momenta change little. Near a singular time or a nonsmooth force the coefficients
+ * of the curve do not decay and do not show its error; steps are then so short that the error is in the momenta. Not
+ * for Newton's method, whose steps may leave vibrations of stiff systems unresolved. */
 static inline int needs_momenta(const run_memory *run, const trial *now)
 {
-  return DOUBTS && !by_newton(now) && (run->steps_to_compare > 0 || now->change <= -LEVELS_PER_BINADE);
+  const int shorter = now->change <= -LEVELS_PER_BINADE;
+  return DOUBTS && !by_newton(now) && (run->steps_to_compare > 0 || (shorter && changes_little(now)));
 }
 
 /* Solves a part of a step without a predictor, and adds its increments. */
