@@ -45,7 +45,7 @@ REDUNDANT = (
 SAMPLES = 16
 """Number of random positive values of the parameters at which a negative coefficient is evaluated again."""
 MOST_PRODUCTS = 100 * 101 // 2
-"""Products of velocities of a chain of 100 angles, whose stepper is made in 45 s of a processor; 10^5 operations."""
+"""Products of velocities of a chain of 100 angles, whose stepper takes 37 s of a processor, and 146,000 operations."""
 
 
 def warn_of_mistakes(system: MechanicalSystem, others: Iterable[Expr] = ()) -> bool:
