@@ -330,8 +330,8 @@ class Runs:
             return False
         rounding = roundoff(1) * max(1.0, max(abs(start), abs(end)) / abs(end - start))  # also of times
         bound = max(PART_OF_ERROR * self.requested, ROUNDINGS * rounding)
-        entries = relative(apart, run.error.sizes)[:, None]
-        leave_out_rounding(run, apart[:, None], entries)
+        entries = relative(apart, run.error.sizes)[..., None]
+        leave_out_rounding(run, apart[..., None], entries)
         if entries.max() <= bound:
             return False
         self.largest = size

@@ -8,7 +8,7 @@ is the error of x_{k+1}, up to terms of the order of delta^2 and the error of ph
 Solving Ordinary Differential Equations I, II.4; R. D. Skeel, Thirteen ways to estimate global error, Numer. Math. 48
 (1986) 1-20). It holds for any sequence of states: phi is one step where all states are saved, else a run at round-off
 from one state to the next, over events, so that no interval ends at one. Further vectors rho transport samples of
-the rounding errors of the states, u |x| times a normal number for each step of the run.
+the rounding errors of the states, u |x| with a random sign for each step of the run.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -24,12 +23,12 @@ from numpy.typing import NDArray
 
 from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError
 from scvi_codegen.runs.accuracy.size import (
-    Motion,
     first_of_groups,
     momenta_of_velocities,
     neighbouring,
     relative,
     roundoff,
+    sizes_of_motion,
 )
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runs.results.dense_output import parameters_set_until
@@ -207,10 +206,9 @@ def error_of(run: Any) -> RunError:
     finer = finer.with_events(stepper.events if stepper.changes_states else ())
     vectors, reason = _Replay(run, finer).of_run()
     m = stepper.dimension
-    columns = [np.ascontiguousarray(part) for part in (vectors[:, 0, :m], vectors[:, 0, m:])]
-    deviations = np.sqrt(np.mean(vectors[:, 1:] ** 2, axis=1))
-    rounding = [deviations[:, :m], deviations[:, m:]]
-    return _described(run, columns, rounding, reason=reason)
+    deviations = np.sqrt(np.mean(vectors[1:] ** 2, axis=0))
+    errors, rounding = ([of[:m].T, of[m:].T] for of in (vectors[0], deviations))
+    return _described(run, errors, rounding, reason=reason)
 
 
 def finer_of(stepper: Any) -> Any:
@@ -254,34 +252,34 @@ def _described(run: Any, errors: list[Array], rounding: list[Array], **others: A
 
 def relative_until(error: RunError, rows: int) -> tuple[Array, Array]:
     """Return (2, m) sizes of the motion in the first ``rows`` states and (rows,) running maxima of relative errors."""
-    bounds = np.array([part[:rows] for part in error.bounds])
-    is_known = np.isfinite(bounds).all(axis=(0, 2))
-    with np.errstate(all="ignore"):
-        bounds = np.where(is_known[:, None], bounds, 0.0)
-        sizes = sizes_of(error._run, rows, bounds.max(axis=1))
-        entries = relative(bounds, sizes[:, None])
-        leave_out_rounding(error._run, bounds, entries)
-        parts = entries.max(axis=(0, 2))
+    bounds = np.array([part[:rows].T for part in error.bounds])
+    is_known = np.isfinite(bounds.sum(axis=(0, 1)))
+    if not is_known.all():
+        bounds = np.where(is_known, bounds, 0.0)
+    sizes = sizes_of(error._run, rows, bounds.max(axis=2))
+    entries = relative(bounds, sizes[:, :, None])
+    leave_out_rounding(error._run, bounds, entries)
+    parts = entries.max(axis=(0, 1))
     if error.reason:  # unknown from the last known state on
         parts[np.count_nonzero(np.cumsum(is_known[::-1])[::-1]) :] = np.inf
     return sizes, np.asarray(np.maximum.accumulate(parts))
 
 
 def leave_out_rounding(run: Any, bounds: Array, entries: Array) -> None:
-    """Set relative errors (2, n, m) to 0 of coordinates that constraints determine, where they are those of rounding.
+    """Set relative errors (2, m, n) to 0 of coordinates that constraints determine, where they are those of rounding.
 
     The height of a rod that swings by 1e-7 has no digits, as the constraint gives it up to rounding.
     """
     if not run.stepper.interface.constraints:
         return
     epsilon = roundoff(run.stepper.interface.words)
-    tiny = bounds[0] <= ROUNDINGS * epsilon * np.abs(np.asarray(run.q)[: bounds.shape[1]])
+    tiny = bounds[0] <= ROUNDINGS * epsilon * np.abs(np.asarray(run.q)[: bounds.shape[2]].T)
     largest = np.where(tiny, 0.0, entries).max(initial=0.0)
-    for k in np.flatnonzero((np.where(tiny, entries, 0.0) > largest).any(axis=(0, 2))).tolist():
-        determined = np.zeros(tiny.shape[1], bool)
+    for k in np.flatnonzero((np.where(tiny, entries, 0.0) > largest).any(axis=(0, 1))).tolist():
+        determined = np.zeros(tiny.shape[0], bool)
         q, t = np.asarray(run.q[k]), float(run.t[k])
         determined[determined_coordinates(run.stepper, q, t, parameters_on_sides(run, t))] = True
-        entries[:, k, tiny[k] & determined] = 0.0
+        entries[:, tiny[:, k] & determined, k] = 0.0
 
 
 def sizes_of(run: Any, rows: int, errors: Array) -> Array:
@@ -291,9 +289,9 @@ def sizes_of(run: Any, rows: int, errors: Array) -> Array:
     if isinstance(plan, Adaptive) and plan.absolute_tolerance != ():
         absolute = absolute_tolerances(interface, m, plan.absolute_tolerance)
     t, q, p = (np.asarray(column)[:rows] for column in (run.t, run.q, run.p))
-    motion = Motion(t, q, p, first_of_groups(interface, m), roundoff(interface.words), absolute)
-    kinetic = momenta_of_velocities(run.stepper, t, q, p, run.parameters).max(axis=0)
-    return motion.sizes(float(t[-1]), errors, kinetic)
+    kinetic = momenta_of_velocities(run.stepper, t, q, p, run.parameters)
+    q, p = (np.ascontiguousarray(column.T) for column in (q, p))
+    return sizes_of_motion(q, p, errors, kinetic, first_of_groups(interface, m), roundoff(interface.words), absolute)
 
 
 class _Replay:
@@ -310,20 +308,20 @@ class _Replay:
         self.now = np.zeros((1 + SAMPLES, 2 * self.m))
 
     def of_run(self) -> tuple[Array, str]:
-        """Return (n, 1 + samples, 2m) errors and rounding errors, NaN where unknown, and the reason for that."""
-        first, result = 0, np.full((len(self.run), *self.now.shape), np.nan)
+        """Return (1 + samples, 2m, n) errors and rounding errors, NaN where unknown, and the reason for that."""
+        first, result = 0, np.full((*self.now.shape, len(self.run)), np.nan)
         initial = getattr(self.run, "_initial", None)
         try:
             if initial is not None:  # t_eval without the initial time
                 t, q, p = initial
                 self._by_run(self.run, t, q, p, 0, steps=self._steps_between(self.run))
-            result[0] = self.now
+            result[..., 0] = self.now
             for piece in self.run._runs:
                 for row, vectors in self._along(piece):
-                    result[first:][row] = vectors
+                    result[..., first:][..., row] = vectors
                 first += len(piece) - 1
         except (ScviCodegenError, FloatingPointError) as failure:
-            known = int(np.count_nonzero(np.isfinite(result[:, 0, 0])))
+            known = int(np.count_nonzero(np.isfinite(result[0, 0])))
             lost = known and not np.abs(self.now[0]).max() <= np.abs(self._state(self.run, slice(None))).max()
             return result, f"errors are lost: {failure}" if lost else str(failure)
         return result, ""
@@ -340,7 +338,7 @@ class _Replay:
                 ahead = np.flatnonzero(~single[first : first + MOST_STEPS])
                 last = first + int(ahead[0]) if len(ahead) else min(first + MOST_STEPS, len(rows) - 1)
                 begin, end = int(rows[first]), int(rows[last])
-                yield slice(begin + 1, end + 1), self._by_steps(piece, begin, end)
+                yield slice(begin + 1, end + 1), self._by_steps(piece, begin, end).transpose(1, 2, 0)
             else:
                 begin, end = int(rows[first]), int(rows[last])
                 start = float(piece.t[begin]), piece.q[begin], piece.p[begin]
@@ -379,12 +377,11 @@ class _Replay:
         states = [np.ascontiguousarray(np.asarray(column)[rows]) for column in (q, p)]
         vectors = np.zeros((n + 1, 1 + SAMPLES, self.finer._input_size))
         vectors[0, :, : 2 * m] = self.now
-        here = vectors[1:, :, : 2 * m]
-        here[:, 1:] = self._rounding(n, steps) * np.abs(np.concatenate(states, axis=1)[1:, None])
+        self.calls += 1
         starts = Starts(np.ascontiguousarray(t), np.ascontiguousarray(h), states[0], states[1])
-        self.finer._transport_errors(starts, vectors, parameters)
+        self.finer._transport_errors(starts, vectors, parameters, math.sqrt(steps) * self.u, self.calls)
         self.now = vectors[-1, :, : 2 * m].copy()
-        return here
+        return vectors[1:, :, : 2 * m]
 
     def _by_run(self, piece: Any, t: float, q: Array, p: Array, end: int, *, steps: float) -> None:
         """Transport the errors to a row by a run of the finer method at round-off, over the events in between."""
@@ -396,7 +393,9 @@ class _Replay:
         fine = run._recorded(None, ALL_STATES)
         if len(times_of_changes(fine)) or (fine.modes is not None and len(fine.modes.t)):
             self.now = fine.tangent(self.now.T)[-1].T
-            self.now[1:] += self._rounding(1, steps)[0] * np.abs(self._state(piece, end))
+            self.calls += 1
+            normal = np.random.default_rng(self.calls).standard_normal((SAMPLES, 2 * self.m))
+            self.now[1:] += math.sqrt(steps) * self.u * normal * np.abs(self._state(piece, end))
         else:
             h, sides = np.diff(fine.t), parameters_on_sides(fine, t)
             for k in range(0, len(h), MOST_STEPS):
@@ -405,19 +404,9 @@ class _Replay:
                 self._transport(fine.t[rows][:-1], own, fine.q, fine.p, rows, sides, steps / len(h))
         self.now[0] += self._state(piece, end) - self._state(fine, -1)
 
-    def _rounding(self, rows: int, steps: float) -> Array:
-        """Return (rows, samples, 2m) rounding errors relative to the states, each of so many steps."""
-        self.calls += 1
-        return _normal_numbers(self.calls, rows, 2 * self.m) * (math.sqrt(steps) * self.u)
-
     @staticmethod
     def _state(states: Any, k: Any) -> Array:
         return np.concatenate([np.asarray(states.q)[k], np.asarray(states.p)[k]], axis=-1)
-
-
-@lru_cache(maxsize=16)
-def _normal_numbers(seed: int, rows: int, columns: int) -> Array:
-    return np.random.default_rng(seed).standard_normal((rows, SAMPLES, columns))
 
 
 def _rows_between(states: Any, special: Array) -> NDArray[np.intp]:

@@ -46,55 +46,42 @@ def first_of_groups(interface: Interface, dimension: int) -> NDArray[np.intp]:
     return firsts.astype(np.intp)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Motion:
-    """States of a run that its size is derived from.
+def sizes_of_motion(
+    q: Array, p: Array, errors: Array, kinetic: Array, firsts: NDArray[np.intp], epsilon: float, absolute: Array | float
+) -> Array:
+    """Return (2, m) sizes of positions and momenta of (m, n) states.
 
-    Attributes:
-        t: (n,) times, in the direction of the run.
-        q, p: (n, m) positions and momenta.
+    Positions: max(range, absolute); of a coordinate that is at rest, up to rounding, its largest value. Momenta: the
+    range, at least ``kinetic`` (m,), those of velocities, times the ratio of the size to the range of their coordinate,
+    or the least one. Of those that consist of rounding errors of others, by which ``errors`` (2, m) are as large, both
+    are the largest one.
+
+    Args:
+        q, p, errors, kinetic: as above.
         firsts: as of :func:`first_of_groups`.
-        absolute: sizes below which errors do not matter, one number or (m,).
         epsilon: largest relative rounding error.
+        absolute: sizes below which errors do not matter, one number or (m,).
     """
 
-    t: Array
-    q: Array
-    p: Array
-    firsts: NDArray[np.intp]
-    epsilon: float
-    absolute: Array | float = 0.0
-
-    def sizes(self, until: float, errors: Array, kinetic: Array | float = 0.0) -> Array:
-        """Return (2, m) sizes of positions and momenta up to a time.
-
-        Positions: max(range, absolute); of a coordinate that is at rest, up to rounding, its largest value. Momenta:
-        the range, at least ``kinetic`` (m,), those of velocities, times the ratio of the size to the range of their
-        coordinate, or the least one. Of those that consist of rounding errors of others, by which ``errors`` (2, m) are
-        as large, both are the largest one.
-        """
-        rows = slice(max(1, np.count_nonzero(abs(self.t - self.t[0]) <= abs(until - self.t[0]))))
-        q, p = np.asarray(self.q)[rows], np.asarray(self.p)[rows]
-        ranges, largest = self._of_groups(np.ptp(q, axis=0)), self._of_groups(np.abs(q).max(axis=0))
-        momenta = self._of_groups(np.maximum(np.ptp(p, axis=0), kinetic))
-        resolution = RESOLVED * self.epsilon
-        rest = ranges <= resolution * largest
-        noise = _is_noise(ranges, errors[0], resolution)
-        sizes = np.where(noise, ranges.max(initial=0.0), np.where(rest, np.maximum(ranges, largest), ranges))
-        sizes = np.maximum(sizes, self.absolute)
-        with np.errstate(all="ignore"):
-            ratio = np.maximum(1.0, sizes / ranges)
-            least = np.fmin.reduce(ratio, initial=1.0 / self.epsilon)  # NaN: of 0 by 0
-            noise_of_p = _is_noise(momenta, errors[1], NOISE_OF_MOMENTA * resolution)
-            of_p = np.where(noise_of_p, momenta.max(initial=0.0), momenta) * np.where(rest | noise, least, ratio)
-        return np.array([sizes, of_p])
-
-    def _of_groups(self, values: Array) -> Array:
-        """Return the largest value of the group of each coordinate."""
-        if len(self.firsts) == len(values):
+    def of_groups(values: Array) -> Array:
+        if len(firsts) == len(values):
             return values
-        counts = np.diff(self.firsts, append=len(values))
-        return np.asarray(np.repeat(np.maximum.reduceat(values, self.firsts), counts))
+        return np.asarray(np.repeat(np.maximum.reduceat(values, firsts), np.diff(firsts, append=len(values))))
+
+    least_q, most_q = q.min(axis=1), q.max(axis=1)
+    ranges, largest = of_groups(most_q - least_q), of_groups(np.maximum(most_q, -least_q))
+    momenta = of_groups(np.maximum(np.ptp(p, axis=1), kinetic))
+    resolution = RESOLVED * epsilon
+    rest = ranges <= resolution * largest
+    noise = _is_noise(ranges, errors[0], resolution)
+    sizes = np.where(noise, ranges.max(initial=0.0), np.where(rest, np.maximum(ranges, largest), ranges))
+    sizes = np.maximum(sizes, absolute)
+    with np.errstate(all="ignore"):
+        ratio = np.maximum(1.0, sizes / ranges)
+        least = np.fmin.reduce(ratio, initial=1.0 / epsilon)  # NaN: of 0 by 0
+        noise_of_p = _is_noise(momenta, errors[1], NOISE_OF_MOMENTA * resolution)
+        of_p = np.where(noise_of_p, momenta.max(initial=0.0), momenta) * np.where(rest | noise, least, ratio)
+    return np.array([sizes, of_p])
 
 
 def _is_noise(sizes: Array, errors: Array, resolution: float) -> NDArray[np.bool_]:
@@ -103,13 +90,13 @@ def _is_noise(sizes: Array, errors: Array, resolution: float) -> NDArray[np.bool
 
 
 def momenta_of_velocities(stepper: Any, t: Array, q: Array, p: Array, parameters: Array) -> Array:
-    """Return (n, m) absolute p(q, v) - p(q, 0) of ``SAMPLES`` states, 0 of the others; |p| if that is undefined.
+    """Return (m,) largest absolute p(q, v) - p(q, 0) of ``SAMPLES`` states; |p| if that is undefined.
 
     Those without velocity, of a vector potential, depend on its gauge.
     """
-    kinetic, rows = np.zeros(np.shape(p)), slice(None, None, -(-len(t) // SAMPLES))
-    kinetic[rows] = np.abs(np.asarray(p[rows]) - _momenta_at_rest(stepper, t[rows], q[rows], parameters))
-    return kinetic
+    rows = slice(None, None, -(-len(t) // SAMPLES))
+    kinetic = np.asarray(p[rows]) - _momenta_at_rest(stepper, t[rows], q[rows], parameters)
+    return np.asarray(np.abs(kinetic).max(axis=0))
 
 
 def _momenta_at_rest(stepper: Any, t: Array, q: Array, parameters: Array) -> Array | float:

@@ -291,7 +291,7 @@ class LinearisedMethod(StateFunctions):
             raise step_failure(status, report, step=failed, h=float(starts.h[failed]))
         return q1, p1
 
-    def _transport_errors(self, starts: Starts, vectors: Array, parameters: Array) -> None:
+    def _transport_errors(self, starts: Starts, vectors: Array, parameters: Array, rounding: float, seed: int) -> None:
         """Transport global errors, and further tangent vectors, along the saved states of another run, in place.
 
         Args:
@@ -299,6 +299,8 @@ class LinearisedMethod(StateFunctions):
             vectors: (n + 1, count, 2m + k + 2) as of :meth:`_propagate`; the first one of each row is the error, to
                 which the difference of the state from the end of this step is added.
             parameters: as of :meth:`_propagate`.
+            rounding: rounding errors relative to the states, which further vectors receive with random signs.
+            seed: of the signs.
         """
         binding = self.tangent
         report, work = binding.new("report *"), np.empty((2, len(starts.h), self.dimension))
@@ -307,6 +309,8 @@ class LinearisedMethod(StateFunctions):
             *map(binding.pointer, (starts.t, starts.h, starts.q, starts.p, parameters)),
             binding.options(None),
             vectors.shape[1],
+            rounding,
+            seed,
             *map(binding.pointer, (vectors, *work)),
             report,
             binding.workspace(),

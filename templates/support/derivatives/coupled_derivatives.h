@@ -69,78 +69,95 @@ static __attribute__((noinline)) void linearise_points(const step_data *step, co
 
 /* Computes the variations of positions from those of velocities v and from x0 (back: adjoints of forces from those of
  * momenta), then the terms f and part of p that follow from both. */
-static inline void vary_positions(iterated_step *at, int back, lanes (*x0)[M], lanes (*v)[M], lanes (*f)[2 * M])
+static inline void vary_positions(iterated_step *at, int back, int count, lanes (*x0)[GROUPS][M],
+    lanes (*v)[GROUPS][M], lanes (*x)[GROUPS][M], lanes (*f)[GROUPS][2 * M])
 {
   const step_data *step = at->step;
   const lanes *table = back ? CHANGE_MOMENTUM_BACK : CHANGE_POSITION;
-  for (int n = 0; n < GROUPS; n++) {
-    for (int i = 0; i < M; i++)
-      at->u[n][i] = x0[n][i] + step->h * apply(table, n, v, i);
-    memcpy(at->u[n] + M, v[n], sizeof v[n]);
-    (back ? TRANSPOSED_PRODUCT : derivative_product)(at->u[n], lanes_of(step->t), step->parameters, f[n]);
-  }
+  for (int j = 0; j < count; j++)
+    for (int n = 0; n < GROUPS; n++) {
+      for (int i = 0; i < M; i++)
+        at->u[n][i] = x[j][n][i] = x0[j][n][i] + step->h * apply(table, n, v[j], i);
+      memcpy(at->u[n] + M, v[j][n], sizeof v[j][n]);
+      (back ? TRANSPOSED_PRODUCT : derivative_product)(at->u[n], lanes_of(step->t), step->parameters, f[j][n]);
+    }
 }
 
-/* Solves for f and v from the initial terms x0 and p0 (back: z and w from y0 and v0); leaves x and v (y and w) in u,
- * and f. The change is measured in the metric of the mass matrices, independent of the units of the coordinates. */
-static inline int solve_vectors(iterated_step *at, int back, lanes (*x0)[M], lanes (*p0)[M], lanes (*f)[2 * M],
-    int *look)
+/* Solves for some f, x and v from the initial terms x0 and p0 (back: z, y and w from y0 and v0) together. Changes are
+ * measured in the metric of the mass matrices, independent of the units of the coordinates. */
+static inline __attribute__((always_inline)) int solve_vectors(iterated_step *at, int back, int count,
+    lanes (*x0)[GROUPS][M], lanes (*p0)[GROUPS][M], lanes (*x)[GROUPS][M], lanes (*v)[GROUPS][M],
+    lanes (*f)[GROUPS][2 * M], int *look)
 {
   const lanes *table = back ? CHANGE_POSITION_BACK : CHANGE_MOMENTUM;
-  lanes v[GROUPS][M], F[GROUPS][M], p[GROUPS][M];
+  lanes p[VECTORS_AT_ONCE][GROUPS][M];
   vector_changes past = {INFINITY, INFINITY, at->accepted};
   int status = 0;
-  memset(v, 0, sizeof v);
-  memset(p, 0, sizeof p);
-  vary_positions(at, back, x0, v, f);
+  memset(v, 0, sizeof *v * (size_t)count);
+  memset(p, 0, sizeof *p * (size_t)count);
+  vary_positions(at, back, count, x0, v, x, f);
   for (int k = 0; status == 0; k++) {
-    lanes moved[GROUPS], size[GROUPS];
-    for (int n = 0; n < GROUPS; n++)
-      memcpy(F[n], f[n], sizeof F[n]);
-    for (int n = 0; n < GROUPS; n++) {
-      lanes next[M], before[M];
-      moved[n] = size[n] = lanes_of(0.0);
-      memcpy(before, p[n], sizeof before);
-      for (int i = 0; i < M; i++)
-        next[i] = p[n][i] = p0[n][i] + at->step->h * apply(table, n, F, i) + f[n][M + i];
-      solve_mass(at->mass[n], next);
-      for (int i = 0; i < M; i++) {
-        moved[n] += (p[n][i] - before[i]) * (next[i] - v[n][i]);
-        size[n] += p[n][i] * next[i];
-        v[n][i] = next[i];
+    double largest[2] = {0.0, 0.0};
+    for (int j = 0; j < count; j++) {
+      lanes moved[GROUPS], size[GROUPS], F[GROUPS][M];
+      for (int n = 0; n < GROUPS; n++)
+        memcpy(F[n], f[j][n], sizeof F[n]);
+      for (int n = 0; n < GROUPS; n++) {
+        lanes next[M], before[M];
+        moved[n] = size[n] = lanes_of(0.0);
+        memcpy(before, p[j][n], sizeof before);
+        for (int i = 0; i < M; i++)
+          next[i] = p[j][n][i] = p0[j][n][i] + at->step->h * apply(table, n, F, i) + f[j][n][M + i];
+        solve_mass(at->mass[n], next);
+        for (int i = 0; i < M; i++) {
+          moved[n] += (p[j][n][i] - before[i]) * (next[i] - v[j][n][i]);
+          size[n] += p[j][n][i] * next[i];
+          v[j][n][i] = next[i];
+        }
       }
+      if (k >= *look)
+        keep_largest(fabs(points_total(moved)), fabs(points_total(size)), largest);
     }
     if (k >= *look)
-      status = vectors_status(fabs(points_total(moved)), fabs(points_total(size)), &past, k, look);
-    vary_positions(at, back, x0, v, f);
+      status = vectors_status(largest[0], largest[1], &past, k, look);
+    vary_positions(at, back, count, x0, v, x, f);
   }
   return status == 1 ? OK : NOT_CONVERGED;
 }
 
 /* Replaces v, variations of (q0, p0, parameters, t, h), by those of (q1, p1, parameters, t + h, h) (JVP). */
-static __attribute__((noinline)) int jvp_by_iteration(iterated_step *at, double *v, int *look)
+static inline __attribute__((always_inline)) int vary_step(iterated_step *at, int count, double (*v)[STEP_INPUTS],
+    int *look)
 {
-  const double h = at->step->h, dh = v[INPUT_T + 1] / h;
-  lanes given[GROUPS][2 * M], x0[GROUPS][M], p0[GROUPS][M], f[GROUPS][2 * M], F[GROUPS][M];
-  vary_by_inputs(at->given, v, given[0], 2 * M);
-  for (int n = 0; n < GROUPS; n++)
-    memcpy(F[n], given[n], sizeof F[n]);
-  for (int n = 0; n < GROUPS; n++)
-    for (int i = 0; i < M; i++) {
-      x0[n][i] = v[i] + dh * at->D[n][i];
-      p0[n][i] = v[M + i] + dh * at->E[n][i] + h * apply(CHANGE_MOMENTUM, n, F, i) + given[n][M + i];
-    }
-  TRY(solve_vectors(at, 0, x0, p0, f, look));
-  for (int i = 0; i < M; i++) {
-    lanes moved[GROUPS], pushed[GROUPS];
-    for (int n = 0; n < GROUPS; n++) {
-      moved[n] = at->end_position[n] * at->u[n][M + i];
-      pushed[n] = at->end_momentum[n] * (f[n][i] + given[n][i]);
-    }
-    v[i] += dh * at->dq[i] + points_total(moved);
-    v[M + i] += dh * at->dp[i] + points_total(pushed);
+  const double h = at->step->h;
+  lanes given[VECTORS_AT_ONCE][GROUPS][2 * M], x0[VECTORS_AT_ONCE][GROUPS][M], p0[VECTORS_AT_ONCE][GROUPS][M],
+      x[VECTORS_AT_ONCE][GROUPS][M], velocity[VECTORS_AT_ONCE][GROUPS][M], f[VECTORS_AT_ONCE][GROUPS][2 * M];
+  for (int j = 0; j < count; j++) {
+    const double dh = v[j][INPUT_T + 1] / h;
+    lanes F[GROUPS][M];
+    vary_by_inputs(at->given, v[j], given[j][0], 2 * M);
+    for (int n = 0; n < GROUPS; n++)
+      memcpy(F[n], given[j][n], sizeof F[n]);
+    for (int n = 0; n < GROUPS; n++)
+      for (int i = 0; i < M; i++) {
+        x0[j][n][i] = v[j][i] + dh * at->D[n][i];
+        p0[j][n][i] = v[j][M + i] + dh * at->E[n][i] + h * apply(CHANGE_MOMENTUM, n, F, i) + given[j][n][M + i];
+      }
   }
-  v[INPUT_T] += v[INPUT_T + 1];
+  TRY(solve_vectors(at, 0, count, x0, p0, x, velocity, f, look));
+  for (int j = 0; j < count; j++) {
+    const double dh = v[j][INPUT_T + 1] / h;
+    for (int i = 0; i < M; i++) {
+      lanes moved[GROUPS], pushed[GROUPS];
+      for (int n = 0; n < GROUPS; n++) {
+        moved[n] = at->end_position[n] * velocity[j][n][i];
+        pushed[n] = at->end_momentum[n] * (f[j][n][i] + given[j][n][i]);
+      }
+      v[j][i] += dh * at->dq[i] + points_total(moved);
+      v[j][M + i] += dh * at->dp[i] + points_total(pushed);
+    }
+    v[j][INPUT_T] += v[j][INPUT_T + 1];
+  }
   return OK;
 }
 
@@ -148,21 +165,21 @@ static __attribute__((noinline)) int jvp_by_iteration(iterated_step *at, double 
 static __attribute__((noinline)) int vjp_by_iteration(iterated_step *at, double *v, int *look)
 {
   double by_h = 0.0;
-  lanes y0[GROUPS][M], v0[GROUPS][M], z[GROUPS][2 * M];
+  lanes y0[1][GROUPS][M], v0[1][GROUPS][M], y[1][GROUPS][M], w[1][GROUPS][M], z[1][GROUPS][2 * M];
   for (int n = 0; n < GROUPS; n++)
     for (int i = 0; i < M; i++) {
-      y0[n][i] = at->end_momentum[n] * v[M + i];
-      v0[n][i] = at->end_position[n] * v[i];
+      y0[0][n][i] = at->end_momentum[n] * v[M + i];
+      v0[0][n][i] = at->end_position[n] * v[i];
     }
-  TRY(solve_vectors(at, 1, y0, v0, z, look));
+  TRY(solve_vectors(at, 1, 1, y0, v0, y, w, z, look));
   v[INPUT_T + 1] += v[INPUT_T];
   add_input_gradient(at->given, at->u[0], 2 * M + POINT_DERIVATIVES, v);
   for (int i = 0; i < M; i++) {
     lanes placed[GROUPS], pushed[GROUPS], grown[GROUPS];
     for (int n = 0; n < GROUPS; n++) {
-      placed[n] = z[n][i];
-      pushed[n] = at->u[n][M + i];
-      grown[n] = z[n][i] * at->D[n][i] + at->u[n][M + i] * at->E[n][i];
+      placed[n] = z[0][n][i];
+      pushed[n] = w[0][n][i];
+      grown[n] = z[0][n][i] * at->D[n][i] + w[0][n][i] * at->E[n][i];
     }
     by_h += v[i] * at->dq[i] + v[M + i] * at->dp[i] + points_total(grown);
     v[i] += points_total(placed);

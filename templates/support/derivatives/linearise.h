@@ -10,6 +10,8 @@ typedef struct {
   int defects; /* whether the first vectors receive the defects of the saved states: q1, p1 are increments then */
   real *vectors, *q1, *p1, *workspace;
   solver_report *report;
+  real rounding; /* relative error of the saved states that the other vectors receive */
+  unsigned long long random;
   long long guess; /* number of previous steps that the predictor uses (fixed-point iteration only) */
   int look, look_at_rounding; /* first iteration of the linearised equations whose convergence is tested */
 } propagation;
@@ -43,6 +45,23 @@ static void add_defect(propagation *over, long long k, int increments)
   }
 }
 
+/* The next number of a linear congruential generator (D. E. Knuth, The Art of Computer Programming 2, 3.3.4). */
+static inline unsigned long long next_random(unsigned long long *x)
+{
+  return *x = 6364136223846793005ULL * *x + 1442695040888963407ULL;
+}
+
+/* Adds rounding errors of x[k + 1] with random signs to all vectors but the first at the end of step k. */
+static void add_rounding(propagation *over, long long k)
+{
+  const real *x[2] = {over->q + (k + 1) * M, over->p + (k + 1) * M};
+  for (int j = 1; j < over->count; j++) {
+    real *to = vectors_at(over, k + 1) + j * STEP_INPUTS;
+    for (int i = 0; i < 2 * M; i++)
+      to[i] += (next_random(&over->random) >> 63 ? over->rounding : -over->rounding) * x[i / M][i % M];
+  }
+}
+
 /* Propagates the vectors from index `first` on over step k. */
 static int vectors_by_newton(propagation *over, long long k, int first)
 {
@@ -61,7 +80,7 @@ static int vectors_by_newton(propagation *over, long long k, int first)
 /* Tangent and adjoint vectors over steps that are solved by fixed-point iteration. Blocks of STEPS_AT_ONCE steps are
  * solved first, each with a predictor from the previous one; then the vectors are propagated, forward or backward.
  * Newton's method takes over where an iteration fails. Requires: iteration, store_step, linearise_points,
- * jvp_by_iteration and vjp_by_iteration, the iteration and its linearisation. */
+ * vary_step and vjp_by_iteration, the iteration and its linearisation. */
 
 static double *stored_of(const propagation *over, long long k)
 {
@@ -101,6 +120,17 @@ static int solve_steps(propagation *over, long long first, long long end)
   return 1;
 }
 
+/* Products of the Jacobian of a step and one vector, or as many as are iterated together. */
+static __attribute__((noinline)) int jvp_by_iteration(iterated_step *at, double *v, int *look)
+{
+  return vary_step(at, 1, (double (*)[STEP_INPUTS])v, look);
+}
+
+static __attribute__((noinline)) int jvps_by_iteration(iterated_step *at, double *v, int *look)
+{
+  return vary_step(at, VECTORS_AT_ONCE, (double (*)[STEP_INPUTS])v, look);
+}
+
 /* Propagates the vectors over a solved step; returns the number propagated before an iteration failed. */
 static int propagate_by_iteration(propagation *over, long long k, const double *kept)
 {
@@ -111,14 +141,16 @@ static int propagate_by_iteration(propagation *over, long long k, const double *
   iterated_step at;
   prepare_iteration(&step, &data);
   linearise_points(&step, &data, kept, &at);
-  for (int j = 0; j < over->count; j++) {
-    double v[STEP_INPUTS];
+  for (int j = 0, own; j < over->count; j += own) {
+    double v[VECTORS_AT_ONCE * STEP_INPUTS];
     int *look = over->defects && j ? &over->look_at_rounding : &over->look;
+    own = over->defects && j && over->count - j >= VECTORS_AT_ONCE ? VECTORS_AT_ONCE : 1;
     at.accepted = over->defects ? LEFT_IN_ERRORS : LEFT_TO_COME;
-    memcpy(v, from + j * STEP_INPUTS, sizeof v);
-    if ((over->back ? vjp_by_iteration : jvp_by_iteration)(&at, v, look) != OK)
+    memcpy(v, from + j * STEP_INPUTS, sizeof(double) * (size_t)(own * STEP_INPUTS));
+    if ((over->back ? vjp_by_iteration : own > 1 ? jvps_by_iteration
+                                                 : jvp_by_iteration)(&at, v, look) != OK)
       return j;
-    for (int i = 0; i < STEP_INPUTS; i++)
+    for (int i = 0; i < own * STEP_INPUTS; i++)
       to[j * STEP_INPUTS + i] += v[i];
   }
   return over->count;
@@ -145,8 +177,10 @@ static int propagate_steps(propagation *over, long long first, long long end)
       status = vectors_by_newton(over, k, carried);
     else if (!all_finite(vectors_at(over, k + !over->back), over->count * STEP_INPUTS))
       status = NOT_FINITE;
-    if (over->defects && status == OK)
+    if (over->defects && status == OK) {
       add_defect(over, k, !by_newton);
+      add_rounding(over, k);
+    }
     over->report->steps += status == OK;
   }
   return status;
@@ -177,11 +211,12 @@ int NAME(linearise)(long long steps, const real *t, const real *h, const real *q
 
 /* Global errors delta[k + 1] = Dphi(x[k]) delta[k] + x[k + 1] - phi(x[k]) of a run by another method from its saved
  * states, transported by the tangent map of that step phi (Hairer, Norsett & Wanner, Solving ODEs I, sec. II.3 and II.4);
- * further vectors are propagated alone. */
+ * further vectors receive rounding errors. */
 int NAME(transport_errors)(long long steps, const real *t, const real *h, const real *q, const real *p,
-    const real *parameters, const solver_options *options, int count, real *vectors, real *q1, real *p1,
-    solver_report *report, real *workspace)
+    const real *parameters, const solver_options *options, int count, double rounding, unsigned long long seed,
+    real *vectors, real *q1, real *p1, solver_report *report, real *workspace)
 {
-  propagation over = {PROPAGATION_OF_ARGUMENTS, .defects = 1, .count = count, .vectors = vectors};
+  propagation over = {PROPAGATION_OF_ARGUMENTS, .defects = 1, .count = count, .rounding = rounding, .random = seed,
+      .vectors = vectors};
   return propagate_blocks(&over, steps);
 }

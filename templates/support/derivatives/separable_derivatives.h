@@ -68,11 +68,14 @@ static __attribute__((noinline)) void linearise_points(const step_data *step, co
 }
 
 /* f = K x; back: K^T x. */
-static inline void apply_derivatives(iterated_step *at, int back, lanes (*f)[M])
+static inline void apply_derivatives(iterated_step *at, int back, int count, lanes (*x)[GROUPS][M], lanes (*f)[GROUPS][M])
 {
   const step_data *step = at->step;
-  for (int n = 0; n < GROUPS; n++)
-    (back ? TRANSPOSED_PRODUCT : derivative_product)(at->u[n], lanes_of(step->t), step->parameters, f[n]);
+  for (int j = 0; j < count; j++)
+    for (int n = 0; n < GROUPS; n++) {
+      memcpy(at->u[n], x[j][n], sizeof x[j][n]);
+      (back ? TRANSPOSED_PRODUCT : derivative_product)(at->u[n], lanes_of(step->t), step->parameters, f[j][n]);
+    }
 }
 
 /* The next iterate of x, whose constant term is x0. */
@@ -82,34 +85,39 @@ static inline lanes next_change(const iterated_step *at, const lanes *table, lan
   return x0[n][i] + at->scale[i] * apply(table, n, f, i);
 }
 
-/* Solves for the x in u, which starts as x0, and f = K x; back: the transpose. The change is measured in the metric of
- * the masses, independent of the units of the coordinates. */
-static inline int solve_vectors(iterated_step *at, int back, lanes (*f)[M], int *look)
+/* Solves for some x, which start as x0, and f = K x, together; back: the transpose. Changes are measured in the metric
+ * of the masses, independent of the units of the coordinates. */
+static inline __attribute__((always_inline)) int solve_vectors(iterated_step *at, int back, int count,
+    lanes (*x)[GROUPS][M], lanes (*f)[GROUPS][M], int *look)
 {
   const lanes *table = back ? PRODUCT_BACK : PRODUCT;
-  lanes(*x)[M + POINT_DERIVATIVES] = at->u, x0[GROUPS][M];
+  lanes x0[VECTORS_AT_ONCE][GROUPS][M];
   vector_changes past = {INFINITY, INFINITY, at->accepted};
   int status = 0;
-  for (int n = 0; n < GROUPS; n++)
-    memcpy(x0[n], x[n], sizeof x0[n]);
-  apply_derivatives(at, back, f);
+  memcpy(x0, x, sizeof *x * (size_t)count);
+  apply_derivatives(at, back, count, x, f);
   for (int k = 0; status == 0; k++) {
     if (k < *look) {
-      for (int i = 0; i < M; i++)
-        for (int n = 0; n < GROUPS; n++)
-          x[n][i] = next_change(at, table, x0, f, n, i);
+      for (int j = 0; j < count; j++)
+        for (int i = 0; i < M; i++)
+          for (int n = 0; n < GROUPS; n++)
+            x[j][n][i] = next_change(at, table, x0[j], f[j], n, i);
     } else {
-      lanes moved[GROUPS] = {{0.0}}, size[GROUPS] = {{0.0}};
-      for (int i = 0; i < M; i++)
-        for (int n = 0; n < GROUPS; n++) {
-          const lanes next = next_change(at, table, x0, f, n, i), change = next - x[n][i];
-          moved[n] += at->mass[i] * (change * change);
-          size[n] += at->mass[i] * (next * next);
-          x[n][i] = next;
-        }
-      status = vectors_status(points_total(moved), points_total(size), &past, k, look);
+      double largest[2] = {0.0, 0.0};
+      for (int j = 0; j < count; j++) {
+        lanes moved[GROUPS] = {{0.0}}, size[GROUPS] = {{0.0}};
+        for (int i = 0; i < M; i++)
+          for (int n = 0; n < GROUPS; n++) {
+            const lanes next = next_change(at, table, x0[j], f[j], n, i), change = next - x[j][n][i];
+            moved[n] += at->mass[i] * (change * change);
+            size[n] += at->mass[i] * (next * next);
+            x[j][n][i] = next;
+          }
+        keep_largest(points_total(moved), points_total(size), largest);
+      }
+      status = vectors_status(largest[0], largest[1], &past, k, look);
     }
-    apply_derivatives(at, back, f);
+    apply_derivatives(at, back, count, x, f);
   }
   return status == 1 ? OK : NOT_CONVERGED;
 }
@@ -134,33 +142,38 @@ static inline int is_of_state(const double *v)
 }
 
 /* Replaces v, variations of (q0, p0, parameters, t, h), by those of (q1, p1, parameters, t + h, h) (JVP). */
-static __attribute__((noinline)) int jvp_by_iteration(iterated_step *at, double *v, int *look)
+static inline __attribute__((always_inline)) int vary_step(iterated_step *at, int count, double (*v)[STEP_INPUTS],
+    int *look)
 {
   const iteration_data *data = at->data;
-  const double h = at->step->h, dh = v[INPUT_T + 1] / h;
-  const int of_state = is_of_state(v);
-  double dm[M];
-  lanes f[GROUPS][M], F[GROUPS][M];
-  vary_masses(at, v, dm);
-  vary_by_inputs(at->given, v, F[0], M);
-  for (int i = 0; i < M; i++) {
-    const double by_length = 2.0 * dh - data->inverse_mass[i] * dm[i];
-    const double drift = h * data->inverse_mass[i] * (v[M + i] - dh * at->step->p0[i]);
-    for (int n = 0; n < GROUPS; n++)
-      at->u[n][i] = v[i] + DRIFT[n] * drift + by_length * at->D[n][i];
-    for (int n = 0; !of_state && n < GROUPS; n++)
-      at->u[n][i] += at->scale[i] * apply(PRODUCT, n, F, i);
+  const double h = at->step->h;
+  double drift[VECTORS_AT_ONCE][M], by_length[VECTORS_AT_ONCE][M];
+  lanes x[VECTORS_AT_ONCE][GROUPS][M], f[VECTORS_AT_ONCE][GROUPS][M], F[VECTORS_AT_ONCE][GROUPS][M];
+  for (int j = 0; j < count; j++) {
+    const double dh = v[j][INPUT_T + 1] / h;
+    const int of_state = is_of_state(v[j]);
+    double dm[M];
+    vary_masses(at, v[j], dm);
+    vary_by_inputs(at->given, v[j], F[j][0], M);
+    for (int i = 0; i < M; i++) {
+      by_length[j][i] = 2.0 * dh - data->inverse_mass[i] * dm[i];
+      drift[j][i] = h * data->inverse_mass[i] * (v[j][M + i] - dh * at->step->p0[i]);
+      for (int n = 0; n < GROUPS; n++)
+        x[j][n][i] = v[j][i] + DRIFT[n] * drift[j][i] + by_length[j][i] * at->D[n][i];
+      for (int n = 0; !of_state && n < GROUPS; n++)
+        x[j][n][i] += at->scale[i] * apply(PRODUCT, n, F[j], i);
+    }
   }
-  TRY(solve_vectors(at, 0, f, look));
-  for (int i = 0; i < M; i++) {
-    const double by_length = 2.0 * dh - data->inverse_mass[i] * dm[i];
-    const double drift = h * data->inverse_mass[i] * (v[M + i] - dh * at->step->p0[i]);
-    for (int n = 0; n < GROUPS; n++)
-      F[n][i] += f[n][i];
-    v[i] += drift + by_length * at->dq[i] + at->scale[i] * weigh(POINT_END_POSITION, F, i);
-    v[M + i] += dh * at->dp[i] + weigh(data->kick, F, i);
+  TRY(solve_vectors(at, 0, count, x, f, look));
+  for (int j = 0; j < count; j++) {
+    for (int i = 0; i < M; i++) {
+      for (int n = 0; n < GROUPS; n++)
+        F[j][n][i] += f[j][n][i];
+      v[j][i] += drift[j][i] + by_length[j][i] * at->dq[i] + at->scale[i] * weigh(POINT_END_POSITION, F[j], i);
+      v[j][M + i] += v[j][INPUT_T + 1] / h * at->dp[i] + weigh(data->kick, F[j], i);
+    }
+    v[j][INPUT_T] += v[j][INPUT_T + 1];
   }
-  v[INPUT_T] += v[INPUT_T + 1];
   return OK;
 }
 
@@ -170,19 +183,19 @@ static __attribute__((noinline)) int vjp_by_iteration(iterated_step *at, double 
   const iteration_data *data = at->data;
   const double h = at->step->h;
   double by_length[M], by_h = 0.0;
-  lanes f[GROUPS][M];
+  lanes x[1][GROUPS][M], f[1][GROUPS][M];
   for (int i = 0; i < M; i++)
     for (int n = 0; n < GROUPS; n++)
-      at->u[n][i] = POINT_END_POSITION[n] * (at->scale[i] * v[i]) + data->kick[n] * v[M + i];
-  TRY(solve_vectors(at, 1, f, look));
+      x[0][n][i] = POINT_END_POSITION[n] * (at->scale[i] * v[i]) + data->kick[n] * v[M + i];
+  TRY(solve_vectors(at, 1, 1, x, f, look));
   v[INPUT_T + 1] += v[INPUT_T];
   add_input_gradient(at->given, at->u[0], M + POINT_DERIVATIVES, v);
   for (int i = 0; i < M; i++) {
     lanes part[GROUPS], turned[GROUPS], drifted[GROUPS];
     for (int n = 0; n < GROUPS; n++) {
-      part[n] = f[n][i];
-      turned[n] = f[n][i] * at->D[n][i];
-      drifted[n] = f[n][i] * DRIFT[n];
+      part[n] = f[0][n][i];
+      turned[n] = f[0][n][i] * at->D[n][i];
+      drifted[n] = f[0][n][i] * DRIFT[n];
     }
     const double drift = h * data->inverse_mass[i] * (v[i] + points_total(drifted));
     by_length[i] = v[i] * at->dq[i] + points_total(turned);

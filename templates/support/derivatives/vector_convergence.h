@@ -3,7 +3,8 @@
 /* Convergence criterion for the fixed-point iterations of tangent and adjoint vectors, and their dependence on
  * parameters and time. Requires: POINT_INPUTS. */
 
-enum { INPUT_T = STEP_INPUTS - 2 };
+enum { INPUT_T = STEP_INPUTS - 2,
+  VECTORS_AT_ONCE = 3 }; /* which are iterated together, so that no product waits for the last one */
 
 #define MOVED_BY_ROUNDING (4.0 * DBL_EPSILON * DBL_EPSILON) /* squared: relative change that rounding alone may cause */
 #define LEFT_TO_COME (DBL_EPSILON * DBL_EPSILON / 16.0) /* squared: relative change still to come that is accepted */
@@ -37,6 +38,13 @@ static inline int vectors_status(double moved, double size, vector_changes *past
     return 1;
   }
   return finite && relative < INFINITY && k < MAX_ITERATIONS && shrinks ? 0 : -1;
+}
+
+/* Replaces the squared change and size of vectors by those of others that changed more. */
+static inline void keep_largest(double moved, double size, double *largest)
+{
+  if (!(moved * largest[1] < largest[0] * size))
+    largest[0] = moved, largest[1] = size;
 }
 
 /* Variations of the results of kernels at fixed points, `results` at each, by those of parameters and time. */
