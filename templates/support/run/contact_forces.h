@@ -243,7 +243,7 @@ static real solve_rows(const contact_terms *of, const contact_mode *mode, const 
   contact_unknowns in;
   real matrix[CONTACT_ROWS][CONTACT_ROWS + 1], null[CONTACT_ROWS][CONTACT_ROWS];
   real x[CONTACT_ROWS], least[CONTACT_ROWS], moved[CONTACT_ROWS] = {0.0}, left[CONTACT_ROWS] = {0.0};
-  real weight[CONTACT_ROWS], load = DBL_MIN;
+  real weight[CONTACT_ROWS] = {0.0}, load = DBL_MIN;
   int independent[CONTACT_ROWS];
   find_unknowns(of, mode, &in, force);
   const int count = in.count, dependent = reduce_equations(of, &in, right, force, matrix, independent);

@@ -66,7 +66,7 @@ typedef struct {
 
 static real length_of(const real *x, int count)
 {
-  return count < 2 ? fabs(x[0]) : hypot(x[0], x[1]);
+  return count == 0 ? 0.0 : count == 1 ? fabs(x[0]) : hypot(x[0], x[1]);
 }
 
 /* Mode of a contact by its parameters; of a slip in space with the direction `ahead`. */
