@@ -597,12 +597,10 @@ def test_values_of_unknown_symbols_are_refused(ball):
 
 
 @pytest.mark.quick
-def test_unsupported_combinations_are_refused(ball):
+def test_unsupported_combinations_are_refused():
     pendulum = sc.problem("planar-pendulum").system
     with pytest.raises(sc.EventError, match="in transformed time, where the energy is the constant"):
         sc.compile_stepper(sc.reparametrise(pendulum, "1 + q**2"), "svi:4", events=sc.Event("q", then={"p_q": "-p_q"}))
-    with pytest.raises(sc.MethodError, match="error="):
-        ball.integrate([1.0], [0.0], t_end=2.0, error=1e-8, events=BOUNCES["impact"])
 
 
 def test_restitution_of_parameters_is_not_negative():

@@ -368,13 +368,14 @@ def _draw_times(
     """
     interface = motion.stepper.interface
     names = names or interface.coordinates[:MAX_CURVES]
-    columns = [*interface.coordinates, *interface.momentum_columns]
-    bounds = np.concatenate(motion.error.bounds, axis=1) if error else np.empty(0)
+    bounds: dict[str, Array] = {}
+    if error:
+        columns = (*interface.coordinates, *interface.momentum_columns)
+        bounds = dict(zip(columns, np.concatenate(motion.error.bounds, axis=1).T, strict=True))
     for number, name in enumerate(names):
         shade = color(number if which is None else which)
         axes.plot(motion.t, motion[name], color=shade, label=plain(name))
-        if error and name in columns:
-            bound = bounds[:, columns.index(name)]
+        if (bound := bounds.get(name)) is not None:
             axes.fill_between(motion.t, motion[name] - bound, motion[name] + bound, color=shade, alpha=0.3, linewidth=0)
     axes.set(xlabel="t", ylabel=plain(names[0]) if len(names) == 1 else "", title="motion in time")
     if len(names) > 1 and not which:
