@@ -166,7 +166,7 @@ class WithErrors:
     def error(self: Any) -> RunError:
         """Global errors of all states since the first one, with their signs (:class:`RunError`), made at first access.
 
-        One step of a finer method and a product with its Jacobian for each step, about four to ten times the cost of
+        One step of a finer method and a product with its Jacobian for each step, about five to nine times the cost of
         the run; a finer method is compiled once. docs/digits.md lists which runs have signs, which are compared with a
         finer run, and which are refused.
 
