@@ -498,6 +498,8 @@ class Sources:
             return self._variant_in_pairs(variant)
         match variant:
             case Lanes(precision):
+                if precision == "single" and self.system.bath is not None:
+                    raise MethodError("precision='single' is not available with a heat bath: omit it")
                 source = render_ensemble(self.program(), precision=precision)
             case NewtonFallback():
                 source = self.fallback()

@@ -116,7 +116,9 @@ REFUSED: tuple[tuple[str, Callable[[Case], bool]], ...] = (
     ("does not support the damping", lambda of: of.acts == "mass" and of.steps in ("collocation", "shooting")),
     (
         "not available with a heat bath",
-        lambda of: of.acts == "bath" and (of.tau or of.form in ("embedded single", "two words")),
+        lambda of: (
+            of.acts == "bath" and (of.tau or of.form in ("embedded single", "two words") or of.kind == Lanes("single"))
+        ),
     ),
     (
         "solver='explicit' requires constant diagonal masses and fixed steps",
