@@ -33,8 +33,8 @@ static real *vectors_at(const propagation *over, long long k)
   return over->vectors + k * over->count * STEP_INPUTS;
 }
 
-/* Adds x[k + 1] - phi(x[k]) to the first vector at the end of step k, with phi from the increments, or else the ends, in
- * q1 and p1. Errors of rounded states cancel in the sum, those of increments do not. */
+/* Adds x[k + 1] - phi(x[k]) to the first vector at the end of step k, with phi from the increments, or else the ends,
+ * in q1 and p1. Errors of rounded states cancel in the sum, those of increments do not. */
 static void add_defect(propagation *over, long long k, int increments)
 {
   const real *x[2] = {over->q + k * M, over->p + k * M}, *step[2] = {over->q1 + k * M, over->p1 + k * M};
@@ -210,7 +210,7 @@ int NAME(linearise)(long long steps, const real *t, const real *h, const real *q
 }
 
 /* Global errors delta[k + 1] = Dphi(x[k]) delta[k] + x[k + 1] - phi(x[k]) of a run by another method from its saved
- * states, transported by the tangent map of that step phi (Hairer, Norsett & Wanner, Solving ODEs I, sec. II.3 and II.4);
+ * states, transported by the tangent map of that step phi (Hairer, Norsett & Wanner, Solving ODEs I, II.3 and II.4);
  * further vectors receive rounding errors. */
 int NAME(transport_errors)(long long steps, const real *t, const real *h, const real *q, const real *p,
     const real *parameters, const solver_options *options, int count, double rounding, unsigned long long seed,

@@ -68,7 +68,8 @@ static __attribute__((noinline)) void linearise_points(const step_data *step, co
 }
 
 /* f = K x; back: K^T x. */
-static inline void apply_derivatives(iterated_step *at, int back, int count, lanes (*x)[GROUPS][M], lanes (*f)[GROUPS][M])
+static inline void apply_derivatives(
+    iterated_step *at, int back, int count, lanes (*x)[GROUPS][M], lanes (*f)[GROUPS][M])
 {
   const step_data *step = at->step;
   for (int j = 0; j < count; j++)

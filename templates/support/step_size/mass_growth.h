@@ -31,7 +31,7 @@ static void grow_velocities(const step_data *step, const real *v, int apart, rea
 }
 
 /* Largest |r_i h| of a step of displacements dq. */
-static real growth_of_step(const step_data *step, const real *dq)
+static inline real growth_of_step(const step_data *step, const real *dq)
 {
   real u[2 * M], growth[M], largest = 0;
   for (int i = 0; i < M; i++)
