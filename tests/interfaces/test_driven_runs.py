@@ -78,7 +78,7 @@ def test_runs_without_steps_and_columns_of_inputs():
     assert "'u_0' is not a coordinate" in error_of(*RUN, "--ensemble", "many.csv")
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_missing_input_is_reported():
     Path("pushed.toml").write_text(MODEL.replace("[inputs]\nu = {", "[parameters]\n# {"))
     assert "the input u is not set" in error_of(*RUN)

@@ -82,7 +82,7 @@ def _tables(stepper, inputs):
     return table, saved
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("precision", ["double", "single"])
 def test_inputs_on_a_microcontroller(model, precision, tmp_path):
     folder = generate_package(model, tmp_path / "pushed", embedded=precision)

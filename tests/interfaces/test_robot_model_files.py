@@ -56,7 +56,7 @@ def test_a_table_by_name_changes_a_part_of_the_state_and_a_list_all_of_it():
     assert (solar.q[0], solar.q[1:]) == (0.1, sc.problem("outer-solar-system").q[1:])
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_urdf_has_inputs_and_a_floating_base():
     text = '[system]\nrobot = "arm.urdf"\nfloating = true\nactuated = true\ngravity = [0, 0, -1.6]\n'
     with pytest.warns(sc.SystemDefinitionWarning, match="limits of joints"):
@@ -115,7 +115,7 @@ def test_mistakes_in_the_section_of_a_robot_are_named(text, message):
         parse_model(text, folder=ROBOTS)
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_formulas_of_large_robots_and_ball_joints_are_not_written():
     """Packages and recordings are then without a model file."""
     for name, message in (("ball.xml", r"write \[system\] robot = FILE"), ("figure.xml", "keep the file from which")):

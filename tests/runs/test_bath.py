@@ -73,7 +73,7 @@ def test_half_steps_are_exact_and_harmonic_covariances_have_no_error(dissipation
     assert np.abs(np.r_[end.q[-1], end.p[-1]] - whole).max() < 1e-14
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_noise_of_a_step_has_the_covariance_of_fluctuation_and_dissipation():
     h, kT, count = 0.9, 1.3, 40000
     free = compiled("svi:1", **{**CHAIN, "lagrangian": CHAIN["lagrangian"].split(" - ")[0]},
@@ -293,7 +293,7 @@ def test_noise_is_a_continuous_function_of_the_state(arguments):
         assert 0 < np.abs(first.p - second.p).max() < 1e-7
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_steps_to_spurious_roots_are_repeated_in_halves():
     """Energies in thermal bounds where single steps jump, with and without friction."""
     pendulum = compiled(

@@ -41,6 +41,7 @@ BALANCES = {
 }
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("name", [*BALANCES])
 def test_the_balance_of_energy_has_the_order_of_the_method(name: str, degree: int) -> None:
@@ -72,6 +73,7 @@ def test_work_is_exact_where_the_motion_is(tmp_path: Any) -> None:
             made.work()
 
 
+@pytest.mark.tiers(0, 1)
 def test_single_steps_require_the_modes_that_runs_choose() -> None:
     stepper = of(POINT, "x y", [sc.contact("y", slip="x_dot", friction=0.3)])
     state, slides = ([0.0, 0.0], [2.0, 0.0]), {"contact_1_closed": 1.0, "contact_1_direction": 1.0}
@@ -98,6 +100,7 @@ def test_single_steps_require_the_modes_that_runs_choose() -> None:
 STEPS = pytest.mark.parametrize("steps", [{"h": 0.05}, {}])
 
 
+@pytest.mark.tiers(0, 1)
 @STEPS
 def test_a_ball_rolls_off_the_edge_of_a_table(steps: dict[str, float]) -> None:
     """Rolling at 2 from x = 0 to the edge x = 1, then a fall by 1 onto the ground, on which it goes on."""
@@ -112,6 +115,7 @@ def test_a_ball_rolls_off_the_edge_of_a_table(steps: dict[str, float]) -> None:
     assert run.q[-1] == pytest.approx([1.4, 0.1 - G / 2 * 0.2**2, 4.0], abs=1e-11)
 
 
+@pytest.mark.tiers(0, 1)
 @STEPS
 @pytest.mark.parametrize(("rise", "meets"), [(2.0, True), (8.0, False)])
 def test_a_ball_misses_a_wall_of_finite_height(rise: float, meets: bool, steps: dict[str, float]) -> None:
@@ -134,6 +138,7 @@ def test_contacts_end_at_times_and_beside_others(steps: dict[str, float]) -> Non
     assert contacts_of([floors[0].table]) == (floors[0],)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("edge", ["t - T", "x - t - 1 - T"])
 def test_a_floor_takes_over_from_another_at_a_node(edge: str) -> None:
     """The nodes h k miss T = h n by rounding, before and after."""
@@ -146,6 +151,7 @@ def test_a_floor_takes_over_from_another_at_a_node(edge: str) -> None:
         assert run.contact_modes[1][0] == pytest.approx(0.1, abs=1e-15)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("steps", "error"), [({"h": 0.05}, 1e-10), ({}, 5e-14)])
 def test_friction_on_a_surface_is_that_of_the_true_normal_force(steps: dict[str, float], error: float) -> None:
     parabola = sc.contact(
@@ -186,6 +192,7 @@ def phase(inverse: Any, rate: Any, mu: float, normal: float | None = None) -> An
     raise AssertionError
 
 
+@pytest.mark.tiers(0, 1)
 def test_poissons_law_replaces_newtons_where_that_creates_energy() -> None:
     """Kane's paradox: random rods for which Newton's law with friction creates energy."""
     rod = of(
@@ -236,6 +243,7 @@ def test_modes_have_names_in_messages_only() -> None:
         stepper.integrate([1.0], velocity=[0.0], h=0.1, steps=80, events=sc.Event("x", then={"k": "sqrt(x - 1)"}))
 
 
+@pytest.mark.tiers(0, 1)
 def test_first_modes_do_not_depend_on_units() -> None:
     text = "m*(x_dot**2 + y_dot**2)/2 + m*r**2*a_dot**2/5 - m*g*y"
     table = sc.contact("y - r", slip="x_dot - r*a_dot", friction=0.3, restitution=0.5)

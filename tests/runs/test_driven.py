@@ -91,7 +91,7 @@ def test_sampled_controller_continues_bitwise(pendulum):
             run.set_inputs(u=0.1)
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("precision", ["double", "double-double"])
 @pytest.mark.parametrize("method", ["stoermer-verlet", "composition:4", "svi:2"])
 def test_first_kick_after_a_jump_is_that_of_the_new_input(method, precision):
@@ -122,7 +122,7 @@ def test_first_kick_after_a_jump_is_that_of_the_new_input(method, precision):
         assert_allclose(found, q, rtol=0, atol=1e-14)
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_inputs_from_sympy_and_scipy():
     q, v, u = sympy.symbols("q q_dot u")
     system = sc.LagrangianSystem.from_sympy(
@@ -135,7 +135,7 @@ def test_inputs_from_sympy_and_scipy():
         assert_allclose(run.q[-1, 0], given.antiderivative(2)(2.6), rtol=0, atol=1e-14)
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("t_end", [2.3, 2.05])
 def test_states_at_breakpoints_are_saved_for_any_save_every(pendulum, t_end):
     """Dense output, work and iterations do not depend on the stride."""
@@ -176,7 +176,7 @@ def test_invalid_inputs_are_rejected(pendulum, inputs, message):
         sc.compile_stepper(pendulum, sc.SVI(2)).integrate([0.3], [0.0], inputs=inputs, h=0.1, t_end=2.3)
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_velocities_at_a_breakpoint_use_the_following_segment():
     """Also on the way back, in the first state of runs of all kinds."""
     system = lagrange("drawn", "q", "q_dot**2/2 + u*q_dot - q**2/2", inputs="u")
@@ -189,7 +189,7 @@ def test_velocities_at_a_breakpoint_use_the_following_segment():
         assert many.p[0, 0, 0] == 0.5 + u
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_missing_input_is_not_zero(pendulum):
     """Wherever a step would be taken; what is given by a name, in order, or held, is taken."""
     stepper, state = sc.compile_stepper(pendulum, sc.SVI(2)), ([0.3], [0.0])
@@ -220,7 +220,7 @@ def test_missing_input_is_not_zero(pendulum):
     assert_allclose(lanes.q[:, 0], given.q, rtol=1e-15)
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_events_and_time_transformations_use_inputs_by_name(pendulum):
     """A crossing of the torque with a number, and of the angle with a line that is data."""
     inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
@@ -242,7 +242,7 @@ def test_events_and_time_transformations_use_inputs_by_name(pendulum):
         stepper.with_events("v - 1")
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_failed_run_with_inputs_ends_with_the_last_state():
     edge = sc.LagrangianSystem.from_text("edge", ["q"], "q_dot**2/2 + sqrt(1 - q)", forces={"q": "u"}, inputs=["u"])
     stepper = sc.compile_stepper(edge, sc.SVI(2))

@@ -108,6 +108,7 @@ def test_runs_have_one_of_all_consistent_modes_and_say_whether_there_are_several
     assert np.all(np.bincount(outcomes, minlength=3) > [0, 100, 0])
 
 
+@pytest.mark.tiers(0, 1)
 def test_independent_contacts_have_their_own_scales() -> None:
     """A block that is pressed with 1e12 times the weight of one that slides to v^2 / (2 mu)."""
     contacts = [sc.contact(gap, slip=slip, friction=0.3) for gap, slip in (("y", "x_dot"), ("u", "z_dot"))]
@@ -118,6 +119,7 @@ def test_independent_contacts_have_their_own_scales() -> None:
     assert run.contact_modes[-1] == (pytest.approx(1 / 0.3), ("stick", "stick"))
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("start", [0.0, 0.123])
 def test_a_limit_lifts_by_a_small_force_in_free_fall(start: float) -> None:
     """A force of 1e-6 of the weight that changes its sign at the start, and s'' = f (1/m + 1/M) after it."""
@@ -143,6 +145,7 @@ def test_a_straight_leg_lands_at_the_limit_of_its_joint(height: float) -> None:
     assert run.contact_modes[-1][1][1:] == ("stick", "stick")
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(
     ("friction", "jumps"),
     [("where(x_dot > w, 1, 2)", True), ("2 - sign(w - x_dot)", True), ("1 + abs(x_dot - w)", False), ("2 + x", False)],

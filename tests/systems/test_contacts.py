@@ -99,6 +99,7 @@ def test_an_open_contact_changes_nothing() -> None:
     assert not run.multipliers().any()
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("degree", "order", "largest"), [(1, 2, 3e-4), (2, 4, 1e-7), (3, 6, 1e-10)])
 def test_the_direction_of_sliding_in_space_turns(degree: int, order: int, largest: float) -> None:
     system = sc.LagrangianSystem.from_text(
@@ -132,6 +133,7 @@ def test_the_direction_of_sliding_in_space_turns(degree: int, order: int, larges
     assert np.log2(errors[0] / errors[1]) > order - 0.3
 
 
+@pytest.mark.tiers(0, 1)
 def test_a_multiplier_is_an_event() -> None:
     system = sc.LagrangianSystem.from_text(
         name="bead", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"]
@@ -174,6 +176,7 @@ def test_a_sliding_ball_rolls(degree: int) -> None:
     assert run.t[-1] == 2.0
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("degree", "error"), [(1, 6e-5), (2, 5e-9), (3, 4e-13)])
 def test_a_ladder_leaves_the_wall(degree: int, error: float) -> None:
     contacts = [sc.contact("y - cos(a)"), sc.contact("x - sin(a)")]
@@ -236,6 +239,7 @@ def test_a_block_on_a_slope_creeps_nowhere() -> None:
         assert slides or not run.q.any()
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("steps", [{"h": 0.02}, {}])
 @pytest.mark.parametrize("height", [0, 0.5])
 def test_a_bouncing_ball_comes_to_rest_on_a_floor_that_moves(steps: dict[str, float], height: float) -> None:
@@ -251,6 +255,7 @@ def gap_of_ball(time: float, height: Any, start: float) -> Any:
     return height(time) - 0.1 * np.sin(5 * (start + time))
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("steps", [{"h": 0.1}, {}])
 def test_a_plastic_ball_leaves_a_shaken_floor_with_the_jerk(steps: dict[str, float]) -> None:
     """Its gap grows as t^3 from the times at which sin(w t) = g/(A w^2)."""
@@ -271,6 +276,7 @@ def test_a_plastic_ball_leaves_a_shaken_floor_with_the_jerk(steps: dict[str, flo
     assert [time for time, _ in run.contact_modes] == pytest.approx(expected, abs=1e-10)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("tangent", "consistent"), [(0.30, True), (0.31, False), (0.81, False), (0.83, True)])
 @pytest.mark.parametrize("e", [0, 0.4])
 def test_painleves_paradox_is_an_impact_without_collision(tangent: float, consistent: bool, e: float) -> None:
@@ -295,6 +301,7 @@ def test_painleves_paradox_is_an_impact_without_collision(tangent: float, consis
     assert run.contact_modes == [(0.0, ("open",))]
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("h", [1e-6, 1e-7])
 def test_steps_near_painleves_paradox_are_solved(h: float) -> None:
     """Slip with G M^-1 D^T = 2e-4, by which rounding of the gap moves the rod much farther than its height."""
@@ -328,6 +335,7 @@ def test_derivatives_through_an_impact_without_collision_are_refused() -> None:
         run.sensitivity()
 
 
+@pytest.mark.tiers(0, 1)
 def test_guesses_of_more_constraints_than_coordinates() -> None:
     slides, floors = {"slip": "x_dot", "friction": 0.1}, ("x < 1", "x > 1")
     contacts = [sc.contact("y", where=where, **cast("Any", slides)) for where in floors]
@@ -349,6 +357,7 @@ def of_sliding(accelerate: Any, velocity: Any) -> Any:
     return rates
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("steps", "error"), [({"h": 0.05}, 2e-9), ({"h": 0.025}, 1e-10), ({}, 2e-14)])
 def test_a_block_pushed_across_a_slope_turns_and_stops(steps: dict[str, float], error: float) -> None:
     c, s = np.cos(0.3), np.sin(0.3)
@@ -366,6 +375,7 @@ def test_a_block_pushed_across_a_slope_turns_and_stops(steps: dict[str, float], 
     assert np.allclose(forces[:, 1:], -0.5 * 9.81 * c * w / np.linalg.norm(w, axis=1)[:, np.newaxis], atol=1e-12)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("steps", [{"h": 0.02}, {"h": 0.01}, {"tolerance": 1e-12}])
 def test_slip_on_a_shaken_table_begins_against_the_force(steps: dict[str, float]) -> None:
     slip = [f"{x}_dot - {floor}" for x, floor in zip("xy", SHAKEN, strict=True)]
@@ -386,6 +396,7 @@ def test_slip_on_a_shaken_table_begins_against_the_force(steps: dict[str, float]
     assert np.abs(np.concatenate([run.q[-1, :2], run.velocity[-1, :2]]) - true).max() < 2e-8
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("at_rest", [0.3, 0.301, 0.306])
 @pytest.mark.parametrize("steps", [{"h": 0.05}, {"h": 0.0125}, {}])
 def test_slip_in_space_begins_without_a_jump_of_friction(steps: dict[str, float], at_rest: float) -> None:
@@ -403,7 +414,7 @@ def test_slip_in_space_begins_without_a_jump_of_friction(steps: dict[str, float]
     assert np.abs(run.q[:, 2]).max() < 1e-14
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_a_slow_slip_in_space_brakes_to_its_stop() -> None:
     """Friction that nearly balances a turning force: w = r/3 sin(3 t) along it, within w' m/F, which ends at pi/3."""
     force = "(1000 + cos(3*t))"
@@ -420,7 +431,7 @@ def test_a_slow_slip_in_space_brakes_to_its_stop() -> None:
     assert not run.velocity[-1].any()
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("count", [2, 3])
 def test_a_body_on_points_with_friction_alone_comes_to_rest(count: int) -> None:
     """It spins until t = I w/(n F r); then accelerations are rounding, and rows depend on each other."""
@@ -436,7 +447,7 @@ def test_a_body_on_points_with_friction_alone_comes_to_rest(count: int) -> None:
         assert np.abs(run.velocity[-1]).max() < 1e-15
 
 
-@pytest.mark.second
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("names", [["x"], ["x", "y"]])
 def test_friction_that_grows_from_zero_acts_on_a_body_that_begins_to_move(names: list[str]) -> None:
     """x'' = 1 - t/5."""
@@ -634,6 +645,7 @@ def test_three_contacts_of_a_woodpecker_lead_to_its_cycle() -> None:
     assert orbit.monodromy[:, 5] == pytest.approx(difference, rel=1e-6, abs=1e-9)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("height", [0.0, 1e-18, -1e-18, -1e-14])
 def test_a_start_within_rounding_of_a_gap_at_the_origin_is_in_contact(height: float) -> None:
     """The size of a gap is that of its motion in a step, not that of the position, which is 0."""
@@ -647,6 +659,7 @@ def test_a_start_within_rounding_of_a_gap_at_the_origin_is_in_contact(height: fl
         stepper.integrate_ensemble([[0.0, height], [0.0, -1e-6]], velocity=[[1.0, 0.0]] * 2, h=0.05, t_end=0.5)
 
 
+@pytest.mark.tiers(0, 1)
 def test_an_impact_lets_dry_friction_slip_that_is_finite() -> None:
     """At x = 0 the momentum of y stays -1, which friction of 0.1 cannot take: y' = -1/2."""
     contacts = [sc.contact("x"), sc.friction("y_dot", limit=0.1)]
@@ -657,12 +670,14 @@ def test_an_impact_lets_dry_friction_slip_that_is_finite() -> None:
     assert run.velocity[-1, 1] == pytest.approx(-0.5 + 0.05 * 0.5, abs=1e-12)
 
 
+@pytest.mark.tiers(0, 1)
 def test_a_joint_with_dry_friction_rests_at_its_limit() -> None:
     contacts = [sc.contact("x"), sc.friction("x_dot", limit=0.1)]
     run = of("x_dot**2/2 - x", "x", contacts, "svi:2").integrate([0.5], velocity=[0], h=0.05, t_end=2)
     assert abs(run.q[-1, 0]) < 1e-12
 
 
+@pytest.mark.tiers(0, 1)
 def test_recordings_and_ensembles_of_dry_friction(tmp_path: Any) -> None:
     """Recordings with friction are read again, and trajectories of an ensemble have the modes of single runs."""
     stepper = of("x_dot**2/2 - x**2/2", "x", [sc.friction("x_dot", limit=0.13)], "svi:3")
@@ -677,6 +692,7 @@ def test_recordings_and_ensembles_of_dry_friction(tmp_path: Any) -> None:
     assert np.abs(member.at(times)[0] - run.at(times)[0]).max() < 1e-14
 
 
+@pytest.mark.tiers(0, 1)
 def test_derivations_show_the_modes_of_contacts() -> None:
     floor = sc.contact("y", slip="x_dot", friction="mu", restitution=0.5)
     system = sc.LagrangianSystem.from_text(
@@ -695,6 +711,7 @@ def test_derivations_show_the_modes_of_contacts() -> None:
     assert "contact 1: gap = y" in derivation_html(system, sc.SVI(1, "gauss-lobatto:2"))
 
 
+@pytest.mark.tiers(0, 1)
 def test_a_ball_in_space_bounces_where_friction_stops_its_slip() -> None:
     ball = of(
         f"{PLANE} + z_dot**2/2 - 9.81*z",
@@ -709,6 +726,7 @@ def test_a_ball_in_space_bounces_where_friction_stops_its_slip() -> None:
     assert not run.velocity[-1, :2].any()
 
 
+@pytest.mark.tiers(0, 1)
 def test_kinks_of_friction_coefficients_are_located() -> None:
     block = of(f"{PLANE} - 10*y", "x y", [sc.contact("y", slip="x_dot", friction="where(x > 0.1, 0.05, 0.3)")], "svi:2")
     run = block.integrate([0, 0], velocity=[1, 0], h=0.07, t_end=0.7)
@@ -754,7 +772,7 @@ def test_coefficients_that_become_negative_end_a_run(
         assert ([*confirmed.ok], [*confirmed.failures]) == ([False, True], [0])
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("steps", [{"h": 0.05}, {"h": 0.7}, {}])
 @pytest.mark.parametrize(
     ("dry", "end"),
@@ -794,6 +812,7 @@ def test_friction_that_is_negative_within_rounding_is_0(steps: dict[str, Any]) -
         block.integrate([1 / 3, 0], velocity=[0, 0], t_end=1.0, parameters={"c": 1e-14}, **steps)
 
 
+@pytest.mark.tiers(0, 1)
 def test_coefficients_of_open_contacts_do_not_count() -> None:
     """Friction is 1 - x/3 < 0 at the start, above the floor, and 1 where the block lands after a fall of t = 1."""
     block = of(f"{PLANE} - y", "x y", [sc.contact("y", slip="x_dot", friction="1 - x/3")], "svi:2")
@@ -810,6 +829,7 @@ def test_friction_that_vanishes_goes_on(steps: dict[str, Any]) -> None:
         assert run.velocity[-1, 0] == pytest.approx(2 - loss, abs=0.02 if steps.get("h") == 0.7 else 1e-4)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("steps", [{"h": 0.07}, {"h": 0.2}, {}])
 def test_modes_at_a_kink_are_those_of_its_side(steps: dict[str, float]) -> None:
     """A belt carries a block until it comes to where friction is less."""
@@ -821,6 +841,7 @@ def test_modes_at_a_kink_are_those_of_its_side(steps: dict[str, float]) -> None:
     assert run.q[-1, 0] == pytest.approx(0.1 + 0.7 * first * later + later**2 / 4, abs=1e-14)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("steps", [{"h": 0.02}, {}])
 @pytest.mark.parametrize("by", ["contact", "impact"])
 def test_drag_turns_with_the_velocity_at_impacts(steps: dict[str, float], by: str) -> None:
@@ -851,6 +872,7 @@ def test_kinks_of_what_rests_have_no_zeros(steps: dict[str, float]) -> None:
     assert run.contact_modes[1][0] == pytest.approx(np.arcsin(0.8)) == run.contact_modes[3][0] - np.pi
 
 
+@pytest.mark.tiers(0, 1)
 def test_stribeck_friction_of_the_size_of_a_slip() -> None:
     """Fixed and adaptive runs agree, slip begins at the limit of the spring force."""
     friction = sc.friction("x_dot - 0.2", limit="1/2 + 3/10*exp(-10*abs(x_dot - 0.2))", static_limit=0.8)

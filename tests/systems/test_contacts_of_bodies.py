@@ -157,6 +157,7 @@ def jellett(run: Any) -> Vector:
     return np.asarray((run.angular_momentum() * (TOP.r * UP - TOP.c[2] * run.rotation()[:, :, 2])).sum(axis=1))
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("degree", "h", "error"), [(1, 0.002, 2e-2), (2, 0.002, 2e-6), (3, 0.001, 2e-10)])
 def test_a_sliding_top_keeps_the_order(degree: int, h: float, error: float) -> None:
     true = solve_ivp(TOP.rates, (0, 0.08), SPUN, "DOP853", rtol=1e-13, atol=1e-16, args=(True,)).y[:, -1]
