@@ -20,7 +20,7 @@ class Stepper:
         self.source = type("Source", (), {{"code": "x = a + b;\\n" * {lines}}})
 
     def integrate(self, *state, **options):
-        return sum(range({work}))
+        return sum(bytes({work}))
 
 
 def compile_stepper(system, method):
@@ -31,9 +31,13 @@ def compile_stepper(system, method):
 
 @pytest.fixture
 def checkout(tmp_path):
-    """Return a function that makes a package whose runs take some work, and whose C has some lines."""
+    """Return a function that makes a package whose runs take some work, and whose C has some lines.
 
-    def made(name, work=20_000, lines=100, missing=""):
+    The work sums bytes: it allocates nothing in its loop, so that its time does not depend on where in a pool of
+    memory a process stands.
+    """
+
+    def made(name, work=100_000, lines=100, missing=""):
         (tmp_path / name / "scvi_codegen").mkdir(parents=True)
         text = PACKAGE.format(work=work, lines=lines, missing=missing)
         (tmp_path / name / "scvi_codegen" / "__init__.py").write_text(text)
@@ -47,7 +51,7 @@ def guard(*arguments):
 
 
 def test_slower_checkout_fails_and_equal_one_passes(checkout):
-    old, same, slow = checkout("old"), checkout("same"), checkout("slow", work=60_000)
+    old, same, slow = checkout("old"), checkout("same"), checkout("slow", work=300_000)
     result = guard(old, slow, "--cases", "kepler fixed")
     assert result.exit_code == 1, result.output
     assert "SLOWER" in result.output
