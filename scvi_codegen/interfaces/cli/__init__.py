@@ -50,12 +50,14 @@ ABOUT = {
     "systems": "List the catalogue, or print a system as a file.",
     "verify": "Measure the guaranteed properties of an integrator.",
 }
+ELSEWHERE = {"reproduce": "scvi_codegen.paper.command"}
+"""Modules of the commands that are not in ``commands``."""
 
 
 @click.group(
     cls=Commands,
     folder="scvi_codegen.interfaces.cli.commands",
-    modules={"reproduce": "scvi_codegen.paper.command"},
+    modules=ELSEWHERE,
     about=ABOUT,
     help=OVERVIEW,
     context_settings={"help_option_names": ["-h", "--help"]},
