@@ -99,7 +99,7 @@ class LagrangianSystem(MechanicalSystem):
     @property
     def keyframes(self) -> dict[str, dict[str, Any]]:
         """States of a robot as arguments of ``integrate``: ``"qpos0"``, at rest at its reference, and its file's."""
-        from scvi_codegen.systems.multibody.trees.keyframes import keyframe
+        from scvi_codegen.extras.robots.trees.keyframes import keyframe
 
         return {name: keyframe(self.links, self.inputs, key) for name, key in {"qpos0": {}, **self.keys}.items()}
 
@@ -274,7 +274,7 @@ class LagrangianSystem(MechanicalSystem):
         """
         from sympy import sympify
 
-        from scvi_codegen.systems.multibody.readers import forces_of_lagranges_method
+        from scvi_codegen.extras.robots.readers import forces_of_lagranges_method
 
         holonomic = [sympify(g) for g in method._hol_coneqs]  # private attribute: SymPy has no public one
         rolling = list(method.coneqs)[len(holonomic) :]  # coneqs begins with the rates of the holonomic constraints
@@ -318,7 +318,7 @@ class LagrangianSystem(MechanicalSystem):
             SystemDefinitionError: if generalised speeds are not an invertible combination of the rates of the
                 coordinates, bodies are missing, or a symbol has no value.
         """
-        from scvi_codegen.systems.multibody.readers import of_kanes_method
+        from scvi_codegen.extras.robots.readers import of_kanes_method
 
         return cls.from_sympy(name=name, parameters=parameters, inputs=inputs, **of_kanes_method(method).formulas())
 
@@ -346,7 +346,7 @@ class LagrangianSystem(MechanicalSystem):
             system: its equations need not have been formed.
             name, parameters, inputs: see :meth:`from_kanes_method`.
         """
-        from scvi_codegen.systems.multibody.readers import of_system
+        from scvi_codegen.extras.robots.readers import of_system
 
         return cls.from_sympy(name=name, parameters=parameters, inputs=inputs, **of_system(system).formulas())
 
@@ -394,7 +394,7 @@ class LagrangianSystem(MechanicalSystem):
         Raises:
             SystemDefinitionError: naming file and element, if something is malformed, unknown or not read.
         """
-        from scvi_codegen.systems.multibody.trees.urdf import links_of_urdf
+        from scvi_codegen.extras.robots.trees.urdf import links_of_urdf
 
         robot, links = links_of_urdf(path, floating=floating, parts=_read_parts(limits=limits, friction=friction))
         return cls._of_tree(path, name or robot, links, gravity, actuated, check_inertias, (restitution, impacts))
@@ -439,7 +439,7 @@ class LagrangianSystem(MechanicalSystem):
                 and is not read: equalities of flexible bodies, tendons around geoms; or if it names a file that
                 is neither in its folder nor in ``folders``.
         """
-        from scvi_codegen.systems.multibody.trees.mjcf import links_of_mjcf
+        from scvi_codegen.extras.robots.trees.mjcf import links_of_mjcf
 
         parts = _read_parts(limits=limits, friction=friction, contacts=contacts)
         with naming_folders(folders):
@@ -452,11 +452,11 @@ class LagrangianSystem(MechanicalSystem):
     def _of_tree(
         cls, path: Any, name: str, links: Any, gravity: Any, actuated: Any, checked: bool, law: Any, *others: Any
     ) -> LagrangianSystem:
-        from scvi_codegen.systems.multibody.trees.closures import conditions_of
-        from scvi_codegen.systems.multibody.trees.contacts import contacts_of
-        from scvi_codegen.systems.multibody.trees.energies import exact_number, system_of_tree
-        from scvi_codegen.systems.multibody.trees.keyframes import outside_limits
-        from scvi_codegen.systems.multibody.trees.tendons import contacts_of_tendons, energies_of
+        from scvi_codegen.extras.robots.trees.closures import conditions_of
+        from scvi_codegen.extras.robots.trees.contacts import contacts_of
+        from scvi_codegen.extras.robots.trees.energies import exact_number, system_of_tree
+        from scvi_codegen.extras.robots.trees.keyframes import outside_limits
+        from scvi_codegen.extras.robots.trees.tendons import contacts_of_tendons, energies_of
 
         try:
             closures, tendons, touches, actuators, keys = others or ((), (), (), (), {})

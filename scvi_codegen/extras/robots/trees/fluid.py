@@ -10,9 +10,9 @@ import scipy
 from sympy import Abs, Expr, Matrix, sqrt
 
 from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.extras.robots.trees.energies import TINY, exact_number, exact_vector
+from scvi_codegen.extras.robots.trees.tree import Vector, about
 from scvi_codegen.systems.formulas.intermediates import intermediate
-from scvi_codegen.systems.multibody.trees.energies import TINY, exact_number, exact_vector
-from scvi_codegen.systems.multibody.trees.tree import Vector, about
 
 MOST_TURNS = 500
 """Rotations of Jacobi's method, which takes fewer than ten."""

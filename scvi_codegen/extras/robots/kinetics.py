@@ -34,9 +34,9 @@ from sympy import Add, Dummy, Expr, Matrix, Pow, Symbol
 from sympy.integrals.manualintegrate import manualintegrate
 
 from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.extras.robots.variables import Variables
 from scvi_codegen.systems.formulas.expressions import NEGLIGIBLE, jacobian, samples, unsupported_part
 from scvi_codegen.systems.formulas.rotations import RotationNames
-from scvi_codegen.systems.multibody.variables import Variables
 
 if TYPE_CHECKING:
     from sympy.physics.mechanics import Particle, ReferenceFrame, RigidBody

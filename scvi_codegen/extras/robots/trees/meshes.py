@@ -17,8 +17,8 @@ import scipy
 from numpy.typing import NDArray
 
 from scvi_codegen.common.errors import imported
-from scvi_codegen.systems.multibody.trees.document import Element, bytes_of
-from scvi_codegen.systems.multibody.trees.tree import Inertia, Vector, rotation_by
+from scvi_codegen.extras.robots.trees.document import Element, bytes_of
+from scvi_codegen.extras.robots.trees.tree import Inertia, Vector, rotation_by
 
 LARGEST = 1e15
 """Bound of the coordinates of corners, beside which 1 is not lost to rounding."""

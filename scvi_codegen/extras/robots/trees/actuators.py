@@ -14,12 +14,9 @@ from itertools import chain
 import numpy as np
 from sympy import Add, Expr, Matrix, S
 
-from scvi_codegen.systems.formulas.intermediates import intermediate
-from scvi_codegen.systems.formulas.kinks import positive_part
-from scvi_codegen.systems.formulas.symbols import DOT, input_parameters, symbol
-from scvi_codegen.systems.multibody.trees.closures import frames_in_common
-from scvi_codegen.systems.multibody.trees.document import Element
-from scvi_codegen.systems.multibody.trees.energies import (
+from scvi_codegen.extras.robots.trees.closures import frames_in_common
+from scvi_codegen.extras.robots.trees.document import Element
+from scvi_codegen.extras.robots.trees.energies import (
     as_quantities,
     between,
     exact_number,
@@ -28,18 +25,12 @@ from scvi_codegen.systems.multibody.trees.energies import (
     rotation_of,
     rotation_vector,
 )
-from scvi_codegen.systems.multibody.trees.schema import ACTUATORS, Kind
-from scvi_codegen.systems.multibody.trees.tendons import Tendon, length_of, rate_of
-from scvi_codegen.systems.multibody.trees.tree import (
-    SINGLE,
-    Joint,
-    Link,
-    Pose,
-    Vector,
-    identifier,
-    numbered,
-    symbols_of,
-)
+from scvi_codegen.extras.robots.trees.schema import ACTUATORS, Kind
+from scvi_codegen.extras.robots.trees.tendons import Tendon, length_of, rate_of
+from scvi_codegen.extras.robots.trees.tree import SINGLE, Joint, Link, Pose, Vector, identifier, numbered, symbols_of
+from scvi_codegen.systems.formulas.intermediates import intermediate
+from scvi_codegen.systems.formulas.kinks import positive_part
+from scvi_codegen.systems.formulas.symbols import DOT, input_parameters, symbol
 
 Motion = tuple[Expr, Expr]
 """Length of an actuator and its rate, times the gear."""

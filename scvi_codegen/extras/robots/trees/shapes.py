@@ -9,10 +9,10 @@ from xml.etree.ElementTree import Element as Node
 
 import numpy as np
 
-from scvi_codegen.systems.multibody.trees.document import Element
-from scvi_codegen.systems.multibody.trees.meshes import inertia_of
-from scvi_codegen.systems.multibody.trees.schema import TURN
-from scvi_codegen.systems.multibody.trees.tree import Inertia, Pose, Vector, about, rotation_by
+from scvi_codegen.extras.robots.trees.document import Element
+from scvi_codegen.extras.robots.trees.meshes import inertia_of
+from scvi_codegen.extras.robots.trees.schema import TURN
+from scvi_codegen.extras.robots.trees.tree import Inertia, Pose, Vector, about, rotation_by
 
 ORIENTATIONS = TURN.split()
 AXES = dict(zip("xyz", np.eye(3), strict=True))

@@ -8,13 +8,8 @@ from typing import Any
 import numpy as np
 from sympy import Abs, Add, Expr, Matrix, S, sqrt
 
-from scvi_codegen.systems.contact import ContactLike, friction
-from scvi_codegen.systems.formulas.expressions import derivative_along, evaluate, gradient
-from scvi_codegen.systems.formulas.intermediates import intermediate
-from scvi_codegen.systems.formulas.kinks import positive_part
-from scvi_codegen.systems.formulas.symbols import DOT, default_momenta, symbol
-from scvi_codegen.systems.multibody.trees.closures import frames_in_common
-from scvi_codegen.systems.multibody.trees.energies import (
+from scvi_codegen.extras.robots.trees.closures import frames_in_common
+from scvi_codegen.extras.robots.trees.energies import (
     Tree,
     dual_energy,
     exact_number,
@@ -23,7 +18,12 @@ from scvi_codegen.systems.multibody.trees.energies import (
     position_of,
     rotation_of,
 )
-from scvi_codegen.systems.multibody.trees.tree import SINGLE, Joint, Link, Pose
+from scvi_codegen.extras.robots.trees.tree import SINGLE, Joint, Link, Pose
+from scvi_codegen.systems.contact import ContactLike, friction
+from scvi_codegen.systems.formulas.expressions import derivative_along, evaluate, gradient
+from scvi_codegen.systems.formulas.intermediates import intermediate
+from scvi_codegen.systems.formulas.kinks import positive_part
+from scvi_codegen.systems.formulas.symbols import DOT, default_momenta, symbol
 from scvi_codegen.systems.rotations.points import torque_of
 
 

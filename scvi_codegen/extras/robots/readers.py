@@ -12,16 +12,10 @@ from sympy import Expr, Symbol
 from sympy.physics.mechanics import KanesMethod, LinearSpring, dynamicsymbols
 
 from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.extras.robots.kinetics import gyroscopic_forces, kinetic_energy, load_forces, motions_of, potential_of
+from scvi_codegen.extras.robots.turning import with_rotations
+from scvi_codegen.extras.robots.variables import Variables, independent_of, solved_for_speeds
 from scvi_codegen.systems.formulas.rotations import Rotation
-from scvi_codegen.systems.multibody.kinetics import (
-    gyroscopic_forces,
-    kinetic_energy,
-    load_forces,
-    motions_of,
-    potential_of,
-)
-from scvi_codegen.systems.multibody.turning import with_rotations
-from scvi_codegen.systems.multibody.variables import Variables, independent_of, solved_for_speeds
 
 if TYPE_CHECKING:
     from sympy.physics.mechanics import LagrangesMethod, ReferenceFrame, System
@@ -210,7 +204,7 @@ def of_kanes_method(method: KanesMethod) -> Multibody:
 def of_system(system: System) -> Multibody:
     """Return the bodies, joints, loads and actuators of a ``System``, whether or not its equations were formed.
 
-    Spherical joints and free bodies become rotations (:mod:`scvi_codegen.systems.multibody.turning`). Potential
+    Spherical joints and free bodies become rotations (:mod:`scvi_codegen.extras.robots.turning`). Potential
     energies of bodies are included unless its equations were formed by Kane's method, which omits them.
     """
     by_kane = isinstance(system.eom_method, KanesMethod)

@@ -17,8 +17,8 @@ import numpy as np
 
 from scvi_codegen.common.atomic import is_inside
 from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
-from scvi_codegen.systems.multibody.trees.schema import Kind
-from scvi_codegen.systems.multibody.trees.tree import Vector
+from scvi_codegen.extras.robots.trees.schema import Kind
+from scvi_codegen.extras.robots.trees.tree import Vector
 
 LARGEST_FILE = 32 * 2**20
 LARGEST_NUMBER = 1e40

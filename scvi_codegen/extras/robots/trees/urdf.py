@@ -1,7 +1,7 @@
 """Reader of URDF, the robot description format of ROS: links, inertials, joints.
 
 Axes and angles are those of https://docs.ros.org/en/rolling/p/urdfdom: ``rpy`` are rotations about the fixed axes x, y,
-z, in this order. :mod:`scvi_codegen.systems.multibody.trees.schema` lists the attributes that are read.
+z, in this order. :mod:`scvi_codegen.extras.robots.trees.schema` lists the attributes that are read.
 """
 
 from collections import defaultdict
@@ -15,9 +15,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from scvi_codegen.common.errors import closest
-from scvi_codegen.systems.multibody.trees.document import Element, Unread, checked_limits, root_of
-from scvi_codegen.systems.multibody.trees.schema import URDF
-from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about, axes_of, named
+from scvi_codegen.extras.robots.trees.document import Element, Unread, checked_limits, root_of
+from scvi_codegen.extras.robots.trees.schema import URDF
+from scvi_codegen.extras.robots.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about, axes_of, named
 
 LIMITED = ("revolute", "prismatic")
 KINDS = {"fixed": "fixed", "revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free"}

@@ -1,7 +1,7 @@
 """Reader of MJCF, the model format of MuJoCo: bodies, joints, inertias of bodies and geoms, gravity, equalities.
 
 Attributes and defaults are those of https://mujoco.readthedocs.io/en/stable/XMLreference.html;
-:mod:`scvi_codegen.systems.multibody.trees.schema` lists which are read.
+:mod:`scvi_codegen.extras.robots.trees.schema` lists which are read.
 """
 
 from collections import defaultdict
@@ -17,8 +17,7 @@ from xml.etree import ElementTree
 import numpy as np
 from sympy import Expr, S
 
-from scvi_codegen.systems.formulas.symbols import symbol
-from scvi_codegen.systems.multibody.trees.actuators import (
+from scvi_codegen.extras.robots.trees.actuators import (
     ACTED,
     JOINTED,
     Actuator,
@@ -32,11 +31,11 @@ from scvi_codegen.systems.multibody.trees.actuators import (
     motion_of,
     motion_of_sites,
 )
-from scvi_codegen.systems.multibody.trees.closures import Closure, Coupling, at_reference
-from scvi_codegen.systems.multibody.trees.contacts import Geom, Pair, Touch
-from scvi_codegen.systems.multibody.trees.document import Element, Unread, checked_limits
-from scvi_codegen.systems.multibody.trees.fluid import box, ellipsoid, principal_axes
-from scvi_codegen.systems.multibody.trees.shapes import (
+from scvi_codegen.extras.robots.trees.closures import Closure, Coupling, at_reference
+from scvi_codegen.extras.robots.trees.contacts import Geom, Pair, Touch
+from scvi_codegen.extras.robots.trees.document import Element, Unread, checked_limits
+from scvi_codegen.extras.robots.trees.fluid import box, ellipsoid, principal_axes
+from scvi_codegen.extras.robots.trees.shapes import (
     AXES,
     ORIENTATIONS,
     SHAPES,
@@ -47,9 +46,10 @@ from scvi_codegen.systems.multibody.trees.shapes import (
     size_of,
     unit_of_angles,
 )
-from scvi_codegen.systems.multibody.trees.sources import document_of, merged
-from scvi_codegen.systems.multibody.trees.tendons import Tendon, length_of, mean_inverses, reference_length
-from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, named
+from scvi_codegen.extras.robots.trees.sources import document_of, merged
+from scvi_codegen.extras.robots.trees.tendons import Tendon, length_of, mean_inverses, reference_length
+from scvi_codegen.extras.robots.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, named
+from scvi_codegen.systems.formulas.symbols import symbol
 
 PARTS = {"limits": "limits", "friction": "dry friction"}
 SLIDING = 3

@@ -16,10 +16,10 @@ from xml.etree.ElementTree import SubElement
 import numpy as np
 
 from scvi_codegen.common.errors import closest
-from scvi_codegen.systems.multibody.trees.actuators import as_general, inherited_by
-from scvi_codegen.systems.multibody.trees.document import Element, root_of
-from scvi_codegen.systems.multibody.trees.schema import MJCF
-from scvi_codegen.systems.multibody.trees.shapes import ORIENTATIONS, pose_of
+from scvi_codegen.extras.robots.trees.actuators import as_general, inherited_by
+from scvi_codegen.extras.robots.trees.document import Element, root_of
+from scvi_codegen.extras.robots.trees.schema import MJCF
+from scvi_codegen.extras.robots.trees.shapes import ORIENTATIONS, pose_of
 
 Defaults = dict[str, dict[str, str]]
 """Attributes by kind of element."""
