@@ -1,6 +1,6 @@
 """Flow map: a number of steps as a differentiable function of (q, p, parameters, t, h), and its form for JAX.
 
-JAX calls the compiled C by XLA, PyTorch (:mod:`scvi_codegen.interfaces.frameworks.torch`) for many rows of numbers at
+JAX calls the compiled C by XLA, PyTorch (:mod:`scvi_codegen.extras.frameworks.torch`) for many rows of numbers at
 once; both have JVP, VJP, second derivatives and batches.
 """
 
@@ -207,7 +207,7 @@ class JaxFlow(ArrayFlow):
 
     def _along(self, x: Any) -> Any:
         """Return the saved states; see :meth:`ArrayFlow._along`."""
-        from scvi_codegen.interfaces.frameworks.jax_primitives import STATES
+        from scvi_codegen.extras.frameworks.jax_primitives import STATES
 
         size = 2 * self.stepper.dimension
         return STATES.bind(x, target=self._target, steps=self.steps, save_every=self.spacing, size=size)
@@ -217,7 +217,7 @@ class JaxFlow(ArrayFlow):
         """Name under which the C functions are registered with XLA; compiled and registered on first use."""
         import jaxlib
 
-        from scvi_codegen.interfaces.frameworks.jax_primitives import SECOND
+        from scvi_codegen.extras.frameworks.jax_primitives import SECOND
 
         name = self._registered(with_xla_flow(self.derivatives, jaxlib.__version__), XLA_PARTS)
         SECOND[name] = lambda: self._second_target

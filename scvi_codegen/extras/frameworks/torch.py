@@ -7,7 +7,7 @@ from typing import Any
 
 from scvi_codegen.common.errors import StateError, imported
 from scvi_codegen.common.validation import checks_arguments, of
-from scvi_codegen.interfaces.frameworks.flow import ArrayFlow, FlowOfRows
+from scvi_codegen.extras.frameworks.flow import ArrayFlow, FlowOfRows
 from scvi_codegen.runs.stepper import Stepper
 
 
@@ -30,7 +30,7 @@ class TorchFlow(FlowOfRows, ArrayFlow):
     """States of a trajectory as a function that PyTorch differentiates."""
 
     def _along(self, x: Any) -> Any:
-        from scvi_codegen.interfaces.frameworks.torch_functions import StatesAlong
+        from scvi_codegen.extras.frameworks.torch_functions import StatesAlong
 
         return StatesAlong.apply(x, self)
 

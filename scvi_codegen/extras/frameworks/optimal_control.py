@@ -17,7 +17,7 @@ import numpy as np
 from scvi_codegen.codegen.native.arguments import checked_number, real_array
 from scvi_codegen.common.errors import ControlError, MethodError, StateError, closest, imported
 from scvi_codegen.common.validation import MAPPING, checked_count, checks_arguments
-from scvi_codegen.interfaces.frameworks.casadi import EndConditions, casadi_step, own_parameters
+from scvi_codegen.extras.frameworks.casadi import EndConditions, casadi_step, own_parameters
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method

@@ -14,7 +14,7 @@ import torch
 
 from scvi_codegen.codegen.native.options import step_failure
 from scvi_codegen.common.errors import MethodError
-from scvi_codegen.interfaces.frameworks.flow import FlowOfRows
+from scvi_codegen.extras.frameworks.flow import FlowOfRows
 
 STATES, PUSH, PULL = range(3)
 NO_MEMORY = 6
