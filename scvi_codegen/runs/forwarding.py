@@ -18,8 +18,8 @@ from scvi_codegen.common.validation import checked_count, checks_arguments
 from scvi_codegen.runs.states.validation import Array, EnsembleParameters, Parameters, States
 
 if TYPE_CHECKING:
-    from scvi_codegen.analysis.chaos.indicators import ChaosIndicators
     from scvi_codegen.analysis.paths.path import ArrayOrFunction, Path
+    from scvi_codegen.extras.chaos.indicators import ChaosIndicators
     from scvi_codegen.interfaces.pictures.animation import Film
     from scvi_codegen.interfaces.pictures.overview import Plots
 
@@ -134,7 +134,7 @@ class SteppersAnalysis:
             MethodError: if time is transformed.
             StateError: if a shape, name or number is invalid.
         """
-        from scvi_codegen.analysis.chaos.ensemble import indicators_of_ensemble
+        from scvi_codegen.extras.chaos.ensemble import indicators_of_ensemble
 
         return indicators_of_ensemble(
             self,
@@ -173,7 +173,7 @@ class ChaosOfRun:
             MethodError: if time is transformed.
             StateError: if the run has no steps, a shape is another, or the states are not at whole steps.
         """
-        from scvi_codegen.analysis.chaos.indicators import InitialTangents, along
+        from scvi_codegen.extras.chaos.indicators import InitialTangents, along
 
         self._require("chaos")
         if len(self) < 2:

@@ -15,14 +15,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.analysis.chaos.indicators import MOST as LARGEST_CHUNK
-from scvi_codegen.analysis.chaos.indicators import (
-    SERIES,
-    ChaosIndicators,
-    InitialTangents,
-    StepSegment,
-    TangentPropagation,
-)
 from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.codegen.native.binding import Binding
@@ -31,6 +23,14 @@ from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.codegen.variants import TangentVectors
 from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.common.validation import checked_count
+from scvi_codegen.extras.chaos.indicators import MOST as LARGEST_CHUNK
+from scvi_codegen.extras.chaos.indicators import (
+    SERIES,
+    ChaosIndicators,
+    InitialTangents,
+    StepSegment,
+    TangentPropagation,
+)
 from scvi_codegen.runs.accuracy.local_error import warn_of_large_steps
 from scvi_codegen.runs.driver.run_loop import record
 from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings, momenta_of_each, start_of_ensemble

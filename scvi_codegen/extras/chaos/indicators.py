@@ -32,7 +32,7 @@ from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.step_derivatives import Starts
 
 SERIES = ("log_norms", "max_log_norms", "log_r_diagonal", "rates", "mean_rates")
-"""Names of the accumulated series, defined in :class:`~scvi_codegen.analysis.chaos.indicators.ChaosIndicators`."""
+"""Names of the accumulated series, defined in :class:`~scvi_codegen.extras.chaos.indicators.ChaosIndicators`."""
 
 MOST_GROWTH_RATIO = 1e3
 """Largest ratio of growth between tangent vectors within a segment; bounds the loss of significant digits."""
