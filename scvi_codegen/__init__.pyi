@@ -15,7 +15,6 @@ from scvi_codegen.analysis.orbits.family import Family as Family
 from scvi_codegen.analysis.orbits.family import family as family
 from scvi_codegen.analysis.orbits.solver import PeriodicOrbit as PeriodicOrbit
 from scvi_codegen.analysis.orbits.solver import periodic_orbit as periodic_orbit
-from scvi_codegen.analysis.paths.path import Path as Path
 from scvi_codegen.analysis.verification import Certificate as Certificate
 from scvi_codegen.analysis.verification import verify as verify
 from scvi_codegen.codegen.native.options import SolverOptions as SolverOptions
@@ -58,6 +57,7 @@ from scvi_codegen.extras.frameworks.optimal_control import ControlledMotion as C
 from scvi_codegen.extras.frameworks.optimal_control import optimal_control as optimal_control
 from scvi_codegen.extras.frameworks.torch import TorchFlow as TorchFlow
 from scvi_codegen.extras.frameworks.torch import torch_flow as torch_flow
+from scvi_codegen.extras.paths.path import Path as Path
 from scvi_codegen.fields.laws import ConservationLaw as ConservationLaw
 from scvi_codegen.fields.laws import FieldDerivation as FieldDerivation
 from scvi_codegen.fields.laws import LocalLaw as LocalLaw

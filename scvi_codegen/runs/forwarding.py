@@ -18,8 +18,8 @@ from scvi_codegen.common.validation import checked_count, checks_arguments
 from scvi_codegen.runs.states.validation import Array, EnsembleParameters, Parameters, States
 
 if TYPE_CHECKING:
-    from scvi_codegen.analysis.paths.path import ArrayOrFunction, Path
     from scvi_codegen.extras.chaos.indicators import ChaosIndicators
+    from scvi_codegen.extras.paths.path import ArrayOrFunction, Path
     from scvi_codegen.interfaces.pictures.animation import Film
     from scvi_codegen.interfaces.pictures.overview import Plots
 
@@ -69,14 +69,14 @@ class SteppersAnalysis:
             inputs: as in :meth:`integrate`; their breakpoints should be ends of steps.
 
         Returns:
-            A :class:`~scvi_codegen.analysis.paths.path.Path`; its ``run()`` integrates from the first state.
+            A :class:`~scvi_codegen.extras.paths.path.Path`; its ``run()`` integrates from the first state.
 
         Raises:
             PathError: if no path is found.
             MethodError: for methods without a sum of L, first-order systems and nonholonomic constraints.
             StateError: if a shape, name or number is invalid.
         """
-        from scvi_codegen.analysis.paths.path import path_of
+        from scvi_codegen.extras.paths.path import path_of
 
         return path_of(
             self.known,

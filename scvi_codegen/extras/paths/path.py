@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.analysis.paths import solver
-from scvi_codegen.analysis.paths.discretisation import Discretisation, discretisation_of, kinetic_energy_is_positive
-from scvi_codegen.analysis.paths.equations import Band, condensed_hessian, hessian_blocks, negative_pivots
-from scvi_codegen.analysis.paths.intervals import Intervals, ManyCoordinates, ReducedIntervals
-from scvi_codegen.analysis.paths.starts import curves_around, curves_at_random
 from scvi_codegen.codegen.native.arguments import checked_number, real_array
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import AccuracyWarning, MethodError, PathError, StateError, warn
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import checked_count
+from scvi_codegen.extras.paths import solver
+from scvi_codegen.extras.paths.discretisation import Discretisation, discretisation_of, kinetic_energy_is_positive
+from scvi_codegen.extras.paths.equations import Band, condensed_hessian, hessian_blocks, negative_pivots
+from scvi_codegen.extras.paths.intervals import Intervals, ManyCoordinates, ReducedIntervals
+from scvi_codegen.extras.paths.starts import curves_around, curves_at_random
 from scvi_codegen.runs.accuracy.size import largest_range, size_for_updates
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runs.states.layout import StateLayout

@@ -9,9 +9,9 @@ from typing import Any
 import click
 import numpy as np
 
-from scvi_codegen.analysis.paths.path import Path, different_paths
 from scvi_codegen.common.errors import MethodError, ModelFileError
 from scvi_codegen.common.representation import counted
+from scvi_codegen.extras.paths.path import Path, different_paths
 from scvi_codegen.interfaces.cli.command_group import check_writable, reporting, tell
 from scvi_codegen.interfaces.cli.model_options import model_arguments, read_model, with_known_sizes
 from scvi_codegen.interfaces.cli.recording import check_output

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.analysis.paths.equations import Bordered, BorderedClosed, Closed, closed_residual, factors_of
-from scvi_codegen.analysis.paths.intervals import Intervals, Linearised
 from scvi_codegen.common.errors import PathError, StateError, StepFailedError
+from scvi_codegen.extras.paths.equations import Bordered, BorderedClosed, Closed, closed_residual, factors_of
+from scvi_codegen.extras.paths.intervals import Intervals, Linearised
 from scvi_codegen.runs.accuracy.size import RESOLVED, SizeOfMotion, largest_range, roundoff, size_for_updates
 from scvi_codegen.runs.states.validation import Array
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.analysis.paths.intervals import Intervals, Linearised
 from scvi_codegen.common.errors import PathError
+from scvi_codegen.extras.paths.intervals import Intervals, Linearised
 from scvi_codegen.runs.states.validation import Array
 
 NULL_EIGENVALUE = 1e-7

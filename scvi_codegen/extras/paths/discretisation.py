@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.analysis.paths.intervals import Intervals
-from scvi_codegen.analysis.paths.solver import Solution
 from scvi_codegen.common.errors import StepFailedError
+from scvi_codegen.extras.paths.intervals import Intervals
+from scvi_codegen.extras.paths.solver import Solution
 from scvi_codegen.runs.accuracy.size import RESOLVED, roundoff
 from scvi_codegen.runs.states.validation import Array
 
