@@ -11,6 +11,7 @@ import click
 
 from scvi_codegen.common.atomic import write_text
 from scvi_codegen.common.representation import counted
+from scvi_codegen.extras.pictures.canvas import check_plot_path
 from scvi_codegen.interfaces.cli.command_group import (
     FAILURE,
     INTERRUPTED,
@@ -20,7 +21,6 @@ from scvi_codegen.interfaces.cli.command_group import (
     reporting,
     tell,
 )
-from scvi_codegen.interfaces.pictures.canvas import check_plot_path
 from scvi_codegen.paper.experiment import Experiment, Result, report_html, tally, write_result
 from scvi_codegen.paper.runner import CATALOGUE, Failure, Watch, catalogue, run_experiments, with_needs
 

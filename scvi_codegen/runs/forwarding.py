@@ -20,8 +20,8 @@ from scvi_codegen.runs.states.validation import Array, EnsembleParameters, Param
 if TYPE_CHECKING:
     from scvi_codegen.extras.chaos.indicators import ChaosIndicators
     from scvi_codegen.extras.paths.path import ArrayOrFunction, Path
-    from scvi_codegen.interfaces.pictures.animation import Film
-    from scvi_codegen.interfaces.pictures.overview import Plots
+    from scvi_codegen.extras.pictures.animation import Film
+    from scvi_codegen.extras.pictures.overview import Plots
 
 
 class SteppersAnalysis:
@@ -225,7 +225,7 @@ class Pictured:
         There are ``motion``, ``phase``, ``energy``, ``momentum_maps`` and ``section``, and of fields on a mesh
         ``field`` and ``spectrum``; each returns Matplotlib axes. Of an ensemble the first 64 trajectories are drawn.
         """
-        from scvi_codegen.interfaces.pictures.overview import Plots
+        from scvi_codegen.extras.pictures.overview import Plots
 
         return Plots(self._pictured)
 
@@ -242,6 +242,6 @@ class Pictured:
 
         Of an ensemble the first 64 trajectories are drawn together.
         """
-        from scvi_codegen.interfaces.pictures.animation import animate
+        from scvi_codegen.extras.pictures.animation import animate
 
         return animate(self._pictured, path, seconds=seconds, positions=positions, picture=picture, progress=progress)

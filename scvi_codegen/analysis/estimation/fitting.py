@@ -26,7 +26,7 @@ from scvi_codegen.runs.states.validation import Array, columns_of_inputs
 from scvi_codegen.runs.stepper import STEPPER, Stepper
 
 if TYPE_CHECKING:
-    from scvi_codegen.interfaces.pictures.conserved import ResidualPlot
+    from scvi_codegen.extras.pictures.conserved import ResidualPlot
 
 SAME = 1e-10
 """Sensitivity relative to the largest below which an unknown counts as undetermined."""
@@ -103,7 +103,7 @@ class Fit:
     @property
     def plot(self) -> ResidualPlot:
         """Plot of the residuals over time with the noise level: ``fit.plot()``, ``fit.plot("residuals.png")``."""
-        from scvi_codegen.interfaces.pictures.conserved import ResidualPlot
+        from scvi_codegen.extras.pictures.conserved import ResidualPlot
 
         return ResidualPlot(self.t, self.residuals, self.deviations, self.observed)
 

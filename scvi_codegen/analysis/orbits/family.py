@@ -274,7 +274,7 @@ class Family:
         Returns:
             The figure of matplotlib; a .png, .svg or .pdf is written if a path is passed.
         """
-        from scvi_codegen.interfaces.pictures.family import plot_family
+        from scvi_codegen.extras.pictures.family import plot_family
 
         return plot_family(self, path)
 

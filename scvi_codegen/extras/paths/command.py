@@ -12,12 +12,12 @@ import numpy as np
 from scvi_codegen.common.errors import MethodError, ModelFileError
 from scvi_codegen.common.representation import counted
 from scvi_codegen.extras.paths.path import Path, different_paths
+from scvi_codegen.extras.pictures.canvas import PICTURES, check_plot_path
 from scvi_codegen.interfaces.cli.command_group import check_writable, reporting, tell
 from scvi_codegen.interfaces.cli.model_options import model_arguments, read_model, with_known_sizes
 from scvi_codegen.interfaces.cli.recording import check_output
 from scvi_codegen.interfaces.models.model import Model
 from scvi_codegen.interfaces.models.options import options_of
-from scvi_codegen.interfaces.pictures.canvas import PICTURES, check_plot_path
 from scvi_codegen.runs.results.export import FORMATS
 from scvi_codegen.runs.trajectory import Trajectory
 

@@ -31,6 +31,9 @@ from scvi_codegen.common.display.page import mathematics_font
 from scvi_codegen.common.errors import ArgumentError, ExpressionError, MethodError, StateError, closest
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import ArgumentType, checks_arguments, keyword_hint, of
+from scvi_codegen.extras.pictures.family import sizes_of
+from scvi_codegen.extras.pictures.recognition import shape_of
+from scvi_codegen.extras.pictures.shape import DrawnSystem, shape_of_picture
 from scvi_codegen.interfaces.models.model import DEFAULT_METHOD, Model
 from scvi_codegen.interfaces.models.model_files.document import document_of
 from scvi_codegen.interfaces.models.model_files.model_file import document_in, load_model
@@ -44,9 +47,6 @@ from scvi_codegen.interfaces.models.options import FURTHER
 from scvi_codegen.interfaces.models.packages.example import absolute_tolerances_of, check_example
 from scvi_codegen.interfaces.models.packages.package import integrator_of
 from scvi_codegen.interfaces.pages.webassembly import LICENCES, check_compiler, webassembly
-from scvi_codegen.interfaces.pictures.family import sizes_of
-from scvi_codegen.interfaces.pictures.recognition import shape_of
-from scvi_codegen.interfaces.pictures.shape import DrawnSystem, shape_of_picture
 from scvi_codegen.runs.stepping.array_interface import read_arrays
 from scvi_codegen.runs.stepping.noise import Noise
 from scvi_codegen.systems.arrays.system import ArraySystem

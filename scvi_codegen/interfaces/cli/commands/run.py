@@ -10,6 +10,8 @@ import click
 from scvi_codegen.analysis.advice.advice import missed_tolerance
 from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE
 from scvi_codegen.common.errors import ScviCodegenError
+from scvi_codegen.extras.pictures.animation import FILMS
+from scvi_codegen.extras.pictures.canvas import PICTURES, check_plot_path
 from scvi_codegen.interfaces.cli.command_group import (
     FAILURE,
     INTERRUPTED,
@@ -48,8 +50,6 @@ from scvi_codegen.interfaces.models.options import (
     WITH_INPUTS,
     check_available,
 )
-from scvi_codegen.interfaces.pictures.animation import FILMS
-from scvi_codegen.interfaces.pictures.canvas import PICTURES, check_plot_path
 from scvi_codegen.runs.accuracy.global_error import GlobalError
 from scvi_codegen.runs.results.export import FORMATS
 

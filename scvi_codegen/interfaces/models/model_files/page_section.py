@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.common.errors import ModelFileError
+from scvi_codegen.extras.pictures.shape import MARKS, DrawnSystem, entry_names, shape_of_picture
 from scvi_codegen.interfaces.models.model import Model
 from scvi_codegen.interfaces.models.model_files.sections import Section, check_keys
 from scvi_codegen.interfaces.models.options import real
-from scvi_codegen.interfaces.pictures.shape import MARKS, DrawnSystem, entry_names, shape_of_picture
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
 
 PAGE_KEYS = ("ranges", "speed", "plots")

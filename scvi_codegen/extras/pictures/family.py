@@ -11,7 +11,7 @@ import numpy as np
 from scvi_codegen.analysis.orbits.family import Family
 from scvi_codegen.analysis.orbits.solver import PeriodicOrbit
 from scvi_codegen.common.errors import MethodError
-from scvi_codegen.interfaces.pictures.canvas import COLORS, check_plot_path, color, new_figure, save, style
+from scvi_codegen.extras.pictures.canvas import COLORS, check_plot_path, color, new_figure, save, style
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.trajectory import Trajectory

@@ -19,10 +19,10 @@ import numpy as np
 
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.validation import CANVAS, NAMES, checks_arguments
-from scvi_codegen.interfaces.pictures.animation import drawn_shape, positions_of
-from scvi_codegen.interfaces.pictures.arrays import plot_arrays, plot_spectrum
-from scvi_codegen.interfaces.pictures.attitudes import draw_unit_vectors, plot_attitude
-from scvi_codegen.interfaces.pictures.canvas import (
+from scvi_codegen.extras.pictures.animation import drawn_shape, positions_of
+from scvi_codegen.extras.pictures.arrays import plot_arrays, plot_spectrum
+from scvi_codegen.extras.pictures.attitudes import draw_unit_vectors, plot_attitude
+from scvi_codegen.extras.pictures.canvas import (
     COLORS,
     MOTIONS,
     Array,
@@ -38,7 +38,7 @@ from scvi_codegen.interfaces.pictures.canvas import (
     smooth,
     style,
 )
-from scvi_codegen.interfaces.pictures.conserved import plot_energy, plot_momentum_maps
+from scvi_codegen.extras.pictures.conserved import plot_energy, plot_momentum_maps
 from scvi_codegen.runs.trajectory import Trajectory
 from scvi_codegen.systems.symmetry.sampling import AXES, bodies
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.validation import CANVAS, checks_arguments
-from scvi_codegen.interfaces.pictures.canvas import MOTIONS, Array, Motions, color, panel, plain, several
+from scvi_codegen.extras.pictures.canvas import MOTIONS, Array, Motions, color, panel, plain, several
 from scvi_codegen.runs.results.energy import energy_account
 from scvi_codegen.runs.trajectory import Trajectory
 
@@ -61,10 +61,10 @@ def plot_energy(trajectories: Motions, path: str | os.PathLike[str] | None = Non
 
     Args:
         trajectories: one or several trajectories, also of array systems.
-        path, ax: as of :func:`~scvi_codegen.interfaces.pictures.overview.plot_motion`.
+        path, ax: as of :func:`~scvi_codegen.extras.pictures.overview.plot_motion`.
 
     Raises:
-        StateError, PlotError: as :func:`~scvi_codegen.interfaces.pictures.overview.plot_motion`.
+        StateError, PlotError: as :func:`~scvi_codegen.extras.pictures.overview.plot_motion`.
     """
     with panel(path, ax) as axes:
         draw_energy_error(axes, several(trajectories)[0])
@@ -82,10 +82,10 @@ def plot_momentum_maps(
 
     Args:
         trajectory: trajectory of a system with symmetries, or several.
-        path, ax: as of :func:`~scvi_codegen.interfaces.pictures.overview.plot_motion`.
+        path, ax: as of :func:`~scvi_codegen.extras.pictures.overview.plot_motion`.
 
     Raises:
-        StateError, PlotError: as :func:`~scvi_codegen.interfaces.pictures.overview.plot_motion`; StateError without a
+        StateError, PlotError: as :func:`~scvi_codegen.extras.pictures.overview.plot_motion`; StateError without a
             symmetry.
     """
     motions = several(trajectory)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.common.errors import StateError, closest
 from scvi_codegen.common.validation import CANVAS, ArgumentType, checks_arguments
-from scvi_codegen.interfaces.pictures.canvas import color, panel, plain
+from scvi_codegen.extras.pictures.canvas import color, panel, plain
 from scvi_codegen.runs.states.words import NamedState
 from scvi_codegen.runs.trajectory import Trajectory
 
@@ -61,7 +61,7 @@ def plot_arrays(
 
     Args:
         trajectory: result of :meth:`Stepper.integrate`.
-        path, ax: as of :func:`~scvi_codegen.interfaces.pictures.overview.plot_motion`.
+        path, ax: as of :func:`~scvi_codegen.extras.pictures.overview.plot_motion`.
         array: name of the array or field; by default the first one with an index.
         state: index of the state drawn of two indices.
 

@@ -18,7 +18,7 @@ from scvi_codegen.common.atomic import replaced
 from scvi_codegen.common.errors import PlotError, StateError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import REAL, checks_arguments
-from scvi_codegen.interfaces.pictures.canvas import (
+from scvi_codegen.extras.pictures.canvas import (
     MOTIONS,
     Array,
     Motions,
@@ -29,8 +29,8 @@ from scvi_codegen.interfaces.pictures.canvas import (
     several,
     style,
 )
-from scvi_codegen.interfaces.pictures.recognition import shape_of
-from scvi_codegen.interfaces.pictures.shape import DrawnSystem, MovingShape, entry_names, shape_of_picture
+from scvi_codegen.extras.pictures.recognition import shape_of
+from scvi_codegen.extras.pictures.shape import DrawnSystem, MovingShape, entry_names, shape_of_picture
 from scvi_codegen.runs.stepping.step_plan import FixedSteps
 from scvi_codegen.runs.trajectory import Trajectory
 

@@ -13,7 +13,7 @@ import sympy
 from sympy import Expr, Matrix
 
 from scvi_codegen.common.errors import ExpressionError, StateError
-from scvi_codegen.interfaces.pictures.shape import DrawnSystem, MovingShape, PointProgram, graph_of
+from scvi_codegen.extras.pictures.shape import DrawnSystem, MovingShape, PointProgram, graph_of
 from scvi_codegen.systems.formulas.grammar import parse_expression
 from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.formulas.rotations import Rotation, RotationNames

@@ -9,7 +9,7 @@ import numpy as np
 
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.validation import CANVAS, WHOLE, checks_arguments
-from scvi_codegen.interfaces.pictures.canvas import MOTIONS, Array, Motions, color, panel, plain, several, smooth
+from scvi_codegen.extras.pictures.canvas import MOTIONS, Array, Motions, color, panel, plain, several, smooth
 from scvi_codegen.runs.trajectory import Trajectory
 
 if TYPE_CHECKING:
