@@ -4,10 +4,6 @@ from scvi_codegen.analysis.advice.advice import Advice as Advice
 from scvi_codegen.analysis.advice.advice import advise as advise
 from scvi_codegen.analysis.advice.solve_ivp import OdeResult as OdeResult
 from scvi_codegen.analysis.advice.solve_ivp import solve_ivp as solve_ivp
-from scvi_codegen.analysis.estimation.averages import Average as Average
-from scvi_codegen.analysis.estimation.averages import average as average
-from scvi_codegen.analysis.estimation.fitting import Fit as Fit
-from scvi_codegen.analysis.estimation.fitting import fit as fit
 from scvi_codegen.analysis.orbits.equilibrium import Equilibrium as Equilibrium
 from scvi_codegen.analysis.orbits.equilibrium import equilibrium as equilibrium
 from scvi_codegen.analysis.orbits.family import Bifurcation as Bifurcation
@@ -49,6 +45,10 @@ from scvi_codegen.common.errors import SystemDefinitionError as SystemDefinition
 from scvi_codegen.common.errors import SystemDefinitionWarning as SystemDefinitionWarning
 from scvi_codegen.common.errors import UnresolvedError as UnresolvedError
 from scvi_codegen.extras.chaos.indicators import ChaosIndicators as ChaosIndicators
+from scvi_codegen.extras.fits.averages import Average as Average
+from scvi_codegen.extras.fits.averages import average as average
+from scvi_codegen.extras.fits.fitting import Fit as Fit
+from scvi_codegen.extras.fits.fitting import fit as fit
 from scvi_codegen.extras.frameworks.casadi import casadi_flow as casadi_flow
 from scvi_codegen.extras.frameworks.casadi import casadi_step as casadi_step
 from scvi_codegen.extras.frameworks.flow import JaxFlow as JaxFlow

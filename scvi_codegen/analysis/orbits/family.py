@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.analysis.estimation.measurements import state_names
 from scvi_codegen.analysis.orbits.continuation import Continuation, FamilyPoint, Formula
 from scvi_codegen.analysis.orbits.equilibrium import Equilibrium
 from scvi_codegen.analysis.orbits.reversor import Reversor
@@ -32,6 +31,7 @@ from scvi_codegen.common.errors import (
 )
 from scvi_codegen.common.representation import counted, summary
 from scvi_codegen.common.validation import WHOLE, ArgumentType, check_kind, checked_count, checks_arguments, of
+from scvi_codegen.extras.fits.measurements import state_names
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import STEPPER, Stepper

@@ -29,8 +29,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.analysis.estimation.fixed_steps import tangents_along
-from scvi_codegen.analysis.estimation.measurements import state_names
 from scvi_codegen.analysis.orbits.constraint_manifold import reduction_of
 from scvi_codegen.analysis.orbits.reversor import Reversor
 from scvi_codegen.analysis.orbits.step_sequence import StepSequence
@@ -48,6 +46,8 @@ from scvi_codegen.common.errors import (
 )
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import checked_count, checks_arguments
+from scvi_codegen.extras.fits.fixed_steps import tangents_along
+from scvi_codegen.extras.fits.measurements import state_names
 from scvi_codegen.runs.accuracy.size import RESOLVED, SizeOfMotion, roundoff
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
 from scvi_codegen.runs.states.layout import InitialData

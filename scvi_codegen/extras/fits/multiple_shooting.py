@@ -13,8 +13,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.analysis.estimation.measurements import Measurements
 from scvi_codegen.common.errors import EventError, FitError, StepFailedError
+from scvi_codegen.extras.fits.measurements import Measurements
 from scvi_codegen.runs.driver.segments import parameters_at
 from scvi_codegen.runs.states.reduction import Reduction
 from scvi_codegen.runs.states.validation import Array

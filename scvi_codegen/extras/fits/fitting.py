@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.analysis.estimation.measurements import Measurements, distinct, state_names
-from scvi_codegen.analysis.estimation.multiple_shooting import LOOSE, TIGHT, Chain, Limits, chained, joined
 from scvi_codegen.codegen.native.arguments import real_array
 from scvi_codegen.common.errors import AccuracyWarning, FitError, StateError, StepFailedError, closest, warn
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import checked_count, checks_arguments
+from scvi_codegen.extras.fits.measurements import Measurements, distinct, state_names
+from scvi_codegen.extras.fits.multiple_shooting import LOOSE, TIGHT, Chain, Limits, chained, joined
 from scvi_codegen.runs.driver.segments import checked_inputs
 from scvi_codegen.runs.states.validation import Array, columns_of_inputs
 from scvi_codegen.runs.stepper import STEPPER, Stepper
