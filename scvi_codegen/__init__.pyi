@@ -4,13 +4,6 @@ from scvi_codegen.analysis.advice.advice import Advice as Advice
 from scvi_codegen.analysis.advice.advice import advise as advise
 from scvi_codegen.analysis.advice.solve_ivp import OdeResult as OdeResult
 from scvi_codegen.analysis.advice.solve_ivp import solve_ivp as solve_ivp
-from scvi_codegen.analysis.orbits.equilibrium import Equilibrium as Equilibrium
-from scvi_codegen.analysis.orbits.equilibrium import equilibrium as equilibrium
-from scvi_codegen.analysis.orbits.family import Bifurcation as Bifurcation
-from scvi_codegen.analysis.orbits.family import Family as Family
-from scvi_codegen.analysis.orbits.family import family as family
-from scvi_codegen.analysis.orbits.solver import PeriodicOrbit as PeriodicOrbit
-from scvi_codegen.analysis.orbits.solver import periodic_orbit as periodic_orbit
 from scvi_codegen.analysis.verification import Certificate as Certificate
 from scvi_codegen.analysis.verification import verify as verify
 from scvi_codegen.codegen.native.options import SolverOptions as SolverOptions
@@ -57,6 +50,13 @@ from scvi_codegen.extras.frameworks.optimal_control import ControlledMotion as C
 from scvi_codegen.extras.frameworks.optimal_control import optimal_control as optimal_control
 from scvi_codegen.extras.frameworks.torch import TorchFlow as TorchFlow
 from scvi_codegen.extras.frameworks.torch import torch_flow as torch_flow
+from scvi_codegen.extras.orbits.equilibrium import Equilibrium as Equilibrium
+from scvi_codegen.extras.orbits.equilibrium import equilibrium as equilibrium
+from scvi_codegen.extras.orbits.family import Bifurcation as Bifurcation
+from scvi_codegen.extras.orbits.family import Family as Family
+from scvi_codegen.extras.orbits.family import family as family
+from scvi_codegen.extras.orbits.solver import PeriodicOrbit as PeriodicOrbit
+from scvi_codegen.extras.orbits.solver import periodic_orbit as periodic_orbit
 from scvi_codegen.extras.paths.path import Path as Path
 from scvi_codegen.extras.pictures.animation import Film as Film
 from scvi_codegen.extras.pictures.animation import animate as animate

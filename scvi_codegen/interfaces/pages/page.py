@@ -21,8 +21,6 @@ from typing import Any
 import numpy as np
 import sympy
 
-from scvi_codegen.analysis.orbits.family import Family
-from scvi_codegen.analysis.orbits.solver import ERROR, PeriodicOrbit
 from scvi_codegen.codegen.rendering.environment import template_environment
 from scvi_codegen.codegen.rendering.source import Interface, Source
 from scvi_codegen.common.atomic import write_text
@@ -31,7 +29,9 @@ from scvi_codegen.common.display.page import mathematics_font
 from scvi_codegen.common.errors import ArgumentError, ExpressionError, MethodError, StateError, closest
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import ArgumentType, checks_arguments, keyword_hint, of
-from scvi_codegen.extras.pictures.family import sizes_of
+from scvi_codegen.extras.orbits.family import Family
+from scvi_codegen.extras.orbits.picture import sizes_of
+from scvi_codegen.extras.orbits.solver import ERROR, PeriodicOrbit
 from scvi_codegen.extras.pictures.recognition import shape_of
 from scvi_codegen.extras.pictures.shape import DrawnSystem, shape_of_picture
 from scvi_codegen.interfaces.models.model import DEFAULT_METHOD, Model

@@ -7,12 +7,12 @@ from typing import Any
 import click
 import numpy as np
 
-from scvi_codegen.analysis.orbits import family as families
-from scvi_codegen.analysis.orbits.continuation import Formula
-from scvi_codegen.analysis.orbits.equilibrium import Equilibrium, equilibrium
-from scvi_codegen.analysis.orbits.solver import PeriodicOrbit, periodic_orbit
 from scvi_codegen.common.errors import ModelFileError
 from scvi_codegen.common.representation import counted
+from scvi_codegen.extras.orbits import family as families
+from scvi_codegen.extras.orbits.continuation import Formula
+from scvi_codegen.extras.orbits.equilibrium import Equilibrium, equilibrium
+from scvi_codegen.extras.orbits.solver import PeriodicOrbit, periodic_orbit
 from scvi_codegen.extras.pictures.canvas import PICTURES, check_plot_path
 from scvi_codegen.interfaces.cli.command_group import check_writable, reporting, tell
 from scvi_codegen.interfaces.cli.model_options import model_arguments, read_model, with_known_sizes

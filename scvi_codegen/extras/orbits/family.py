@@ -12,11 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.analysis.orbits.continuation import Continuation, FamilyPoint, Formula
-from scvi_codegen.analysis.orbits.equilibrium import Equilibrium
-from scvi_codegen.analysis.orbits.reversor import Reversor
-from scvi_codegen.analysis.orbits.solver import OrbitSearch, PeriodicOrbit, bound_of, checked_part, gains_of, indices_of
-from scvi_codegen.analysis.orbits.step_sequence import StepSequence
 from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.atomic import write_atomically
@@ -32,6 +27,11 @@ from scvi_codegen.common.errors import (
 from scvi_codegen.common.representation import counted, summary
 from scvi_codegen.common.validation import WHOLE, ArgumentType, check_kind, checked_count, checks_arguments, of
 from scvi_codegen.extras.fits.measurements import state_names
+from scvi_codegen.extras.orbits.continuation import Continuation, FamilyPoint, Formula
+from scvi_codegen.extras.orbits.equilibrium import Equilibrium
+from scvi_codegen.extras.orbits.reversor import Reversor
+from scvi_codegen.extras.orbits.solver import OrbitSearch, PeriodicOrbit, bound_of, checked_part, gains_of, indices_of
+from scvi_codegen.extras.orbits.step_sequence import StepSequence
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import STEPPER, Stepper
@@ -274,7 +274,7 @@ class Family:
         Returns:
             The figure of matplotlib; a .png, .svg or .pdf is written if a path is passed.
         """
-        from scvi_codegen.extras.pictures.family import plot_family
+        from scvi_codegen.extras.orbits.picture import plot_family
 
         return plot_family(self, path)
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scvi_codegen.analysis.orbits.family import Family
-from scvi_codegen.analysis.orbits.solver import PeriodicOrbit
 from scvi_codegen.common.errors import MethodError
+from scvi_codegen.extras.orbits.family import Family
+from scvi_codegen.extras.orbits.solver import PeriodicOrbit
 from scvi_codegen.extras.pictures.canvas import COLORS, check_plot_path, color, new_figure, save, style
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runs.states.validation import Array

@@ -13,7 +13,7 @@ inverse), so the iteration converges to a nearby orbit without phase conditions.
 quantities are projected out (Munoz-Almaraz et al., Physica D 181 (2003) 1).
 
 Symmetric orbits start in the fixed set of a reversor R and return to it after half a period, which is computed alone:
-the end x has the defect (x - R x)/2; see :mod:`~scvi_codegen.analysis.orbits.reversor`.
+the end x has the defect (x - R x)/2; see :mod:`~scvi_codegen.extras.orbits.reversor`.
 """
 
 from __future__ import annotations
@@ -29,9 +29,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.analysis.orbits.constraint_manifold import reduction_of
-from scvi_codegen.analysis.orbits.reversor import Reversor
-from scvi_codegen.analysis.orbits.step_sequence import StepSequence
 from scvi_codegen.codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import (
@@ -48,6 +45,9 @@ from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import checked_count, checks_arguments
 from scvi_codegen.extras.fits.fixed_steps import tangents_along
 from scvi_codegen.extras.fits.measurements import state_names
+from scvi_codegen.extras.orbits.constraint_manifold import reduction_of
+from scvi_codegen.extras.orbits.reversor import Reversor
+from scvi_codegen.extras.orbits.step_sequence import StepSequence
 from scvi_codegen.runs.accuracy.size import RESOLVED, SizeOfMotion, roundoff
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
 from scvi_codegen.runs.states.layout import InitialData

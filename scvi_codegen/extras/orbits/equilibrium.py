@@ -14,11 +14,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.analysis.orbits.constraint_manifold import reduction_of
 from scvi_codegen.common.errors import OrbitError, StateError, StepFailedError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.extras.fits.fixed_steps import tangents_along
+from scvi_codegen.extras.orbits.constraint_manifold import reduction_of
 from scvi_codegen.runs.accuracy.size import RESOLVED, roundoff
 from scvi_codegen.runs.events.saltation import check_sides
 from scvi_codegen.runs.states.reduction import Reduction

@@ -31,8 +31,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.analysis.orbits.equilibrium import Equilibrium
-from scvi_codegen.analysis.orbits.solver import (
+from scvi_codegen.common.errors import EventError, OrbitError, StepFailedError
+from scvi_codegen.extras.orbits.equilibrium import Equilibrium
+from scvi_codegen.extras.orbits.solver import (
     DIFFERENCE_INCREMENT,
     EASY,
     NULL_SINGULAR_VALUE,
@@ -45,8 +46,7 @@ from scvi_codegen.analysis.orbits.solver import (
     PeriodicOrbit,
     block_diagonal,
 )
-from scvi_codegen.analysis.orbits.step_sequence import StepSequence
-from scvi_codegen.common.errors import EventError, OrbitError, StepFailedError
+from scvi_codegen.extras.orbits.step_sequence import StepSequence
 from scvi_codegen.runs.accuracy.size import RESOLVED, roundoff
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runs.states.validation import Array
