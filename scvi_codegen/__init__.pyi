@@ -38,6 +38,11 @@ from scvi_codegen.common.errors import SystemDefinitionError as SystemDefinition
 from scvi_codegen.common.errors import SystemDefinitionWarning as SystemDefinitionWarning
 from scvi_codegen.common.errors import UnresolvedError as UnresolvedError
 from scvi_codegen.extras.chaos.indicators import ChaosIndicators as ChaosIndicators
+from scvi_codegen.extras.fields.laws import ConservationLaw as ConservationLaw
+from scvi_codegen.extras.fields.laws import FieldDerivation as FieldDerivation
+from scvi_codegen.extras.fields.laws import LocalLaw as LocalLaw
+from scvi_codegen.extras.fields.mesh import MeshSystem as MeshSystem
+from scvi_codegen.extras.fields.system import FieldSystem as FieldSystem
 from scvi_codegen.extras.fits.averages import Average as Average
 from scvi_codegen.extras.fits.averages import average as average
 from scvi_codegen.extras.fits.fitting import Fit as Fit
@@ -69,11 +74,6 @@ from scvi_codegen.extras.pictures.overview import plot_motion as plot_motion
 from scvi_codegen.extras.pictures.overview import plot_phase as plot_phase
 from scvi_codegen.extras.pictures.overview import plot_section as plot_section
 from scvi_codegen.extras.pictures.overview import plot_trajectory as plot_trajectory
-from scvi_codegen.fields.laws import ConservationLaw as ConservationLaw
-from scvi_codegen.fields.laws import FieldDerivation as FieldDerivation
-from scvi_codegen.fields.laws import LocalLaw as LocalLaw
-from scvi_codegen.fields.mesh import MeshSystem as MeshSystem
-from scvi_codegen.fields.system import FieldSystem as FieldSystem
 from scvi_codegen.interfaces.derivation.equations import StepEquations as StepEquations
 from scvi_codegen.interfaces.derivation.equations import derive as derive
 from scvi_codegen.interfaces.models.model import Model as Model

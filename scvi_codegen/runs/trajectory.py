@@ -425,7 +425,7 @@ class Trajectory(
     def unresolved(self) -> Array:
         """Return (n,) parts of the squared amplitude in the highest modes of the mesh of fields (resolution monitor).
 
-        See :meth:`~scvi_codegen.fields.mesh.Mesh.unresolved`; the largest of all fields.
+        See :meth:`~scvi_codegen.extras.fields.mesh.Mesh.unresolved`; the largest of all fields.
 
         Raises:
             MethodError: if the system is not that of a mesh.

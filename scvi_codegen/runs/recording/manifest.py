@@ -240,7 +240,7 @@ class Manifest:
         """Return the mesh of the fields of a density, or ``None``."""
         if self.mesh is None:
             return None
-        from scvi_codegen.fields.system import FieldSystem  # here, because it imports SymPy
+        from scvi_codegen.extras.fields.system import FieldSystem  # here, because it imports SymPy
 
         try:
             section = dict(self.mesh["field"])

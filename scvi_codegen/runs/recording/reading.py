@@ -106,7 +106,7 @@ class RecordedRun(AttitudeHistory, OfMethod):
 
     @cached_property
     def mesh(self) -> Any:
-        """Mesh of the fields of a density (:class:`~scvi_codegen.fields.mesh.MeshSystem`), or ``None``."""
+        """Mesh of the fields of a density (:class:`~scvi_codegen.extras.fields.mesh.MeshSystem`), or ``None``."""
         return self.manifest.mesh_of_fields(self.folder)
 
     @property

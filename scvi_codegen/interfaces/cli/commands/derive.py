@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from scvi_codegen.fields.laws import derivation_of
+from scvi_codegen.extras.fields.laws import derivation_of
 from scvi_codegen.interfaces.cli.command_group import check_writable, emit, reporting
 from scvi_codegen.interfaces.cli.model_options import model_arguments, read_model, with_known_sizes
 from scvi_codegen.interfaces.derivation import derivation_html

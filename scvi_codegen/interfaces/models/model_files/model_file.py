@@ -199,9 +199,7 @@ def _read_model(document: Document, changes: Document, folder: str | os.PathLike
     with warnings.catch_warnings():  # other formulas than that of the system may use its parameters
         warnings.simplefilter("ignore", SystemDefinitionWarning)
         if "field" in document:
-            from scvi_codegen.interfaces.models.model_files.field_section import (
-                read_field,  # not needed for other systems
-            )
+            from scvi_codegen.extras.fields.section import read_field  # not needed for other systems
 
             system = read_field(document)
         else:

@@ -130,9 +130,7 @@ def _values_of_arrays(
         name = system.rotations[0].member.name
         raise ModelFileError(f"sizes of arrays of rotations, directions and spins must be numbers, as '{name}[3]'")
     if system.mesh is not None:
-        from scvi_codegen.interfaces.models.model_files.field_section import (
-            fields_at_points,  # not needed for other systems
-        )
+        from scvi_codegen.extras.fields.section import fields_at_points  # not needed for other systems
 
         document = {**document, "initial": fields_at_points(document["initial"], system)}
     for key, value in document.get("tables", {}).items():

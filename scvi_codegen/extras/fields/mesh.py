@@ -12,9 +12,16 @@ from scvi_codegen.codegen.lowering.arrays import one_coordinate
 from scvi_codegen.codegen.pipeline import program_of
 from scvi_codegen.common.errors import StateError, closest
 from scvi_codegen.common.representation import summary
-from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis
-from scvi_codegen.fields.density import Density
-from scvi_codegen.fields.laws import FieldDerivation, FieldHistory, LocalLaw, chosen_laws, derivation_of, local_law
+from scvi_codegen.extras.fields.axes import NATURAL, PERIODIC, Axis
+from scvi_codegen.extras.fields.density import Density
+from scvi_codegen.extras.fields.laws import (
+    FieldDerivation,
+    FieldHistory,
+    LocalLaw,
+    chosen_laws,
+    derivation_of,
+    local_law,
+)
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.systems.formulas.array_statements import array_text

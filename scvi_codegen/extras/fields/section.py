@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.common.errors import ModelFileError
-from scvi_codegen.fields.mesh import Mesh
-from scvi_codegen.fields.system import FieldSystem
+from scvi_codegen.extras.fields.mesh import Mesh
+from scvi_codegen.extras.fields.system import FieldSystem
 from scvi_codegen.interfaces.models.model_files.sections import Document, Section, check_keys, in_section
 from scvi_codegen.interfaces.models.options import real
 from scvi_codegen.systems.formulas.grammar import parse_expression

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from sympy import Add, Expr, Float, Rational, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.fields.axes import Axis, Cells, fixed_place, rational, same, span
-from scvi_codegen.fields.density import Density, place_text
-from scvi_codegen.fields.mesh import Mesh, MeshSystem
+from scvi_codegen.extras.fields.axes import Axis, Cells, fixed_place, rational, same, span
+from scvi_codegen.extras.fields.density import Density, place_text
+from scvi_codegen.extras.fields.mesh import Mesh, MeshSystem
 from scvi_codegen.systems.arrays.system import ArrayHamiltonian, ArrayLagrangian, friction
 from scvi_codegen.systems.formulas.array_statements import ArrayForce, array_text
 from scvi_codegen.systems.formulas.arrays import MAX_UNROLLED_TERMS, ArrayTerm, term_of

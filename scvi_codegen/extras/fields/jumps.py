@@ -13,8 +13,8 @@ import sympy
 from sympy import Expr
 
 from scvi_codegen.common.errors import SystemDefinitionWarning, warn
-from scvi_codegen.fields.axes import Axis
-from scvi_codegen.fields.density import Density
+from scvi_codegen.extras.fields.axes import Axis
+from scvi_codegen.extras.fields.density import Density
 from scvi_codegen.systems.formulas.symbols import symbol
 
 SAMPLES, HALVINGS = 65, 40

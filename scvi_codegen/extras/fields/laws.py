@@ -29,8 +29,8 @@ from sympy.core.function import AppliedUndef
 
 from scvi_codegen.common.errors import AccuracyWarning, StateError, StepFailedError, closest, warn
 from scvi_codegen.common.representation import summary
-from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis
-from scvi_codegen.fields.density import Density, place_text
+from scvi_codegen.extras.fields.axes import NATURAL, PERIODIC, Axis
+from scvi_codegen.extras.fields.density import Density, place_text
 from scvi_codegen.systems.formulas.expressions import sums_to_zero
 from scvi_codegen.systems.formulas.symbols import TIME, symbol
 from scvi_codegen.systems.formulas.translation import format_expression

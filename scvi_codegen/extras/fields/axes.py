@@ -38,7 +38,7 @@ from sympy import Expr, Rational
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.precision import Matrix, Number, Vector, mp
 from scvi_codegen.common.validation import checked_count
-from scvi_codegen.fields.density import Density
+from scvi_codegen.extras.fields.density import Density
 from scvi_codegen.methods.tables.basis import differentiation_matrix, identity_matrix, matrix_product
 from scvi_codegen.methods.tables.nodes import point_count
 from scvi_codegen.methods.tables.quadrature import Quadrature, gauss_lobatto

@@ -14,12 +14,12 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.validation import checks_arguments
-from scvi_codegen.fields.assembly import Assembly
-from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis, FiniteDifferences, Fourier, SpectralElements
-from scvi_codegen.fields.density import Density, derivatives_of
-from scvi_codegen.fields.jumps import warn_of_jumps
-from scvi_codegen.fields.laws import FieldDerivation, derivation_of
-from scvi_codegen.fields.mesh import MeshSystem
+from scvi_codegen.extras.fields.assembly import Assembly
+from scvi_codegen.extras.fields.axes import NATURAL, PERIODIC, Axis, FiniteDifferences, Fourier, SpectralElements
+from scvi_codegen.extras.fields.density import Density, derivatives_of
+from scvi_codegen.extras.fields.jumps import warn_of_jumps
+from scvi_codegen.extras.fields.laws import FieldDerivation, derivation_of
+from scvi_codegen.extras.fields.mesh import MeshSystem
 from scvi_codegen.systems.formulas.array_statements import array_text
 from scvi_codegen.systems.formulas.grammar import parse_expression
 from scvi_codegen.systems.formulas.symbols import TIME, check_names, number, symbol
@@ -37,7 +37,7 @@ class FieldSystem(Density):
     A Hamiltonian density H(u, p, u_x, p_x, ..) describes fields of first order in time, u_t = dH/dp, p_t = -dH/du, with
     variational derivatives. Build it with :meth:`from_text` or :meth:`from_sympy`; :meth:`discretise` returns a system
     that :func:`~scvi_codegen.compile_stepper` compiles. The attributes are those of
-    :class:`~scvi_codegen.fields.density.Density`.
+    :class:`~scvi_codegen.extras.fields.density.Density`.
     """
 
     @classmethod
