@@ -38,6 +38,9 @@ from scvi_codegen.common.errors import SystemDefinitionError as SystemDefinition
 from scvi_codegen.common.errors import SystemDefinitionWarning as SystemDefinitionWarning
 from scvi_codegen.common.errors import UnresolvedError as UnresolvedError
 from scvi_codegen.extras.chaos.indicators import ChaosIndicators as ChaosIndicators
+from scvi_codegen.extras.exact.discrete_lagrangian import ExactStep as ExactStep
+from scvi_codegen.extras.exact.discrete_lagrangian import exact_discrete_lagrangian as exact_discrete_lagrangian
+from scvi_codegen.extras.exact.discrete_lagrangian import exact_map as exact_map
 from scvi_codegen.extras.fields.laws import ConservationLaw as ConservationLaw
 from scvi_codegen.extras.fields.laws import FieldDerivation as FieldDerivation
 from scvi_codegen.extras.fields.laws import LocalLaw as LocalLaw
@@ -101,9 +104,6 @@ from scvi_codegen.methods import RungeKutta as RungeKutta
 from scvi_codegen.methods import SpectralCollocation as SpectralCollocation
 from scvi_codegen.methods import StoermerVerlet as StoermerVerlet
 from scvi_codegen.methods import as_method as as_method
-from scvi_codegen.methods.exact.discrete_lagrangian import ExactStep as ExactStep
-from scvi_codegen.methods.exact.discrete_lagrangian import exact_discrete_lagrangian as exact_discrete_lagrangian
-from scvi_codegen.methods.exact.discrete_lagrangian import exact_map as exact_map
 from scvi_codegen.methods.explicit import ExplicitMethod as ExplicitMethod
 from scvi_codegen.methods.recurrence import ExplicitStep as ExplicitStep
 from scvi_codegen.methods.tables.nodes import Nodes as Nodes

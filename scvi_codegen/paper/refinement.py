@@ -19,8 +19,8 @@ from scvi_codegen.common.display.page import Cell, TableBlock
 from scvi_codegen.common.errors import StepFailedError
 from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.common.toml_text import package_table
+from scvi_codegen.extras.exact.step import derived_step
 from scvi_codegen.methods import SVI, SpectralCollocation
-from scvi_codegen.methods.exact.step import derived_step
 from scvi_codegen.methods.method import Method
 from scvi_codegen.paper.experiment import Array, Comparison, Experiment, Panel, Picture, Result, Series, comparison
 from scvi_codegen.paper.runs import KEPLER, ROUNDOFF, stepper_of, system_of

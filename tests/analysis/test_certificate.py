@@ -26,9 +26,9 @@ from scvi_codegen.codegen.lowering import stage_groups
 from scvi_codegen.codegen.native import announcements
 from scvi_codegen.codegen.rendering.kernels import printer
 from scvi_codegen.common.precision import mp
+from scvi_codegen.extras.exact.solution import exact_motion
+from scvi_codegen.extras.exact.step import derived_step
 from scvi_codegen.methods import constraints, stage_system
-from scvi_codegen.methods.exact.solution import exact_motion
-from scvi_codegen.methods.exact.step import derived_step
 from scvi_codegen.runs import compiler
 from scvi_codegen.systems import derived_expressions
 from scvi_codegen.systems.formulas.expressions import evaluate

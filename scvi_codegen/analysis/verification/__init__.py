@@ -1,9 +1,9 @@
 """Certificates of integrators: measurement of every guaranteed property of the code as built.
 
 Three independent computations are compared. The *compiled* step is compared with the paper's equations solved in 60
-digits (:mod:`scvi_codegen.methods.exact.step`) and, for its structure, with finite differences of itself. *These
+digits (:mod:`scvi_codegen.extras.exact.step`) and, for its structure, with finite differences of itself. *These
 digits* are compared with the exact motion, computed from the formula of L or H alone
-(:mod:`scvi_codegen.methods.exact.solution`), and with other methods that are the same map. An error in the printed C,
+(:mod:`scvi_codegen.extras.exact.solution`), and with other methods that are the same map. An error in the printed C,
 the tables, a kernel or a solver shows in the first comparison; an error in the derivation, which both sides share, in
 the second.
 

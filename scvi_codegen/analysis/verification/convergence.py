@@ -18,6 +18,8 @@ from scvi_codegen.analysis.verification.certificate import Check, Finding, check
 from scvi_codegen.analysis.verification.system_under_test import LARGEST_RATIO, State, SystemUnderTest
 from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.common.precision import Number, mp
+from scvi_codegen.extras.exact.solution import exact_motion, numbers
+from scvi_codegen.extras.exact.step import derived_step
 from scvi_codegen.methods import (
     SCVI,
     SVI,
@@ -30,8 +32,6 @@ from scvi_codegen.methods import (
     StoermerVerlet,
     method_from_specification,
 )
-from scvi_codegen.methods.exact.solution import exact_motion, numbers
-from scvi_codegen.methods.exact.step import derived_step
 from scvi_codegen.methods.tables.quadrature import (
     Quadrature,
     clenshaw_curtis,

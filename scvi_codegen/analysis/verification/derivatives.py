@@ -21,9 +21,9 @@ from scvi_codegen.analysis.verification.system_under_test import (
 from scvi_codegen.analysis.verification.variable_steps import VariableSteps
 from scvi_codegen.common.errors import MethodError
 from scvi_codegen.common.precision import Number, mp
+from scvi_codegen.extras.exact.solution import exact_motion
+from scvi_codegen.extras.exact.step import compiled_equations
 from scvi_codegen.methods.discretise import is_symplectic
-from scvi_codegen.methods.exact.solution import exact_motion
-from scvi_codegen.methods.exact.step import compiled_equations
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.step_derivatives import Starts

@@ -27,8 +27,8 @@ from scvi_codegen.analysis.verification.system_under_test import (
 from scvi_codegen.codegen.rendering.events import EventFormulas
 from scvi_codegen.common.errors import EventWarning, StateError
 from scvi_codegen.common.precision import mp
+from scvi_codegen.extras.exact.solution import ExactMotion, Numbers, exact_motion, numbers, solved
 from scvi_codegen.methods.discretise import is_symplectic
-from scvi_codegen.methods.exact.solution import ExactMotion, Numbers, exact_motion, numbers, solved
 from scvi_codegen.runs.results.recomputation import changes_by_events
 from scvi_codegen.runs.results.saved_states import parameters_on_sides
 from scvi_codegen.runs.states.validation import Array

@@ -27,8 +27,8 @@ from scvi_codegen.analysis.verification.system_under_test import (
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.precision import mp
+from scvi_codegen.extras.exact.solution import numbers
 from scvi_codegen.methods import SCVI
-from scvi_codegen.methods.exact.solution import numbers
 from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings
 from scvi_codegen.runs.ensembles.individual import runs_of
 from scvi_codegen.runs.ensembles.lanes import CommonRuns, LaneRuns

@@ -25,9 +25,9 @@ from scvi_codegen.analysis.verification.system_under_test import (
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.common.precision import mp
+from scvi_codegen.extras.exact.solution import Numbers, numbers
+from scvi_codegen.extras.exact.step import SolvedStep, compiled_equations
 from scvi_codegen.methods.discretise import discretise, in_moving_frame
-from scvi_codegen.methods.exact.solution import Numbers, numbers
-from scvi_codegen.methods.exact.step import SolvedStep, compiled_equations
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
 

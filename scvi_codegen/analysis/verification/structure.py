@@ -21,8 +21,8 @@ from scvi_codegen.analysis.verification.system_under_test import (
 )
 from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.common.precision import mp
+from scvi_codegen.extras.exact.solution import numbers
 from scvi_codegen.methods.discretise import is_conformally_symplectic, is_symplectic
-from scvi_codegen.methods.exact.solution import numbers
 from scvi_codegen.runs.states.reduction import Reduction
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.trajectory import Trajectory

@@ -10,8 +10,8 @@ from scvi_codegen.codegen.native.announcements import tell
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import EventError, StateError, StepFailedError
 from scvi_codegen.common.precision import Number, mp
-from scvi_codegen.methods.exact.solution import ExactMotion, exact_motion, numbers
-from scvi_codegen.methods.exact.step import DerivedStep, SolvedStep, derived_step
+from scvi_codegen.extras.exact.solution import ExactMotion, exact_motion, numbers
+from scvi_codegen.extras.exact.step import DerivedStep, SolvedStep, derived_step
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper

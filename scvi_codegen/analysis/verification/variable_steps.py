@@ -17,7 +17,7 @@ from scvi_codegen.analysis.verification.system_under_test import (
     SystemUnderTest,
 )
 from scvi_codegen.common.precision import mp
-from scvi_codegen.methods.exact.solution import ExactMotion, exact_motion, numbers
+from scvi_codegen.extras.exact.solution import ExactMotion, exact_motion, numbers
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.trajectory import Trajectory

@@ -18,8 +18,8 @@ import sympy
 
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.precision import Number, mp
-from scvi_codegen.methods.exact.newton import Array as Numbers
-from scvi_codegen.methods.exact.newton import Floats, NotConvergedError, Solve, newton, solver
+from scvi_codegen.extras.exact.newton import Array as Numbers
+from scvi_codegen.extras.exact.newton import Floats, NotConvergedError, Solve, newton, solver
 from scvi_codegen.systems.constraints import force_directions, position_conditions, velocity_conditions
 from scvi_codegen.systems.first_order import FirstOrderSystem
 from scvi_codegen.systems.formulas.expressions import Tape, jacobian

@@ -20,9 +20,9 @@ import numpy as np
 
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.precision import Number, mp
+from scvi_codegen.extras.exact.newton import NotConvergedError, Solve, newton
+from scvi_codegen.extras.exact.solution import Numbers, exact_motion, numbers
 from scvi_codegen.methods.discretise import MIDDLE, discretise, reference_equations
-from scvi_codegen.methods.exact.newton import NotConvergedError, Solve, newton
-from scvi_codegen.methods.exact.solution import Numbers, exact_motion, numbers
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import StageGroup, StageSystem, Velocities, straight
 from scvi_codegen.systems.formulas.expressions import Tape

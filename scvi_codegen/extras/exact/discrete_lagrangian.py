@@ -3,7 +3,7 @@
     L_d^E(q0, q1) = integral of L(q(t), q'(t), t) from t to t + h, q the solution of (2) with q(t) = q0, q(t + h) = q1.
 
 Its derivatives are the momenta of that solution at its ends, p0 = -D_1 L_d^E and p1 = D_2 L_d^E, which yield the exact
-discrete Legendre transforms and the exact flow. The solution is computed by :mod:`scvi_codegen.methods.exact.curve` on
+discrete Legendre transforms and the exact flow. The solution is computed by :mod:`scvi_codegen.extras.exact.curve` on
 successively finer grids, until two in a row agree to the requested digits.
 """
 
@@ -19,9 +19,9 @@ from scvi_codegen.common.errors import StateError, closest
 from scvi_codegen.common.precision import Number, Vector, mp
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import MAPPING, NUMBERS, ArgumentType, checked_count, checks_arguments, of
-from scvi_codegen.methods.exact.curve import Curve, Grid
-from scvi_codegen.methods.exact.newton import Array, NotConvergedError, largest
-from scvi_codegen.methods.exact.solution import ExactMotion
+from scvi_codegen.extras.exact.curve import Curve, Grid
+from scvi_codegen.extras.exact.newton import Array, NotConvergedError, largest
+from scvi_codegen.extras.exact.solution import ExactMotion
 from scvi_codegen.systems.arrays.system import ArrayLagrangian
 from scvi_codegen.systems.kinks import check_continuity
 from scvi_codegen.systems.lagrangian import LagrangianSystem
