@@ -4,8 +4,6 @@ from scvi_codegen.analysis.advice.advice import Advice as Advice
 from scvi_codegen.analysis.advice.advice import advise as advise
 from scvi_codegen.analysis.advice.solve_ivp import OdeResult as OdeResult
 from scvi_codegen.analysis.advice.solve_ivp import solve_ivp as solve_ivp
-from scvi_codegen.analysis.verification import Certificate as Certificate
-from scvi_codegen.analysis.verification import verify as verify
 from scvi_codegen.codegen.native.options import SolverOptions as SolverOptions
 from scvi_codegen.codegen.pipeline import generate_source as generate_source
 from scvi_codegen.common.cache import CacheInfo as CacheInfo
@@ -77,6 +75,8 @@ from scvi_codegen.extras.pictures.overview import plot_motion as plot_motion
 from scvi_codegen.extras.pictures.overview import plot_phase as plot_phase
 from scvi_codegen.extras.pictures.overview import plot_section as plot_section
 from scvi_codegen.extras.pictures.overview import plot_trajectory as plot_trajectory
+from scvi_codegen.extras.verification import Certificate as Certificate
+from scvi_codegen.extras.verification import verify as verify
 from scvi_codegen.interfaces.derivation.equations import StepEquations as StepEquations
 from scvi_codegen.interfaces.derivation.equations import derive as derive
 from scvi_codegen.interfaces.models.model import Model as Model

@@ -7,17 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.analysis.verification.certificate import Check, Finding, checked
-from scvi_codegen.analysis.verification.structure import momentum_error
-from scvi_codegen.analysis.verification.system_under_test import (
-    EPSILON,
-    ROUNDINGS,
-    STEP_DIVISOR,
-    State,
-    SystemUnderTest,
-)
 from scvi_codegen.common.precision import mp
 from scvi_codegen.extras.exact.solution import ExactMotion, exact_motion, numbers
+from scvi_codegen.extras.verification.certificate import Check, Finding, checked
+from scvi_codegen.extras.verification.structure import momentum_error
+from scvi_codegen.extras.verification.system_under_test import EPSILON, ROUNDINGS, STEP_DIVISOR, State, SystemUnderTest
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.trajectory import Trajectory

@@ -11,8 +11,13 @@ from functools import partial
 
 import numpy as np
 
-from scvi_codegen.analysis.verification.certificate import Check, Finding, ViolationError, checked
-from scvi_codegen.analysis.verification.system_under_test import (
+from scvi_codegen.codegen.native.options import SolverOptions
+from scvi_codegen.common.errors import StateError, StepFailedError
+from scvi_codegen.common.precision import mp
+from scvi_codegen.extras.exact.solution import Numbers, numbers
+from scvi_codegen.extras.exact.step import SolvedStep, compiled_equations
+from scvi_codegen.extras.verification.certificate import Check, Finding, ViolationError, checked
+from scvi_codegen.extras.verification.system_under_test import (
     EPSILON,
     LARGEST_RATIO,
     MAX_UNKNOWNS,
@@ -22,11 +27,6 @@ from scvi_codegen.analysis.verification.system_under_test import (
     State,
     SystemUnderTest,
 )
-from scvi_codegen.codegen.native.options import SolverOptions
-from scvi_codegen.common.errors import StateError, StepFailedError
-from scvi_codegen.common.precision import mp
-from scvi_codegen.extras.exact.solution import Numbers, numbers
-from scvi_codegen.extras.exact.step import SolvedStep, compiled_equations
 from scvi_codegen.methods.discretise import discretise, in_moving_frame
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper

@@ -20,19 +20,19 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.analysis.verification.arrays import state_of_fields, verify_arrays
-from scvi_codegen.analysis.verification.certificate import Certificate, Check, Outcome, issued
-from scvi_codegen.analysis.verification.convergence import convergence_checks, identity_checks
-from scvi_codegen.analysis.verification.derivatives import derivative_checks, time_transformation_derivative_checks
-from scvi_codegen.analysis.verification.impacts import STEPS, impact_checks, run_of, transition_checks
-from scvi_codegen.analysis.verification.roundoff import roundoff_checks
-from scvi_codegen.analysis.verification.stepping import predictor_checks, step_checks
-from scvi_codegen.analysis.verification.structure import largest_step, structure_checks
-from scvi_codegen.analysis.verification.system_under_test import State, SystemUnderTest
-from scvi_codegen.analysis.verification.variable_steps import VariableSteps, at_fixed_energy, variable_step_checks
 from scvi_codegen.codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.common.validation import checks_arguments
+from scvi_codegen.extras.verification.arrays import state_of_fields, verify_arrays
+from scvi_codegen.extras.verification.certificate import Certificate, Check, Outcome, issued
+from scvi_codegen.extras.verification.convergence import convergence_checks, identity_checks
+from scvi_codegen.extras.verification.derivatives import derivative_checks, time_transformation_derivative_checks
+from scvi_codegen.extras.verification.impacts import STEPS, impact_checks, run_of, transition_checks
+from scvi_codegen.extras.verification.roundoff import roundoff_checks
+from scvi_codegen.extras.verification.stepping import predictor_checks, step_checks
+from scvi_codegen.extras.verification.structure import largest_step, structure_checks
+from scvi_codegen.extras.verification.system_under_test import State, SystemUnderTest
+from scvi_codegen.extras.verification.variable_steps import VariableSteps, at_fixed_energy, variable_step_checks
 from scvi_codegen.methods import as_method, sliding
 from scvi_codegen.methods.discretise import discretised_form
 from scvi_codegen.methods.method import Method

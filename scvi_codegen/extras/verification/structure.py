@@ -6,8 +6,11 @@ from functools import partial
 
 import numpy as np
 
-from scvi_codegen.analysis.verification.certificate import Check, Finding, checked, information
-from scvi_codegen.analysis.verification.system_under_test import (
+from scvi_codegen.common.errors import StateError, StepFailedError
+from scvi_codegen.common.precision import mp
+from scvi_codegen.extras.exact.solution import numbers
+from scvi_codegen.extras.verification.certificate import Check, Finding, checked, information
+from scvi_codegen.extras.verification.system_under_test import (
     BOUND,
     CONSECUTIVE_STEPS,
     EPSILON,
@@ -19,9 +22,6 @@ from scvi_codegen.analysis.verification.system_under_test import (
     SystemUnderTest,
     canonical_form,
 )
-from scvi_codegen.common.errors import StateError, StepFailedError
-from scvi_codegen.common.precision import mp
-from scvi_codegen.extras.exact.solution import numbers
 from scvi_codegen.methods.discretise import is_conformally_symplectic, is_symplectic
 from scvi_codegen.runs.states.reduction import Reduction
 from scvi_codegen.runs.states.validation import Array

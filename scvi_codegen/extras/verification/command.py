@@ -7,9 +7,9 @@ from typing import Any
 
 import click
 
-from scvi_codegen.analysis import verification
-from scvi_codegen.analysis.verification import Certificate
 from scvi_codegen.common.errors import PackageError
+from scvi_codegen.extras import verification
+from scvi_codegen.extras.verification import Certificate
 from scvi_codegen.interfaces.cli.command_group import FAILURE, CommandFailure, check_writable, note, reporting, tell
 from scvi_codegen.interfaces.cli.model_options import (
     Choices,

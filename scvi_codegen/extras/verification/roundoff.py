@@ -16,18 +16,18 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from scvi_codegen.analysis.verification.certificate import Check, Finding, ViolationError, checked
-from scvi_codegen.analysis.verification.system_under_test import (
+from scvi_codegen.codegen.native.options import SolverOptions
+from scvi_codegen.common.errors import StateError
+from scvi_codegen.common.precision import mp
+from scvi_codegen.extras.exact.solution import numbers
+from scvi_codegen.extras.verification.certificate import Check, Finding, ViolationError, checked
+from scvi_codegen.extras.verification.system_under_test import (
     CONSECUTIVE_STEPS,
     EPSILON,
     ROUNDINGS,
     State,
     SystemUnderTest,
 )
-from scvi_codegen.codegen.native.options import SolverOptions
-from scvi_codegen.common.errors import StateError
-from scvi_codegen.common.precision import mp
-from scvi_codegen.extras.exact.solution import numbers
 from scvi_codegen.methods import SCVI
 from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings
 from scvi_codegen.runs.ensembles.individual import runs_of

@@ -1,7 +1,7 @@
 """Checks of convergence to the exact motion, in h and in the degree, in 60-digit arithmetic, above all round-off.
 
 The compiled step equals the step in 60 digits up to round-off, which
-:mod:`~scvi_codegen.analysis.verification.stepping` checks; here the latter is compared with the exact motion, which is
+:mod:`~scvi_codegen.extras.verification.stepping` checks; here the latter is compared with the exact motion, which is
 computed from the formula of L or H alone.
 
 Methods that are the same map are solved in 60 digits by different paths through the generator, and compared.
@@ -14,12 +14,12 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from scvi_codegen.analysis.verification.certificate import Check, Finding, checked
-from scvi_codegen.analysis.verification.system_under_test import LARGEST_RATIO, State, SystemUnderTest
 from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.extras.exact.solution import exact_motion, numbers
 from scvi_codegen.extras.exact.step import derived_step
+from scvi_codegen.extras.verification.certificate import Check, Finding, checked
+from scvi_codegen.extras.verification.system_under_test import LARGEST_RATIO, State, SystemUnderTest
 from scvi_codegen.methods import (
     SCVI,
     SVI,

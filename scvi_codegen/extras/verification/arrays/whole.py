@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sympy import Expr
 
-from scvi_codegen.analysis.verification.certificate import Check, Finding, Outcome, checked, information
 from scvi_codegen.common.errors import StepFailedError
+from scvi_codegen.extras.verification.certificate import Check, Finding, Outcome, checked, information
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.driver.run import Run
 from scvi_codegen.runs.stepper import Stepper

@@ -10,19 +10,13 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.analysis.verification.certificate import Check, Finding, checked
-from scvi_codegen.analysis.verification.system_under_test import (
-    BOUND,
-    ROUND_OFF,
-    State,
-    SystemUnderTest,
-    canonical_form,
-)
-from scvi_codegen.analysis.verification.variable_steps import VariableSteps
 from scvi_codegen.common.errors import MethodError
 from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.extras.exact.solution import exact_motion
 from scvi_codegen.extras.exact.step import compiled_equations
+from scvi_codegen.extras.verification.certificate import Check, Finding, checked
+from scvi_codegen.extras.verification.system_under_test import BOUND, ROUND_OFF, State, SystemUnderTest, canonical_form
+from scvi_codegen.extras.verification.variable_steps import VariableSteps
 from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper

@@ -10,9 +10,13 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 import sympy
 
-from scvi_codegen.analysis.verification.certificate import Check, Finding, checked
-from scvi_codegen.analysis.verification.convergence import MAX_HALVINGS
-from scvi_codegen.analysis.verification.system_under_test import (
+from scvi_codegen.codegen.rendering.events import EventFormulas
+from scvi_codegen.common.errors import EventWarning, StateError
+from scvi_codegen.common.precision import mp
+from scvi_codegen.extras.exact.solution import ExactMotion, Numbers, exact_motion, numbers, solved
+from scvi_codegen.extras.verification.certificate import Check, Finding, checked
+from scvi_codegen.extras.verification.convergence import MAX_HALVINGS
+from scvi_codegen.extras.verification.system_under_test import (
     EPSILON,
     ROUND_OFF,
     ROUNDINGS,
@@ -24,10 +28,6 @@ from scvi_codegen.analysis.verification.system_under_test import (
     canonical_form,
     linearised,
 )
-from scvi_codegen.codegen.rendering.events import EventFormulas
-from scvi_codegen.common.errors import EventWarning, StateError
-from scvi_codegen.common.precision import mp
-from scvi_codegen.extras.exact.solution import ExactMotion, Numbers, exact_motion, numbers, solved
 from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.runs.results.recomputation import changes_by_events
 from scvi_codegen.runs.results.saved_states import parameters_on_sides

@@ -13,15 +13,15 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.analysis.verification.arrays.whole import WholeStart, whole_checks
-from scvi_codegen.analysis.verification.certificate import Certificate, Check, Finding, checked, information, issued
-from scvi_codegen.analysis.verification.convergence import convergence_checks
-from scvi_codegen.analysis.verification.impacts import impact_checks
-from scvi_codegen.analysis.verification.stepping import step_checks
-from scvi_codegen.analysis.verification.structure import structure_checks
-from scvi_codegen.analysis.verification.system_under_test import State, SystemUnderTest
 from scvi_codegen.codegen.rendering.source import Interface
 from scvi_codegen.common.errors import StateError
+from scvi_codegen.extras.verification.arrays.whole import WholeStart, whole_checks
+from scvi_codegen.extras.verification.certificate import Certificate, Check, Finding, checked, information, issued
+from scvi_codegen.extras.verification.convergence import convergence_checks
+from scvi_codegen.extras.verification.impacts import impact_checks
+from scvi_codegen.extras.verification.stepping import step_checks
+from scvi_codegen.extras.verification.structure import structure_checks
+from scvi_codegen.extras.verification.system_under_test import State, SystemUnderTest
 from scvi_codegen.methods import SVI, StoermerVerlet
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.compiler import compile_stepper
