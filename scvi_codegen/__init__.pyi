@@ -36,6 +36,8 @@ from scvi_codegen.common.errors import SystemDefinitionError as SystemDefinition
 from scvi_codegen.common.errors import SystemDefinitionWarning as SystemDefinitionWarning
 from scvi_codegen.common.errors import UnresolvedError as UnresolvedError
 from scvi_codegen.extras.chaos.indicators import ChaosIndicators as ChaosIndicators
+from scvi_codegen.extras.derivation.equations import StepEquations as StepEquations
+from scvi_codegen.extras.derivation.equations import derive as derive
 from scvi_codegen.extras.exact.discrete_lagrangian import ExactStep as ExactStep
 from scvi_codegen.extras.exact.discrete_lagrangian import exact_discrete_lagrangian as exact_discrete_lagrangian
 from scvi_codegen.extras.exact.discrete_lagrangian import exact_map as exact_map
@@ -77,8 +79,6 @@ from scvi_codegen.extras.pictures.overview import plot_section as plot_section
 from scvi_codegen.extras.pictures.overview import plot_trajectory as plot_trajectory
 from scvi_codegen.extras.verification import Certificate as Certificate
 from scvi_codegen.extras.verification import verify as verify
-from scvi_codegen.interfaces.derivation.equations import StepEquations as StepEquations
-from scvi_codegen.interfaces.derivation.equations import derive as derive
 from scvi_codegen.interfaces.models.model import Model as Model
 from scvi_codegen.interfaces.models.model_files.model_file import load_model as load_model
 from scvi_codegen.interfaces.models.model_files.model_file import save_model as save_model

@@ -8,8 +8,8 @@ import numpy as np
 import sympy
 
 from scvi_codegen.common.display.page import TableBlock
+from scvi_codegen.extras.derivation.equations import derive
 from scvi_codegen.extras.verification.system_under_test import canonical_form
-from scvi_codegen.interfaces.derivation.equations import derive
 from scvi_codegen.interfaces.models.problems import problem
 from scvi_codegen.methods import SCVI, SVI, SpectralCollocation
 from scvi_codegen.methods.method import Method

@@ -2,7 +2,7 @@
 
 It shares the definition of the method with the compiled code, but not the solution: the equations are the paper's
 (:meth:`~scvi_codegen.methods.method.Method.paper_form`, which
-:func:`~scvi_codegen.interfaces.derivation.equations.derive` writes out), kernels are evaluated expression by
+:func:`~scvi_codegen.extras.derivation.equations.derive` writes out), kernels are evaluated expression by
 expression, and the matrix of Newton's iteration is computed by finite differences.
 """
 

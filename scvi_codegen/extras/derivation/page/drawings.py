@@ -13,8 +13,8 @@ from scvi_codegen.codegen.ir.program import Program
 from scvi_codegen.common.display.page import Cell, Content, Drawing, Formula, Paragraph, Section, TableBlock, formulas
 from scvi_codegen.common.precision import Vector
 from scvi_codegen.common.representation import counted
-from scvi_codegen.interfaces.derivation.equations import StepEquations
-from scvi_codegen.interfaces.derivation.notation import TableEntry
+from scvi_codegen.extras.derivation.equations import StepEquations
+from scvi_codegen.extras.derivation.notation import TableEntry
 from scvi_codegen.methods import SCVI, SVI, Composition, Method, RungeKutta, SpectralCollocation, StoermerVerlet
 from scvi_codegen.methods.stage_system import StageSystem
 from scvi_codegen.methods.tables.number_tables import Part, decimal, number_table, positions, short

@@ -28,7 +28,7 @@ from scvi_codegen.common.display.cards import card, listed, plain
 from scvi_codegen.common.precision import Number
 from scvi_codegen.common.representation import LONGEST, clipped, counted
 from scvi_codegen.common.validation import checks_arguments
-from scvi_codegen.interfaces.derivation.notation import (
+from scvi_codegen.extras.derivation.notation import (
     LARGEST_DENOMINATOR,
     LARGEST_SHOWN,
     Equation,
@@ -55,7 +55,7 @@ from scvi_codegen.systems.symmetry.symmetry import Symmetry, symmetries
 from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS, MechanicalSystem
 
 if TYPE_CHECKING:
-    from scvi_codegen.interfaces.derivation.arrays import ArrayStepEquations
+    from scvi_codegen.extras.derivation.arrays import ArrayStepEquations
 
 MOVING_FRAME = "moving frame: V(Phi_tau(Q, P)) in place of H_0, tau = (c_n - 1/2) h, between two steps of h/2 of Phi_t:"
 FREE_ROTATION = "Phi_t: q, p <- q, p exp(t Pi/(2 A)), flow of the kinetic energy of H_0 = H - kappa Pi_k^2/2"
@@ -203,7 +203,7 @@ def derive(
         radicals: replace table entries by radicals if they have a short form.
     """
     if isinstance(system, ArraySystem):
-        from scvi_codegen.interfaces.derivation.arrays import ArrayStepEquations
+        from scvi_codegen.extras.derivation.arrays import ArrayStepEquations
         from scvi_codegen.systems.legendre.of_arrays import site_hamiltonian
 
         sites = site_hamiltonian(system) if system.coupled_terms else None

@@ -10,6 +10,6 @@ are replaced by their size (:mod:`scvi_codegen.common.display.page`), so that th
 readable.
 """
 
-from scvi_codegen.interfaces.derivation.page.document import derivation_html
+from scvi_codegen.extras.derivation.page.document import derivation_html
 
 __all__ = ["derivation_html"]

@@ -30,10 +30,10 @@ from scvi_codegen.common.display.page import (
     style_sheet,
 )
 from scvi_codegen.common.representation import counted
-from scvi_codegen.interfaces.derivation.equations import StepEquations, derive
-from scvi_codegen.interfaces.derivation.notation import contact_lines, events_text, table_entries
-from scvi_codegen.interfaces.derivation.page.drawings import curve_section, jacobian_section, tables_section
-from scvi_codegen.interfaces.derivation.page.sums import end_formulas, gather_formulas, meaning, row_formulas
+from scvi_codegen.extras.derivation.equations import StepEquations, derive
+from scvi_codegen.extras.derivation.notation import contact_lines, events_text, table_entries
+from scvi_codegen.extras.derivation.page.drawings import curve_section, jacobian_section, tables_section
+from scvi_codegen.extras.derivation.page.sums import end_formulas, gather_formulas, meaning, row_formulas
 from scvi_codegen.methods.discretise import check_regular, discretise, paper_equations
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import StageGroup, StageSystem
