@@ -65,6 +65,8 @@ from scvi_codegen.extras.orbits.family import Family as Family
 from scvi_codegen.extras.orbits.family import family as family
 from scvi_codegen.extras.orbits.solver import PeriodicOrbit as PeriodicOrbit
 from scvi_codegen.extras.orbits.solver import periodic_orbit as periodic_orbit
+from scvi_codegen.extras.pages.page import Page as Page
+from scvi_codegen.extras.pages.page import page as page
 from scvi_codegen.extras.paths.path import Path as Path
 from scvi_codegen.extras.pictures.animation import Film as Film
 from scvi_codegen.extras.pictures.animation import animate as animate
@@ -87,8 +89,6 @@ from scvi_codegen.interfaces.models.packages.package import generate_package as 
 from scvi_codegen.interfaces.models.packages.package import load_package as load_package
 from scvi_codegen.interfaces.models.problems import PROBLEMS as PROBLEMS
 from scvi_codegen.interfaces.models.problems import problem as problem
-from scvi_codegen.interfaces.pages.page import Page as Page
-from scvi_codegen.interfaces.pages.page import page as page
 from scvi_codegen.methods import SCVI as SCVI
 from scvi_codegen.methods import SVI as SVI
 from scvi_codegen.methods import ChebyshevGauss as ChebyshevGauss

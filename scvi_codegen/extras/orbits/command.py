@@ -13,6 +13,7 @@ from scvi_codegen.extras.orbits import family as families
 from scvi_codegen.extras.orbits.continuation import Formula
 from scvi_codegen.extras.orbits.equilibrium import Equilibrium, equilibrium
 from scvi_codegen.extras.orbits.solver import PeriodicOrbit, periodic_orbit
+from scvi_codegen.extras.pages.page import page_of
 from scvi_codegen.extras.pictures.canvas import PICTURES, check_plot_path
 from scvi_codegen.interfaces.cli.command_group import check_writable, reporting, tell
 from scvi_codegen.interfaces.cli.model_options import model_arguments, read_model, with_known_sizes
@@ -21,7 +22,6 @@ from scvi_codegen.interfaces.cli.supervision import progress_bar
 from scvi_codegen.interfaces.models.model import Model
 from scvi_codegen.interfaces.models.model_files.document import document_of
 from scvi_codegen.interfaces.models.options import options_of
-from scvi_codegen.interfaces.pages.page import page_of
 from scvi_codegen.runs.stepper import Stepper
 
 OWN = tuple(option.name for option in options_of("family"))

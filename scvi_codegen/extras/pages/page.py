@@ -32,6 +32,7 @@ from scvi_codegen.common.validation import ArgumentType, checks_arguments, keywo
 from scvi_codegen.extras.orbits.family import Family
 from scvi_codegen.extras.orbits.picture import sizes_of
 from scvi_codegen.extras.orbits.solver import ERROR, PeriodicOrbit
+from scvi_codegen.extras.pages.webassembly import LICENCES, check_compiler, webassembly
 from scvi_codegen.extras.pictures.recognition import shape_of
 from scvi_codegen.extras.pictures.shape import DrawnSystem, shape_of_picture
 from scvi_codegen.interfaces.models.model import DEFAULT_METHOD, Model
@@ -46,7 +47,6 @@ from scvi_codegen.interfaces.models.model_files.page_section import (
 from scvi_codegen.interfaces.models.options import FURTHER
 from scvi_codegen.interfaces.models.packages.example import absolute_tolerances_of, check_example
 from scvi_codegen.interfaces.models.packages.package import integrator_of
-from scvi_codegen.interfaces.pages.webassembly import LICENCES, check_compiler, webassembly
 from scvi_codegen.runs.stepping.array_interface import read_arrays
 from scvi_codegen.runs.stepping.noise import Noise
 from scvi_codegen.systems.arrays.system import ArraySystem
