@@ -1,9 +1,5 @@
 """The public names as type checkers and editors see them; at run time each is imported when it is first used."""
 
-from scvi_codegen.analysis.advice.advice import Advice as Advice
-from scvi_codegen.analysis.advice.advice import advise as advise
-from scvi_codegen.analysis.advice.solve_ivp import OdeResult as OdeResult
-from scvi_codegen.analysis.advice.solve_ivp import solve_ivp as solve_ivp
 from scvi_codegen.codegen.native.options import SolverOptions as SolverOptions
 from scvi_codegen.codegen.pipeline import generate_source as generate_source
 from scvi_codegen.common.cache import CacheInfo as CacheInfo
@@ -35,6 +31,10 @@ from scvi_codegen.common.errors import StepFailedError as StepFailedError
 from scvi_codegen.common.errors import SystemDefinitionError as SystemDefinitionError
 from scvi_codegen.common.errors import SystemDefinitionWarning as SystemDefinitionWarning
 from scvi_codegen.common.errors import UnresolvedError as UnresolvedError
+from scvi_codegen.extras.advice.advice import Advice as Advice
+from scvi_codegen.extras.advice.advice import advise as advise
+from scvi_codegen.extras.advice.solve_ivp import OdeResult as OdeResult
+from scvi_codegen.extras.advice.solve_ivp import solve_ivp as solve_ivp
 from scvi_codegen.extras.chaos.indicators import ChaosIndicators as ChaosIndicators
 from scvi_codegen.extras.derivation.equations import StepEquations as StepEquations
 from scvi_codegen.extras.derivation.equations import derive as derive

@@ -11,7 +11,7 @@ from commands import error_of, invoke, output_of
 from notation import lagrange
 
 import scvi_codegen as sc
-from scvi_codegen.analysis.advice.advice import missed_tolerance
+from scvi_codegen.extras.advice.advice import missed_tolerance
 from scvi_codegen.interfaces.cli.reports import in_known_digits
 
 

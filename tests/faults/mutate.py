@@ -31,7 +31,7 @@ from operators import Place, places
 from reach import Reach
 
 PACKAGE = (
-    *("common", "systems", "methods", "codegen", "runs", "analysis/advice"),
+    *("common", "systems", "methods", "codegen", "runs", "extras/advice"),
     *("interfaces/cli", "extras/derivation", "interfaces/models"),
 )
 """Folders of which Python is drawn; the others draw pictures, measure, or need programs that CI may not have."""

@@ -50,7 +50,7 @@ ABOUT = {
     "systems": "List the catalogue, or print a system as a file.",
     "verify": "Measure the guaranteed properties of an integrator.",
 }
-ELSEWHERE = {"reproduce": "scvi_codegen.paper.command"}
+ELSEWHERE = {"reproduce": "scvi_codegen.extras.paper.command"}
 """Modules of the commands that are not in ``commands``."""
 
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import click
 
-from scvi_codegen.analysis.advice.advice import Advice, Evidence, advise
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.common.errors import AccuracyWarning, StateError
 from scvi_codegen.common.representation import counted
 from scvi_codegen.common.validation import check_tolerance
+from scvi_codegen.extras.advice.advice import Advice, Evidence, advise
 from scvi_codegen.interfaces.cli.command_group import tell
 from scvi_codegen.interfaces.cli.reports import duration
 from scvi_codegen.interfaces.models.model import Model

@@ -7,9 +7,9 @@ from typing import Any
 
 import click
 
-from scvi_codegen.analysis.advice.advice import missed_tolerance
 from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE
 from scvi_codegen.common.errors import ScviCodegenError
+from scvi_codegen.extras.advice.advice import missed_tolerance
 from scvi_codegen.extras.pictures.animation import FILMS
 from scvi_codegen.extras.pictures.canvas import PICTURES, check_plot_path
 from scvi_codegen.interfaces.cli.command_group import (

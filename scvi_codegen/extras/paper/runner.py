@@ -19,10 +19,10 @@ from multiprocessing.context import SpawnProcess
 from typing import Any, TypeAlias
 
 from scvi_codegen.common.errors import MethodWarning, StateError, closest
-from scvi_codegen.paper.experiment import Experiment, Result
+from scvi_codegen.extras.paper.experiment import Experiment, Result
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 
-CATALOGUE = "scvi_codegen.paper.catalogue"
+CATALOGUE = "scvi_codegen.extras.paper.catalogue"
 PATIENCE = 10.0
 """Seconds to wait for a process to end by itself."""
 

@@ -16,16 +16,16 @@ import numpy as np
 
 from scvi_codegen.common.display.page import TableBlock
 from scvi_codegen.common.toml_text import package_table
+from scvi_codegen.extras.paper.experiment import Array, Comparison, Experiment, Result, comparison
+from scvi_codegen.extras.paper.runs import SECTION_3, perihelion
 from scvi_codegen.methods.tables.basis import cardinal_derivatives, cardinal_values, differentiation_matrix
 from scvi_codegen.methods.tables.nodes import chebyshev_lobatto
 from scvi_codegen.methods.tables.quadrature import gauss_legendre
-from scvi_codegen.paper.experiment import Array, Comparison, Experiment, Result, comparison
-from scvi_codegen.paper.runs import SECTION_3, perihelion
 
 SPAN = 100.0
 ECCENTRICITY: Mapping[int, float] = {8: 0.2, 9: 0.5}
 COLUMNS = tuple((n, scheme) for n in (2, 5, 10, 15, 20) for scheme in ("SC", "SVI"))
-PRINTED: Mapping[str, Mapping[str, str]] = package_table("paper/paper.toml")["iterations"]
+PRINTED: Mapping[str, Mapping[str, str]] = package_table("extras/paper/paper.toml")["iterations"]
 """Counts by table and h: max/total for each of :data:`COLUMNS`; a dash where the paper has none."""
 AS_PRINTED = 0.9
 """Least share of cells that converge or fail as printed for a table to count as reproduced."""

@@ -9,12 +9,12 @@ import sympy
 
 from scvi_codegen.common.display.page import TableBlock
 from scvi_codegen.extras.derivation.equations import derive
+from scvi_codegen.extras.paper.experiment import Comparison, Experiment, Panel, Picture, Result, Series, comparison
+from scvi_codegen.extras.paper.runs import KEPLER, ROUNDOFF, MeasuredRun, RunSetting, Scheme, exact_kepler, largest
 from scvi_codegen.extras.verification.system_under_test import canonical_form
 from scvi_codegen.interfaces.models.problems import problem
 from scvi_codegen.methods import SCVI, SVI, SpectralCollocation
 from scvi_codegen.methods.method import Method
-from scvi_codegen.paper.experiment import Comparison, Experiment, Panel, Picture, Result, Series, comparison
-from scvi_codegen.paper.runs import KEPLER, ROUNDOFF, MeasuredRun, RunSetting, Scheme, exact_kepler, largest
 
 ROWS = ((2, 2), (3, 2), (4, 3), (5, 4), (6, 5), (7, 6), (9, 7))
 """Numbers of points and of Gauss points."""

@@ -1,6 +1,6 @@
 """Catalogue of all experiments by name, in the paper's order; ``claims``, which judges the others, is last."""
 
-from scvi_codegen.paper import correction, experiment, iterations, refinement, runs
+from scvi_codegen.extras.paper import correction, experiment, iterations, refinement, runs
 
 ORDER = """
     figure-1 figure-3 figure-4 figure-5 figure-6 figure-7 figure-8

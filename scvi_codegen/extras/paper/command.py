@@ -11,6 +11,8 @@ import click
 
 from scvi_codegen.common.atomic import write_text
 from scvi_codegen.common.representation import counted
+from scvi_codegen.extras.paper.experiment import Experiment, Result, report_html, tally, write_result
+from scvi_codegen.extras.paper.runner import CATALOGUE, Failure, Watch, catalogue, run_experiments, with_needs
 from scvi_codegen.extras.pictures.canvas import check_plot_path
 from scvi_codegen.interfaces.cli.command_group import (
     FAILURE,
@@ -21,8 +23,6 @@ from scvi_codegen.interfaces.cli.command_group import (
     reporting,
     tell,
 )
-from scvi_codegen.paper.experiment import Experiment, Result, report_html, tally, write_result
-from scvi_codegen.paper.runner import CATALOGUE, Failure, Watch, catalogue, run_experiments, with_needs
 
 EVERYTHING = "all"
 Report: TypeAlias = Callable[[str], None]

@@ -59,7 +59,7 @@ class Comparison:
         claim: statement of the paper, in one sentence.
         measured: measurement, in one sentence with its numbers.
         verdict: whether they agree.
-        bears_on: keys of the claims (:mod:`scvi_codegen.paper.experiment`) that this decides.
+        bears_on: keys of the claims (:mod:`scvi_codegen.extras.paper.experiment`) that this decides.
     """
 
     claim: str
@@ -133,7 +133,7 @@ class Experiment:
         return replace(result, name=self.name, title=result.title or self.title)
 
 
-CLAIMS: Mapping[str, str] = package_table("paper/paper.toml")["claims"]
+CLAIMS: Mapping[str, str] = package_table("extras/paper/paper.toml")["claims"]
 """Claims by the keys that checks name in ``bears_on``."""
 
 EVIDENCE = ("figure-1", *(f"figure-{k}" for k in range(3, 31)), "table-8", "table-9", "correction")

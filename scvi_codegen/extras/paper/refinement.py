@@ -20,10 +20,19 @@ from scvi_codegen.common.errors import StepFailedError
 from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.common.toml_text import package_table
 from scvi_codegen.extras.exact.step import derived_step
+from scvi_codegen.extras.paper.experiment import (
+    Array,
+    Comparison,
+    Experiment,
+    Panel,
+    Picture,
+    Result,
+    Series,
+    comparison,
+)
+from scvi_codegen.extras.paper.runs import KEPLER, ROUNDOFF, stepper_of, system_of
 from scvi_codegen.methods import SVI, SpectralCollocation
 from scvi_codegen.methods.method import Method
-from scvi_codegen.paper.experiment import Array, Comparison, Experiment, Panel, Picture, Result, Series, comparison
-from scvi_codegen.paper.runs import KEPLER, ROUNDOFF, stepper_of, system_of
 from scvi_codegen.systems.system import MechanicalSystem
 
 SCHEMES = ("SVI", "SC")
@@ -393,5 +402,5 @@ def _figure(name: str, title: str, study: str, **changes: Any) -> Experiment:
     return refinement(name, title, _study(study, **changes))
 
 
-_TABLES = package_table("paper/refinement.toml")
+_TABLES = package_table("extras/paper/refinement.toml")
 EXPERIMENTS = tuple(_figure(name, **table) for name, table in _TABLES.items() if name != "studies")

@@ -24,10 +24,7 @@ from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.display.page import TableBlock
 from scvi_codegen.common.errors import MethodWarning, StepFailedError
 from scvi_codegen.common.toml_text import package_table
-from scvi_codegen.interfaces.models.problems import problem
-from scvi_codegen.methods import SCVI, SVI, as_method, method_from_specification
-from scvi_codegen.methods.method import Method
-from scvi_codegen.paper.experiment import (
+from scvi_codegen.extras.paper.experiment import (
     Array,
     Comparison,
     Experiment,
@@ -39,6 +36,9 @@ from scvi_codegen.paper.experiment import (
     largest_in_bins,
     thinned,
 )
+from scvi_codegen.interfaces.models.problems import problem
+from scvi_codegen.methods import SCVI, SVI, as_method, method_from_specification
+from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.compiler import compile_stepper
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.trajectory import Trajectory
@@ -320,7 +320,7 @@ def compared(claim: str, check: str, runs: Runs) -> Comparison:
         claim: statement of the paper.
         check: ``"ATTRIBUTE: CONDITION, ..; ATTRIBUTE: ..|CLAIMS|NOTE"``. A condition is a chain such as
             ``svi < 1e-6 < sc`` or ``100*svi < sc`` of numbers and absolute values of the attribute for runs by key; a
-            key alone is only listed. CLAIMS are keys of :mod:`scvi_codegen.paper.experiment`; NOTE is appended.
+            key alone is only listed. CLAIMS are keys of :mod:`scvi_codegen.extras.paper.experiment`; NOTE is appended.
         runs: runs by key.
     """
     conditions, claims, note = (part.strip() for part in f"{check}||".split("|")[:3])
@@ -476,6 +476,6 @@ def _figure(
 
 
 VIEWS: Mapping[str, Callable[..., Iterable[Panel]]] = {"plane": plane, "over time": over_time}
-_TABLES = package_table("paper/figures.toml")
+_TABLES = package_table("extras/paper/figures.toml")
 SETTINGS = _settings(_TABLES.pop("settings"))
 EXPERIMENTS = tuple(_figure(name, **table) for name, table in _TABLES.items())
