@@ -12,7 +12,7 @@ import numpy as np
 from scvi_codegen.common.errors import ModelFileError
 from scvi_codegen.extras.fields.mesh import Mesh
 from scvi_codegen.extras.fields.system import FieldSystem
-from scvi_codegen.interfaces.models.model_files.sections import Document, Section, check_keys, in_section
+from scvi_codegen.interfaces.models.model_files.sections import Document, ModelSection, Section, check_keys, in_section
 from scvi_codegen.interfaces.models.options import real
 from scvi_codegen.systems.formulas.grammar import parse_expression
 from scvi_codegen.systems.formulas.numpy_values import array_value
@@ -69,3 +69,13 @@ def _values(value: Any, where: str, mesh: Mesh, names: Mapping[str, Any]) -> Any
     with np.errstate(all="ignore"):
         values = array_value(formula, {symbol(name): number for name, number in names.items()})
     return np.broadcast_to(np.asarray(values, float), mesh.weights.shape).tolist()
+
+
+field = ModelSection(
+    keys=(
+        *("name", "fields", "momenta", "space", "boundary", "density", "hamiltonian", "dissipation"),
+        *("scalars", "point_lagrangians", "discretisation"),
+    ),
+    system=read_field,
+    initial=fields_at_points,
+)

@@ -8,13 +8,13 @@ import click
 import numpy as np
 
 from scvi_codegen.common.errors import ModelFileError
+from scvi_codegen.common.registry import part
 from scvi_codegen.common.representation import counted
 from scvi_codegen.extras.orbits import family as families
 from scvi_codegen.extras.orbits.continuation import Formula
 from scvi_codegen.extras.orbits.equilibrium import Equilibrium, equilibrium
 from scvi_codegen.extras.orbits.solver import PeriodicOrbit, periodic_orbit
-from scvi_codegen.extras.pages.page import page_of
-from scvi_codegen.extras.pictures.canvas import PICTURES, check_plot_path
+from scvi_codegen.extras.pictures.services import check_picture
 from scvi_codegen.interfaces.cli.command_group import check_writable, reporting, tell
 from scvi_codegen.interfaces.cli.model_options import model_arguments, read_model, with_known_sizes
 from scvi_codegen.interfaces.cli.recording import check_resumed
@@ -59,12 +59,12 @@ def family(model_name: str, resume: str | None, output: str | None, plot: str | 
     if output is not None and Path(output).suffix != ".npz":
         raise ModelFileError(f"orbits of a family are saved as .npz, not as '{output}'")
     if plot is not None:
-        check_plot_path(plot, PICTURES)
+        check_picture(plot)
     model = with_known_sizes(read_model(model_name, choices), "family")
     with progress_bar(model.family.get("count", COUNT), "orbits") as progress:
         members = _members(model, resume, progress)
     tell(_described(members), **_numbers(members))
-    moving = page_of(model, document_of(model), {"family": members}) if page else members
+    moving = part("services", "page_of")(model, document_of(model), {"family": members}) if page else members
     for target, write in ((output, members.save), (plot, members.plot), (page, moving.save)):
         if target is not None:
             write(target)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from scvi_codegen.common.errors import MethodError
-from scvi_codegen.extras.orbits.family import Family
 from scvi_codegen.extras.orbits.solver import PeriodicOrbit
 from scvi_codegen.extras.pictures.canvas import COLORS, check_plot_path, color, new_figure, save, style
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
@@ -23,8 +22,8 @@ MOST_CURVES = 40
 """Number of orbits that are drawn at most, evenly spaced in their order."""
 
 
-def plot_family(family: Family, path: str | os.PathLike[str] | None = None) -> Figure:
-    """Draw a family, blue where it is stable; write a .png, .svg or .pdf if a path is passed.
+def plot_family(family: Any, path: str | os.PathLike[str] | None = None) -> Figure:
+    """Draw a :class:`~scvi_codegen.Family`, blue where it is stable; write a .png, .svg or .pdf if a path is passed.
 
     The third picture is the period by the energy, or of a family along a parameter the largest first coordinate by it.
     """

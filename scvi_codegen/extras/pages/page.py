@@ -32,18 +32,13 @@ from scvi_codegen.common.validation import ArgumentType, checks_arguments, keywo
 from scvi_codegen.extras.orbits.family import Family
 from scvi_codegen.extras.orbits.picture import sizes_of
 from scvi_codegen.extras.orbits.solver import ERROR, PeriodicOrbit
+from scvi_codegen.extras.pages.section import check_page, check_picture, drawn_system_of_model, starts_from_momenta
 from scvi_codegen.extras.pages.webassembly import LICENCES, check_compiler, webassembly
 from scvi_codegen.extras.pictures.recognition import shape_of
 from scvi_codegen.extras.pictures.shape import DrawnSystem, shape_of_picture
 from scvi_codegen.interfaces.models.model import DEFAULT_METHOD, Model
 from scvi_codegen.interfaces.models.model_files.document import document_of
 from scvi_codegen.interfaces.models.model_files.model_file import document_in, load_model
-from scvi_codegen.interfaces.models.model_files.page_section import (
-    check_page,
-    check_picture,
-    drawn_system_of_model,
-    starts_from_momenta,
-)
 from scvi_codegen.interfaces.models.options import FURTHER
 from scvi_codegen.interfaces.models.packages.example import absolute_tolerances_of, check_example
 from scvi_codegen.interfaces.models.packages.package import integrator_of

@@ -12,7 +12,7 @@ import numpy as np
 from scvi_codegen.common.errors import MethodError, ModelFileError
 from scvi_codegen.common.representation import counted
 from scvi_codegen.extras.paths.path import Path, different_paths
-from scvi_codegen.extras.pictures.canvas import PICTURES, check_plot_path
+from scvi_codegen.extras.pictures.services import check_picture
 from scvi_codegen.interfaces.cli.command_group import check_writable, reporting, tell
 from scvi_codegen.interfaces.cli.model_options import model_arguments, read_model, with_known_sizes
 from scvi_codegen.interfaces.cli.recording import check_output
@@ -52,7 +52,7 @@ def path(model_name: str, output: str | None, plot: str | None, **choices: Any) 
         check_output(output)
     if plot is not None:
         check_writable(FilePath(plot), "'--plot'")
-        check_plot_path(plot, PICTURES)
+        check_picture(plot)
     model = with_known_sizes(read_model(model_name, choices), "path")
     paths = _paths(model)
     title = f"{model.system.name}\n{model.method.title}; {counted(len(paths), 'path')}"

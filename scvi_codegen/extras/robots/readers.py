@@ -152,7 +152,7 @@ def _sum(rows: Iterable[Sequence[Expr]], size: int) -> tuple[Expr, ...]:
     return tuple(sympy.Add(*(row[i] for row in rows)) for i in range(size))
 
 
-def forces_of_lagranges_method(method: LagrangesMethod) -> dict[Expr, Expr]:
+def of_lagranges_method(method: LagrangesMethod) -> dict[Expr, Expr]:
     """Return the generalised forces of its ``forcelist`` by coordinate; its bodies are part of its Lagrangian.
 
     Raises:

@@ -9,9 +9,7 @@ import click
 
 from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE
 from scvi_codegen.common.errors import ScviCodegenError
-from scvi_codegen.extras.advice.advice import missed_tolerance
-from scvi_codegen.extras.pictures.animation import FILMS
-from scvi_codegen.extras.pictures.canvas import PICTURES, check_plot_path
+from scvi_codegen.common.registry import part
 from scvi_codegen.interfaces.cli.command_group import (
     FAILURE,
     INTERRUPTED,
@@ -248,7 +246,7 @@ def _check_outputs(output: str | None, plot: str | None, ensemble: str | None, c
         check_output(output, ensemble=ensemble is not None)
     if plot is not None:
         check_writable(Path(plot), "'--plot'")
-        check_plot_path(plot, PICTURES + FILMS)
+        part("services", "check_picture")(plot, films=True)
 
 
 def _check_combination(
@@ -296,7 +294,7 @@ def _run_one(
     for path in written:
         tell(f"wrote {path}")
     if advised is not None:
-        _fail_for(missed_tolerance(outcome.trajectory, advised))
+        _fail_for(part("services", "missed_tolerance")(outcome.trajectory, advised))
 
 
 def _finish_recording(outcome: RecordedOutcome) -> None:
@@ -328,7 +326,7 @@ def _run_ensemble(
     for path in written:
         tell(f"wrote {path}", written=written)
     if advised is not None and outcome.result.ok[member]:
-        missed = missed_tolerance(outcome.result[member], advised)
+        missed = part("services", "missed_tolerance")(outcome.result[member], advised)
         _fail_for(missed, f"trajectory {member}: ")
 
 
@@ -347,7 +345,7 @@ def _write_outputs(
 ) -> list[str]:
     if output is not None:
         result.save(output, **saved)
-    if plot is not None and Path(plot).suffix.lower() in FILMS:
+    if plot is not None and part("services", "is_film")(plot):
         progress = (lambda *_: None) if is_quiet() else None
         result.animate(plot, picture=model.picture or None, progress=progress)
     elif plot is not None:

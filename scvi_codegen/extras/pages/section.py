@@ -10,7 +10,7 @@ import numpy as np
 from scvi_codegen.common.errors import ModelFileError
 from scvi_codegen.extras.pictures.shape import MARKS, DrawnSystem, entry_names, shape_of_picture
 from scvi_codegen.interfaces.models.model import Model
-from scvi_codegen.interfaces.models.model_files.sections import Section, check_keys
+from scvi_codegen.interfaces.models.model_files.sections import ModelSection, Section, check_keys
 from scvi_codegen.interfaces.models.options import real
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
 
@@ -102,3 +102,7 @@ def check_picture(model: Model) -> None:
     """Raise ModelFileError for mistakes in the section ``[picture]`` of a model."""
     if model.picture:
         shape_of_picture(drawn_system_of_model(model), model.picture, "[picture]")
+
+
+page = ModelSection(keys=PAGE_KEYS, check=lambda model: check_page(model.page, model))
+picture = ModelSection(keys=PICTURE_KEYS, check=check_picture)
