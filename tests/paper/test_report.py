@@ -12,7 +12,7 @@ from commands import error_of, json_of, output_of
 from html_page import Page
 from toy_experiments import EXPERIMENTS, GOOD
 
-from scvi_codegen.common.display.page import cell, prose
+from scvi_codegen.extras.derivation.writing import cell, prose
 from scvi_codegen.extras.paper.command import experiments_table, experiments_titles
 from scvi_codegen.extras.paper.experiment import Result, draw, report_html
 from scvi_codegen.extras.paper.runner import Failure, run_experiments, with_needs

@@ -31,10 +31,10 @@ from scvi_codegen.common.errors import (
 )
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import checks_arguments
+from scvi_codegen.extras.advice.size import distances_from_mean, relative_to_motion
 from scvi_codegen.methods import ARGUMENTS, Method, as_method, method_from_specification
 from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.runs.accuracy.run_error import DEVIATIONS, LOST
-from scvi_codegen.runs.accuracy.size import distances_from_mean, relative_to_motion
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runs.compiler import compile_stepper
 from scvi_codegen.runs.ensembles.ensemble import momenta_of_each, start_of_ensemble

@@ -6,7 +6,7 @@
     True
 
 The page is self-contained: formulas are MathML, pictures inline, without scripts or network. Formulas that are too long
-are replaced by their size (:mod:`scvi_codegen.common.display.page`), so that the page of a large system remains
+are replaced by their size (:mod:`scvi_codegen.extras.derivation.writing`), so that the page of a large system remains
 readable.
 """
 

@@ -20,10 +20,10 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.codegen.native import building
-from scvi_codegen.codegen.rendering.program_source import casadi_name, with_casadi_flow
 from scvi_codegen.common.errors import ArgumentError, MethodError, StateError, imported
 from scvi_codegen.common.validation import TEXTS, checked_count, checks_arguments, of
 from scvi_codegen.extras.frameworks.flow import Flow
+from scvi_codegen.extras.frameworks.sources import casadi_name, with_casadi_flow
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method

@@ -16,11 +16,11 @@ import numpy as np
 
 from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.native.binding import Binding
-from scvi_codegen.codegen.rendering.program_source import XLA_PARTS, XLA_SECOND_ORDER, with_flow_of_rows, with_xla_flow
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.common.errors import StateError, imported
 from scvi_codegen.common.representation import LONGEST, clipped
 from scvi_codegen.common.validation import checked_count, checks_arguments, of
+from scvi_codegen.extras.frameworks.sources import XLA_PARTS, XLA_SECOND_ORDER, with_flow_of_rows, with_xla_flow
 from scvi_codegen.runs.states.validation import check_inputs_given, parameter_index
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.features import require

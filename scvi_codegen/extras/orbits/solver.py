@@ -48,7 +48,8 @@ from scvi_codegen.extras.fits.measurements import state_names
 from scvi_codegen.extras.orbits.constraint_manifold import reduction_of
 from scvi_codegen.extras.orbits.reversor import Reversor
 from scvi_codegen.extras.orbits.step_sequence import StepSequence
-from scvi_codegen.runs.accuracy.size import RESOLVED, SizeOfMotion, roundoff
+from scvi_codegen.extras.paths.size import SizeOfMotion
+from scvi_codegen.runs.accuracy.size import RESOLVED, roundoff
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
 from scvi_codegen.runs.states.layout import InitialData
 from scvi_codegen.runs.states.reduction import Reduction

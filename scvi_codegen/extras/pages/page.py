@@ -25,10 +25,10 @@ from scvi_codegen.codegen.rendering.environment import template_environment
 from scvi_codegen.codegen.rendering.source import Interface, Source
 from scvi_codegen.common.atomic import write_text
 from scvi_codegen.common.display.mathml import mathml_terms
-from scvi_codegen.common.display.page import mathematics_font
 from scvi_codegen.common.errors import ArgumentError, ExpressionError, MethodError, StateError, closest
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import ArgumentType, checks_arguments, keyword_hint, of
+from scvi_codegen.extras.derivation.writing import mathematics_font
 from scvi_codegen.extras.orbits.family import Family
 from scvi_codegen.extras.orbits.picture import sizes_of
 from scvi_codegen.extras.orbits.solver import ERROR, PeriodicOrbit

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import sympy
 
-from scvi_codegen.common.display.page import TableBlock
+from scvi_codegen.common.display.tables import TableBlock
 from scvi_codegen.extras.derivation.equations import derive
 from scvi_codegen.extras.paper.experiment import Comparison, Experiment, Panel, Picture, Result, Series, comparison
 from scvi_codegen.extras.paper.runs import KEPLER, ROUNDOFF, MeasuredRun, RunSetting, Scheme, exact_kepler, largest

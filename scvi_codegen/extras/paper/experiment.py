@@ -24,8 +24,9 @@ from markupsafe import Markup
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.common.atomic import write_atomically
-from scvi_codegen.common.display.page import SPACE, TableBlock, page_template, style_sheet
+from scvi_codegen.common.display.tables import TableBlock
 from scvi_codegen.common.toml_text import package_table
+from scvi_codegen.extras.derivation.writing import SPACE, page_template, style_sheet
 from scvi_codegen.extras.pictures.canvas import STYLE as TRAJECTORY_STYLE
 from scvi_codegen.extras.pictures.canvas import write_figure
 from scvi_codegen.version import __version__

@@ -14,7 +14,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from scvi_codegen.common.display.page import TableBlock
+from scvi_codegen.common.display.tables import TableBlock
 from scvi_codegen.common.toml_text import package_table
 from scvi_codegen.extras.paper.experiment import Array, Comparison, Experiment, Result, comparison
 from scvi_codegen.extras.paper.runs import SECTION_3, perihelion

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.common.display.page import Cell, TableBlock
+from scvi_codegen.common.display.tables import Cell, TableBlock
 from scvi_codegen.common.errors import StepFailedError
 from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.common.toml_text import package_table

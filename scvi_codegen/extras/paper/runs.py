@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.codegen.native.options import SolverOptions
-from scvi_codegen.common.display.page import TableBlock
+from scvi_codegen.common.display.tables import TableBlock
 from scvi_codegen.common.errors import MethodWarning, StepFailedError
 from scvi_codegen.common.toml_text import package_table
 from scvi_codegen.extras.paper.experiment import (

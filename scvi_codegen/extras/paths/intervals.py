@@ -16,7 +16,7 @@ import numpy as np
 
 from scvi_codegen.codegen.native.options import SolverOptions, step_failure
 from scvi_codegen.common.errors import PathError, StateError
-from scvi_codegen.runs.accuracy.size import size_for_updates
+from scvi_codegen.extras.paths.size import size_for_updates
 from scvi_codegen.runs.states.rotations import members_of
 from scvi_codegen.runs.states.validation import Array
 

@@ -20,8 +20,8 @@ from scvi_codegen.extras.paths import solver
 from scvi_codegen.extras.paths.discretisation import Discretisation, discretisation_of, kinetic_energy_is_positive
 from scvi_codegen.extras.paths.equations import Band, condensed_hessian, hessian_blocks, negative_pivots
 from scvi_codegen.extras.paths.intervals import Intervals, ManyCoordinates, ReducedIntervals
+from scvi_codegen.extras.paths.size import largest_range, size_for_updates
 from scvi_codegen.extras.paths.starts import curves_around, curves_at_random
-from scvi_codegen.runs.accuracy.size import largest_range, size_for_updates
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runs.states.layout import StateLayout
 from scvi_codegen.runs.states.validation import Array, Parameters, States, columns_of_inputs

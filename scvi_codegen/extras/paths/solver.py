@@ -16,7 +16,8 @@ import numpy as np
 from scvi_codegen.common.errors import PathError, StateError, StepFailedError
 from scvi_codegen.extras.paths.equations import Bordered, BorderedClosed, Closed, closed_residual, factors_of
 from scvi_codegen.extras.paths.intervals import Intervals, Linearised
-from scvi_codegen.runs.accuracy.size import RESOLVED, SizeOfMotion, largest_range, roundoff, size_for_updates
+from scvi_codegen.extras.paths.size import SizeOfMotion, largest_range, size_for_updates
+from scvi_codegen.runs.accuracy.size import RESOLVED, roundoff
 from scvi_codegen.runs.states.validation import Array
 
 TOLERANCE = 1e-11

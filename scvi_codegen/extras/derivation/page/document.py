@@ -12,9 +12,15 @@ from scvi_codegen.codegen.ir.kernel import Kernel
 from scvi_codegen.codegen.ir.program import Program
 from scvi_codegen.codegen.lowering.program import step_texts
 from scvi_codegen.codegen.pipeline import c_identifier, program_of
-from scvi_codegen.codegen.rendering.outline import Function, functions_of, reached
 from scvi_codegen.codegen.rendering.program_source import render
-from scvi_codegen.common.display.page import (
+from scvi_codegen.common.display.tables import TableBlock
+from scvi_codegen.common.representation import counted
+from scvi_codegen.extras.derivation.equations import StepEquations, derive
+from scvi_codegen.extras.derivation.notation import contact_lines, events_text, table_entries
+from scvi_codegen.extras.derivation.outline import Function, functions_of, reached
+from scvi_codegen.extras.derivation.page.drawings import curve_section, jacobian_section, tables_section
+from scvi_codegen.extras.derivation.page.sums import end_formulas, gather_formulas, meaning, row_formulas
+from scvi_codegen.extras.derivation.writing import (
     MOST_FORMULAS,
     Content,
     Formula,
@@ -22,18 +28,12 @@ from scvi_codegen.common.display.page import (
     Paragraph,
     Section,
     SideBySide,
-    TableBlock,
     formulas,
     lines,
     operations,
     page_template,
     style_sheet,
 )
-from scvi_codegen.common.representation import counted
-from scvi_codegen.extras.derivation.equations import StepEquations, derive
-from scvi_codegen.extras.derivation.notation import contact_lines, events_text, table_entries
-from scvi_codegen.extras.derivation.page.drawings import curve_section, jacobian_section, tables_section
-from scvi_codegen.extras.derivation.page.sums import end_formulas, gather_formulas, meaning, row_formulas
 from scvi_codegen.methods.discretise import check_regular, discretise, paper_equations
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import StageGroup, StageSystem

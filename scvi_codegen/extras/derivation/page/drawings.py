@@ -10,11 +10,12 @@ import sympy
 from sympy import Function, Identity, KroneckerProduct, MatrixSymbol, Symbol
 
 from scvi_codegen.codegen.ir.program import Program
-from scvi_codegen.common.display.page import Cell, Content, Drawing, Formula, Paragraph, Section, TableBlock, formulas
+from scvi_codegen.common.display.tables import Cell, TableBlock
 from scvi_codegen.common.precision import Vector
 from scvi_codegen.common.representation import counted
 from scvi_codegen.extras.derivation.equations import StepEquations
 from scvi_codegen.extras.derivation.notation import TableEntry
+from scvi_codegen.extras.derivation.writing import Content, Drawing, Formula, Paragraph, Section, formulas
 from scvi_codegen.methods import SCVI, SVI, Composition, Method, RungeKutta, SpectralCollocation, StoermerVerlet
 from scvi_codegen.methods.stage_system import StageSystem
 from scvi_codegen.methods.tables.number_tables import Part, decimal, number_table, positions, short

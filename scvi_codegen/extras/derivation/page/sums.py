@@ -17,8 +17,8 @@ from sympy import Symbol
 
 from scvi_codegen.codegen.lowering.stage_groups import argument_name
 from scvi_codegen.common.display.mathml import RAISED
-from scvi_codegen.common.display.page import Formula
 from scvi_codegen.common.precision import Number
+from scvi_codegen.extras.derivation.writing import Formula
 from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table
 from scvi_codegen.systems.constraints import (
     constraint_rates,

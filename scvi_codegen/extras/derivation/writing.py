@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import re
 from base64 import b64encode
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import TypeAlias
 
@@ -21,28 +21,8 @@ from sympy.printing.pretty.pretty_symbology import greek_unicode
 
 from scvi_codegen.common.cache import template_folder
 from scvi_codegen.common.display.mathml import mathml, mathml_terms
+from scvi_codegen.common.display.tables import Cell, TableBlock
 from scvi_codegen.common.representation import counted
-
-Cell: TypeAlias = float | int | str | sympy.Basic | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TableBlock:
-    """Table of numbers, written as CSV in full precision.
-
-    Attributes:
-        name: ``""`` for the main table of a result, else what is appended to the file's name.
-        columns: headings.
-        rows: as many cells as columns; ``None`` for a missing number.
-        formats: format specification by column, for the report; default ``".3g"``.
-        shown: whether the report prints it; long series of a curve are only drawn.
-    """
-
-    columns: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
-    name: str = ""
-    formats: Mapping[str, str] = field(default_factory=dict)
-    shown: bool = True
 
 
 @dataclass(frozen=True, slots=True)
