@@ -17,10 +17,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from scvi_codegen.codegen.native.arguments import checked_number
+from scvi_codegen.api.checks import checks_arguments
+from scvi_codegen.api.methods import Method, method_from_specification
+from scvi_codegen.api.runs import without_accuracy_warnings
+from scvi_codegen.api.states import Array, States, checked_number
+from scvi_codegen.api.systems import SYSTEM_OR_ARRAYS, MechanicalSystem
+from scvi_codegen.api.text import Html, card, grid, plain, summary
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
-from scvi_codegen.common.display.cards import Html, card, grid, plain
 from scvi_codegen.common.errors import (
     ArgumentError,
     MethodError,
@@ -29,20 +33,16 @@ from scvi_codegen.common.errors import (
     StepFailedError,
     UnresolvedError,
 )
-from scvi_codegen.common.representation import summary
-from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.extras.advice.size import distances_from_mean, relative_to_motion
-from scvi_codegen.methods import ARGUMENTS, Method, as_method, method_from_specification
+from scvi_codegen.methods import ARGUMENTS, as_method
 from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.runs.accuracy.run_error import DEVIATIONS, LOST
-from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runs.compiler import compile_stepper
 from scvi_codegen.runs.ensembles.ensemble import momenta_of_each, start_of_ensemble
-from scvi_codegen.runs.states.validation import Array, EnsembleParameters, States
+from scvi_codegen.runs.states.validation import EnsembleParameters
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 from scvi_codegen.systems.rolling import unrolled_at
-from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS, MechanicalSystem
 
 DEGREES = {1: (2, 4, 6, 8, 10, 12), 2: (8, 12, 16, 20, 24, 32)}
 """Degrees, or numbers of stages, among which ``advise`` chooses, by the number of words of the states."""

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from scvi_codegen.runs.accuracy.size import RESOLVED, relative, roundoff
-from scvi_codegen.runs.states.validation import Array
+from scvi_codegen.api.states import RESOLVED, Array, roundoff
+from scvi_codegen.runs.accuracy.size import relative
 
 
 def distances_from_mean(q: Array) -> Array:

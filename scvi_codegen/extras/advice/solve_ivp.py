@@ -6,16 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.codegen.native.arguments import checked_number, real_array
+from scvi_codegen.api.checks import Kind, checks_arguments
+from scvi_codegen.api.states import Array, checked_number, real_array
+from scvi_codegen.api.systems import MechanicalSystem
+from scvi_codegen.api.text import summary
 from scvi_codegen.common.errors import ArgumentError, StateError, StepFailedError
-from scvi_codegen.common.representation import summary
-from scvi_codegen.common.validation import SWITCH, ArgumentType, checks_arguments
 from scvi_codegen.runs.compiler import compile_stepper
 from scvi_codegen.runs.results.dense_output import times_of_run
-from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.trajectory import Trajectory
-from scvi_codegen.systems.system import MechanicalSystem
 
 WORDS = "a system or its stepper (for a function f(t, y) use scipy.integrate.solve_ivp, see docs/limits.md)"
 
@@ -36,7 +35,7 @@ class OdeResult:
     __repr__ = summary("t", "y", "status", "message")
 
 
-@checks_arguments(dense_output=SWITCH, system=ArgumentType(WORDS, lambda s: isinstance(s, MechanicalSystem | Stepper)))
+@checks_arguments(dense_output=Kind.SWITCH, system=Kind(WORDS, lambda s: isinstance(s, MechanicalSystem | Stepper)))
 def solve_ivp(system: Any, t_span: Any, y0: Any, *, velocity: Any = None, method: Any = None, t_eval: Any = None,
               dense_output: bool = False, events: Any = None, args: Any = None, rtol: Any = None, atol: Any = None,
               max_step: Any = math.inf, first_step: Any = None, **others: Any) -> OdeResult:  # fmt: skip

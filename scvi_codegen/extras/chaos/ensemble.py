@@ -15,14 +15,15 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from scvi_codegen.api.checks import checked_count
+from scvi_codegen.api.program import Source
+from scvi_codegen.api.runs import EnsembleSettings
+from scvi_codegen.api.states import Array, Fixed, Starts, States, checked_number, checked_step, require
 from scvi_codegen.codegen.native import building
-from scvi_codegen.codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.codegen.native.binding import Binding
 from scvi_codegen.codegen.native.options import SolverOptions, checked_options
-from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.codegen.variants import TangentVectors
 from scvi_codegen.common.errors import StateError, StepFailedError
-from scvi_codegen.common.validation import checked_count
 from scvi_codegen.extras.chaos.indicators import MOST as LARGEST_CHUNK
 from scvi_codegen.extras.chaos.indicators import (
     SERIES,
@@ -33,18 +34,15 @@ from scvi_codegen.extras.chaos.indicators import (
 )
 from scvi_codegen.runs.accuracy.local_error import warn_of_large_steps
 from scvi_codegen.runs.driver.run_loop import record
-from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings, momenta_of_each, start_of_ensemble
+from scvi_codegen.runs.ensembles.ensemble import Ensemble, momenta_of_each, start_of_ensemble
 from scvi_codegen.runs.ensembles.lanes import LaneRuns
 from scvi_codegen.runs.ensembles.result import OK
 from scvi_codegen.runs.ensembles.schedule import CommonSteps
 from scvi_codegen.runs.ensembles.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runs.states.times import times_after
-from scvi_codegen.runs.states.validation import Array, EnsembleParameters, States
-from scvi_codegen.runs.stepping.features import require
+from scvi_codegen.runs.states.validation import EnsembleParameters
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.memory import Memory
-from scvi_codegen.runs.stepping.step_derivatives import Starts
-from scvi_codegen.runs.stepping.step_plan import Fixed
 
 CHECKED_STRIDE: Final = 64
 """Stride of the trajectories whose step error is estimated."""

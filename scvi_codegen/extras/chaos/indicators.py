@@ -18,18 +18,14 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.codegen.native.arguments import real_array
+from scvi_codegen.api.checks import checked_count
+from scvi_codegen.api.states import Array, Reduction, Starts, real_array, require
+from scvi_codegen.api.text import summary
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.common.representation import summary
-from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.derivatives.gradients import pieces, propagate, starts_of
 from scvi_codegen.runs.results.saved_states import SavedStates, parameters_on_sides
-from scvi_codegen.runs.states.reduction import Reduction
-from scvi_codegen.runs.states.validation import Array
-from scvi_codegen.runs.stepping.features import require
 from scvi_codegen.runs.stepping.integrator import Integrator
-from scvi_codegen.runs.stepping.step_derivatives import Starts
 
 SERIES = ("log_norms", "max_log_norms", "log_r_diagonal", "rates", "mean_rates")
 """Names of the accumulated series, defined in :class:`~scvi_codegen.extras.chaos.indicators.ChaosIndicators`."""

@@ -7,12 +7,13 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from scvi_codegen.api.checks import checked_count, checks_arguments
+from scvi_codegen.api.states import Array, States
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.common.validation import checked_count, checks_arguments
 from scvi_codegen.extras.chaos.ensemble import indicators_of_ensemble
 from scvi_codegen.extras.chaos.indicators import ChaosIndicators, InitialTangents, along
-from scvi_codegen.runs.states.validation import Array, EnsembleParameters, States
+from scvi_codegen.runs.states.validation import EnsembleParameters
 
 
 class OfSteppers:

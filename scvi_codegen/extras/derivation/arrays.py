@@ -5,14 +5,15 @@ from dataclasses import dataclass
 
 from sympy import latex
 
+from scvi_codegen.api.methods import Method
+from scvi_codegen.api.systems import ArraySystem
 from scvi_codegen.codegen.ir.equations import FixedPointIteration, Splitting
 from scvi_codegen.codegen.ir.kernel import Number
 from scvi_codegen.codegen.ir.program import ArrayProgram
 from scvi_codegen.codegen.lowering.program import lower_arrays
 from scvi_codegen.common.representation import LONGEST, clipped
-from scvi_codegen.methods.method import Method
 from scvi_codegen.systems.arrays.symmetry import momentum_maps
-from scvi_codegen.systems.arrays.system import ArraySystem, constraint_text, force_of
+from scvi_codegen.systems.arrays.system import constraint_text, force_of
 from scvi_codegen.systems.formulas.array_statements import latex_entry, latex_sums
 
 DIGITS = 17

@@ -5,13 +5,13 @@ from typing import Any
 
 import click
 
-from scvi_codegen.extras.derivation import derivation_html
+from scvi_codegen.api.commands import check_writable, model_arguments, read_model, reporting, with_known_sizes
 from scvi_codegen.extras.derivation.equations import StepEquations
 from scvi_codegen.extras.derivation.equations import derive as derive_equations
 from scvi_codegen.extras.derivation.notation import events_text
+from scvi_codegen.extras.derivation.page.document import derivation_html
 from scvi_codegen.extras.fields.laws import derivation_of
-from scvi_codegen.interfaces.cli.command_group import check_writable, emit, reporting
-from scvi_codegen.interfaces.cli.model_options import model_arguments, read_model, with_known_sizes
+from scvi_codegen.interfaces.cli.command_group import emit
 
 
 @click.command()

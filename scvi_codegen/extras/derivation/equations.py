@@ -23,11 +23,14 @@ from typing import TYPE_CHECKING, overload
 
 import sympy
 
+from scvi_codegen.api.checks import checks_arguments
+from scvi_codegen.api.formulas import Number, jacobian
+from scvi_codegen.api.methods import Method, StageGroup, StageSystem
+from scvi_codegen.api.systems import SYSTEM_OR_ARRAYS, ArraySystem, MechanicalSystem
+from scvi_codegen.api.text import card, counted, plain
 from scvi_codegen.codegen.lowering.program import step_texts
-from scvi_codegen.common.display.cards import card, listed, plain
-from scvi_codegen.common.precision import Number
-from scvi_codegen.common.representation import LONGEST, clipped, counted
-from scvi_codegen.common.validation import checks_arguments
+from scvi_codegen.common.display.cards import listed
+from scvi_codegen.common.representation import LONGEST, clipped
 from scvi_codegen.extras.derivation.notation import (
     LARGEST_DENOMINATOR,
     LARGEST_SHOWN,
@@ -42,17 +45,13 @@ from scvi_codegen.extras.derivation.notation import (
 )
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretised_form, in_moving_frame, paper_equations
-from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.stage_system import Block, EntryName, Row, StageGroup, StageSystem, Table
-from scvi_codegen.systems.arrays.system import ArraySystem
+from scvi_codegen.methods.stage_system import Block, EntryName, Row, Table
 from scvi_codegen.systems.contacts.modes import in_all_modes
 from scvi_codegen.systems.first_order import FirstOrderSystem
-from scvi_codegen.systems.formulas.expressions import jacobian
 from scvi_codegen.systems.formulas.intermediates import inner_of, written_out
 from scvi_codegen.systems.formulas.translation import format_expression
 from scvi_codegen.systems.splittings.axial import axial_turns
 from scvi_codegen.systems.symmetry.symmetry import Symmetry, symmetries
-from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS, MechanicalSystem
 
 if TYPE_CHECKING:
     from scvi_codegen.extras.derivation.arrays import ArrayStepEquations

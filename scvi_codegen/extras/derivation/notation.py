@@ -8,21 +8,20 @@ from itertools import combinations
 
 import sympy
 
-from scvi_codegen.common.display.cards import Html, plain
+from scvi_codegen.api.formulas import TIME, Number, Vector, mp, parse_expression, symbol
+from scvi_codegen.api.methods import Method, StageSystem
+from scvi_codegen.api.systems import MechanicalSystem
+from scvi_codegen.api.text import Html, plain
 from scvi_codegen.common.display.mathml import latex_name, mathml_terms
 from scvi_codegen.common.errors import ExpressionError
-from scvi_codegen.common.precision import DIGITS, Number, Vector, mp
-from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.stage_system import EntryName, StageSystem
+from scvi_codegen.common.precision import DIGITS
+from scvi_codegen.methods.stage_system import EntryName
 from scvi_codegen.methods.tables.closed_forms import exact_points, exact_rule, exact_tableau
 from scvi_codegen.methods.tables.quadrature import Quadrature
 from scvi_codegen.methods.tables.tableau import Tableau
 from scvi_codegen.systems.event import Event
-from scvi_codegen.systems.formulas.grammar import parse_expression
-from scvi_codegen.systems.formulas.symbols import TIME, symbol
 from scvi_codegen.systems.formulas.translation import format_expression
 from scvi_codegen.systems.symmetry.symmetry import Symmetry
-from scvi_codegen.systems.system import MechanicalSystem
 
 LARGEST_BASIS = 8
 LARGEST_COEFFICIENT = 10**5

@@ -19,10 +19,10 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 from sympy.printing.pretty.pretty_symbology import greek_unicode
 
+from scvi_codegen.api.text import counted
 from scvi_codegen.common.cache import template_folder
 from scvi_codegen.common.display.mathml import mathml, mathml_terms
 from scvi_codegen.common.display.tables import Cell, TableBlock
-from scvi_codegen.common.representation import counted
 
 
 @dataclass(frozen=True, slots=True)

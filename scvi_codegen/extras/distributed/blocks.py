@@ -14,16 +14,16 @@ from functools import lru_cache
 from inspect import signature
 from typing import TYPE_CHECKING, Any, cast
 
+from scvi_codegen.api.checks import checked_count
+from scvi_codegen.api.runs import EnsembleSettings
 from scvi_codegen.common.errors import StateError, closest
-from scvi_codegen.common.validation import checked_count
-from scvi_codegen.runs.ensembles.ensemble import EnsembleSettings
 from scvi_codegen.runs.ensembles.individual import IndividualRuns, runs_of
 from scvi_codegen.runs.ensembles.lanes import CommonRuns
 from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
 from scvi_codegen.runs.stepper import checked_ensemble_result
 
 if TYPE_CHECKING:
-    from scvi_codegen.runs.states.validation import Array, States
+    from scvi_codegen.api.states import Array, States
     from scvi_codegen.runs.stepper import Stepper
 
 __all__ = ["integrate_ensemble"]

@@ -15,8 +15,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from scvi_codegen.api.formulas import Number, mp
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.extras.exact.newton import Array, Floats, Solve, inverse, largest, newton, scaled, solver
 from scvi_codegen.extras.exact.solution import ExactMotion
 from scvi_codegen.methods.tables.basis import cardinal_integrals

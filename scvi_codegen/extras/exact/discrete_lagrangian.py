@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from scvi_codegen.api.checks import Kind, checked_count, checks_arguments
+from scvi_codegen.api.formulas import Number, Vector, mp
+from scvi_codegen.api.text import summary
 from scvi_codegen.common.errors import StateError, closest
-from scvi_codegen.common.precision import Number, Vector, mp
-from scvi_codegen.common.representation import summary
-from scvi_codegen.common.validation import MAPPING, NUMBERS, ArgumentType, checked_count, checks_arguments, of
 from scvi_codegen.extras.exact.curve import Curve, Grid
 from scvi_codegen.extras.exact.newton import Array, NotConvergedError, largest
 from scvi_codegen.extras.exact.solution import ExactMotion
@@ -35,8 +35,10 @@ MAX_STRAIGHT_PIECES = 2
 """Maximum number of pieces for which the straight line is the initial guess; more have not helped."""
 
 Values = Mapping[str, Any] | Sequence[Any] | None
-LAGRANGIAN_OR_ARRAYS = of("a LagrangianSystem", LagrangianSystem, ArrayLagrangian)
-VALUES = ArgumentType("values by name or a list of all", lambda value: MAPPING.accepts(value) or NUMBERS.accepts(value))
+LAGRANGIAN_OR_ARRAYS = Kind.of("a LagrangianSystem", LagrangianSystem, ArrayLagrangian)
+VALUES = Kind(
+    "values by name or a list of all", lambda value: Kind.MAPPING.accepts(value) or Kind.NUMBERS.accepts(value)
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

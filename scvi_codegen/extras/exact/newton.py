@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.common.precision import Number, mp
+from scvi_codegen.api.formulas import Number, mp
 
 Array: TypeAlias = NDArray[Any]
 """Array of mpmath numbers."""

@@ -16,14 +16,13 @@ from typing import Any
 import numpy as np
 import sympy
 
+from scvi_codegen.api.formulas import Number, Tape, jacobian, mp
+from scvi_codegen.api.systems import MechanicalSystem, position_conditions
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.extras.exact.newton import Array as Numbers
 from scvi_codegen.extras.exact.newton import Floats, NotConvergedError, Solve, newton, solver
-from scvi_codegen.systems.constraints import force_directions, position_conditions, velocity_conditions
+from scvi_codegen.systems.constraints import force_directions, velocity_conditions
 from scvi_codegen.systems.first_order import FirstOrderSystem
-from scvi_codegen.systems.formulas.expressions import Tape, jacobian
-from scvi_codegen.systems.system import MechanicalSystem
 
 __all__ = ["ExactMotion", "Numbers", "exact_motion", "numbers"]
 

@@ -18,15 +18,14 @@ from typing import Any
 
 import numpy as np
 
+from scvi_codegen.api.formulas import Number, Tape, mp
+from scvi_codegen.api.methods import Method, StageGroup, StageSystem, discretise
+from scvi_codegen.api.systems import MechanicalSystem
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.extras.exact.newton import NotConvergedError, Solve, newton
 from scvi_codegen.extras.exact.solution import Numbers, exact_motion, numbers
-from scvi_codegen.methods.discretise import MIDDLE, discretise, reference_equations
-from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.stage_system import StageGroup, StageSystem, Velocities, straight
-from scvi_codegen.systems.formulas.expressions import Tape
-from scvi_codegen.systems.system import MechanicalSystem
+from scvi_codegen.methods.discretise import MIDDLE, reference_equations
+from scvi_codegen.methods.stage_system import Velocities, straight
 
 DIGITS = 45
 """Digits to which the equations are solved."""

@@ -20,6 +20,7 @@ import sympy
 from numpy.typing import NDArray
 from sympy import Add, Expr, Float, Rational, Symbol
 
+from scvi_codegen.api.formulas import DOT, TIME, Array, symbol
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.extras.fields.axes import Axis, Cells, fixed_place, rational, same, span
 from scvi_codegen.extras.fields.density import Density, place_text
@@ -27,8 +28,7 @@ from scvi_codegen.extras.fields.mesh import Mesh, MeshSystem
 from scvi_codegen.systems.arrays.system import ArrayHamiltonian, ArrayLagrangian, friction
 from scvi_codegen.systems.formulas.array_statements import ArrayForce, array_text
 from scvi_codegen.systems.formulas.arrays import MAX_UNROLLED_TERMS, ArrayTerm, term_of
-from scvi_codegen.systems.formulas.indices import Access, Array, Convolution, Loop, Place, Size
-from scvi_codegen.systems.formulas.symbols import DOT, TIME, symbol
+from scvi_codegen.systems.formulas.indices import Access, Convolution, Loop, Place, Size
 
 Slot: TypeAlias = Any
 """Number of a point within a cell, or in the general term of a sum its index as text."""

@@ -35,15 +35,15 @@ import numpy as np
 from numpy.typing import NDArray
 from sympy import Expr, Rational
 
+from scvi_codegen.api.checks import checked_count
+from scvi_codegen.api.formulas import Number, Vector, mp, symbol
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.common.precision import Matrix, Number, Vector, mp
-from scvi_codegen.common.validation import checked_count
+from scvi_codegen.common.precision import Matrix
 from scvi_codegen.extras.fields.density import Density
 from scvi_codegen.methods.tables.basis import differentiation_matrix, identity_matrix, matrix_product
 from scvi_codegen.methods.tables.nodes import point_count
 from scvi_codegen.methods.tables.quadrature import Quadrature, gauss_lobatto
 from scvi_codegen.systems.formulas.indices import Loop, Place, Size
-from scvi_codegen.systems.formulas.symbols import symbol
 
 Array = NDArray[np.float64]
 INWARD = 1e-6

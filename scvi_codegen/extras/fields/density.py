@@ -8,12 +8,12 @@ from typing import Any
 import sympy
 from sympy import Add, Expr, S, Symbol
 
+from scvi_codegen.api.formulas import TIME, symbol
+from scvi_codegen.api.text import summary
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.common.representation import summary
 from scvi_codegen.systems.checks.continuity import kink_in_velocities, velocity_message
 from scvi_codegen.systems.formulas.expressions import evaluated, hessian
 from scvi_codegen.systems.formulas.kinks import rint, unit_step
-from scvi_codegen.systems.formulas.symbols import TIME, symbol
 
 Boundary = Mapping[str, Any]
 

@@ -12,10 +12,10 @@ import numpy as np
 import sympy
 from sympy import Expr
 
+from scvi_codegen.api.formulas import symbol
 from scvi_codegen.common.errors import SystemDefinitionWarning, warn
 from scvi_codegen.extras.fields.axes import Axis
 from scvi_codegen.extras.fields.density import Density
-from scvi_codegen.systems.formulas.symbols import symbol
 
 SAMPLES, HALVINGS = 65, 40
 """Number of samples of a function within an element, and of bisections that locate its jump."""

@@ -27,12 +27,12 @@ from numpy.typing import NDArray
 from sympy import Add, Derivative, Eq, Expr, Function, S, Symbol
 from sympy.core.function import AppliedUndef
 
+from scvi_codegen.api.formulas import TIME, symbol
+from scvi_codegen.api.text import summary
 from scvi_codegen.common.errors import AccuracyWarning, StateError, StepFailedError, closest, warn
-from scvi_codegen.common.representation import summary
 from scvi_codegen.extras.fields.axes import NATURAL, PERIODIC, Axis
 from scvi_codegen.extras.fields.density import Density, place_text
 from scvi_codegen.systems.formulas.expressions import sums_to_zero
-from scvi_codegen.systems.formulas.symbols import TIME, symbol
 from scvi_codegen.systems.formulas.translation import format_expression
 
 Variation = dict[str, Expr]

@@ -8,10 +8,12 @@ import numpy as np
 import sympy
 from numpy.typing import ArrayLike, NDArray
 
+from scvi_codegen.api.formulas import TIME, symbol
+from scvi_codegen.api.methods import Method
+from scvi_codegen.api.text import summary
 from scvi_codegen.codegen.lowering.arrays import one_coordinate
 from scvi_codegen.codegen.pipeline import program_of
 from scvi_codegen.common.errors import StateError, closest
-from scvi_codegen.common.representation import summary
 from scvi_codegen.extras.fields.axes import NATURAL, PERIODIC, Axis
 from scvi_codegen.extras.fields.density import Density
 from scvi_codegen.extras.fields.laws import (
@@ -23,9 +25,7 @@ from scvi_codegen.extras.fields.laws import (
     local_law,
 )
 from scvi_codegen.methods import as_method
-from scvi_codegen.methods.method import Method
 from scvi_codegen.systems.formulas.array_statements import array_text
-from scvi_codegen.systems.formulas.symbols import TIME, symbol
 
 Array = NDArray[np.float64]
 

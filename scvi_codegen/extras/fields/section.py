@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from scvi_codegen.api.formulas import TIME, parse_expression, symbol
 from scvi_codegen.common.errors import ModelFileError
 from scvi_codegen.extras.fields.mesh import Mesh
 from scvi_codegen.extras.fields.system import FieldSystem
 from scvi_codegen.interfaces.models.model_files.sections import Document, ModelSection, Section, check_keys, in_section
 from scvi_codegen.interfaces.models.options import real
-from scvi_codegen.systems.formulas.grammar import parse_expression
 from scvi_codegen.systems.formulas.numpy_values import array_value
-from scvi_codegen.systems.formulas.symbols import TIME, symbol
 
 OTHERS = ("forces", "torques", "torques_space", "inputs", "sizes", "tables")
 """Sections that a density replaces."""

@@ -12,8 +12,9 @@ from typing import Any
 import sympy
 from sympy import Expr, Symbol
 
+from scvi_codegen.api.checks import checks_arguments
+from scvi_codegen.api.formulas import TIME, parse_expression, symbol
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.extras.fields.assembly import Assembly
 from scvi_codegen.extras.fields.axes import NATURAL, PERIODIC, Axis, FiniteDifferences, Fourier, SpectralElements
 from scvi_codegen.extras.fields.density import Density, derivatives_of
@@ -21,8 +22,7 @@ from scvi_codegen.extras.fields.jumps import warn_of_jumps
 from scvi_codegen.extras.fields.laws import FieldDerivation, derivation_of
 from scvi_codegen.extras.fields.mesh import MeshSystem
 from scvi_codegen.systems.formulas.array_statements import array_text
-from scvi_codegen.systems.formulas.grammar import parse_expression
-from scvi_codegen.systems.formulas.symbols import TIME, check_names, number, symbol
+from scvi_codegen.systems.formulas.symbols import check_names, number
 
 CLAMPED = "clamped"
 MOST_AXES = 3

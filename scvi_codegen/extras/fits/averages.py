@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.codegen.native.arguments import checked_number
+from scvi_codegen.api.checks import checks_arguments
+from scvi_codegen.api.states import Array, checked_number
 from scvi_codegen.common.errors import AccuracyWarning, StateError
-from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
-from scvi_codegen.runs.states.validation import Array
 
 WINDOW, RELAXATION, LEAST_TIMES = 5.0, 10.0, 50.0
 """Autocorrelation times in a window, omitted by default, and in all values, below which the error is unreliable."""

@@ -15,15 +15,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.codegen.native.arguments import real_array
+from scvi_codegen.api.checks import checked_count, checks_arguments
+from scvi_codegen.api.runs import STEPPER
+from scvi_codegen.api.states import Array, real_array
+from scvi_codegen.api.text import summary
 from scvi_codegen.common.errors import AccuracyWarning, FitError, StateError, StepFailedError, closest, warn
-from scvi_codegen.common.representation import summary
-from scvi_codegen.common.validation import checked_count, checks_arguments
 from scvi_codegen.extras.fits.measurements import Measurements, distinct, state_names
 from scvi_codegen.extras.fits.multiple_shooting import LOOSE, TIGHT, Chain, Limits, chained, joined
 from scvi_codegen.runs.driver.segments import checked_inputs
-from scvi_codegen.runs.states.validation import Array, columns_of_inputs
-from scvi_codegen.runs.stepper import STEPPER, Stepper
+from scvi_codegen.runs.states.validation import columns_of_inputs
+from scvi_codegen.runs.stepper import Stepper
 
 if TYPE_CHECKING:
     from scvi_codegen.extras.pictures.conserved import ResidualPlot

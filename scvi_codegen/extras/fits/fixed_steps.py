@@ -4,16 +4,14 @@ from itertools import pairwise
 
 import numpy as np
 
+from scvi_codegen.api.states import Array, Fixed, Starts
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import EventError
 from scvi_codegen.runs.derivatives.gradients import forward
 from scvi_codegen.runs.results.recomputation import SAME_STEP_SIZE
 from scvi_codegen.runs.states.layout import InitialData
 from scvi_codegen.runs.states.times import times_after
-from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
-from scvi_codegen.runs.stepping.step_derivatives import Starts
-from scvi_codegen.runs.stepping.step_plan import Fixed
 
 
 def tangents_along(

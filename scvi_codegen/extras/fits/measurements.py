@@ -13,16 +13,14 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.codegen.native.arguments import checked_number, checked_step, real_array
+from scvi_codegen.api.states import Array, checked_number, checked_step, real_array, require
 from scvi_codegen.common.errors import StateError, closest
 from scvi_codegen.extras.fits.fixed_steps import tangents_along
 from scvi_codegen.runs.driver.segments import Input, parameters_of
 from scvi_codegen.runs.results.dense_output import checked_times
 from scvi_codegen.runs.states.rotation_quantities import observable_derivatives, observable_names, observables
 from scvi_codegen.runs.states.times import steps_within
-from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
-from scvi_codegen.runs.stepping.features import require
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,11 +13,10 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.api.states import Array, Reduction
 from scvi_codegen.common.errors import EventError, FitError, StepFailedError
 from scvi_codegen.extras.fits.measurements import Measurements
 from scvi_codegen.runs.driver.segments import parameters_at
-from scvi_codegen.runs.states.reduction import Reduction
-from scvi_codegen.runs.states.validation import Array
 
 LOOSE, TIGHT = 0.1, 1e-9
 """Jumps, relative to the size of states, that weigh as much as a measurement residual: initially, and finally."""

@@ -19,29 +19,28 @@ from typing import Any
 import sympy
 from sympy import Expr, Symbol
 
+from scvi_codegen.api.checks import Kind, checked_count, checks_arguments
+from scvi_codegen.api.formulas import input_parameters, parse_expression, symbol
+from scvi_codegen.api.methods import Method, StageGroup, StageSystem, discretise
+from scvi_codegen.api.systems import MechanicalSystem, forms_of, position_conditions
 from scvi_codegen.codegen.native import building
 from scvi_codegen.common.errors import ArgumentError, MethodError, StateError, imported
-from scvi_codegen.common.validation import TEXTS, checked_count, checks_arguments, of
 from scvi_codegen.extras.frameworks.flow import Flow
 from scvi_codegen.extras.frameworks.sources import casadi_name, with_casadi_flow
 from scvi_codegen.methods import as_method
-from scvi_codegen.methods.discretise import discretise
-from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.stage_system import StageGroup, StageSystem, Table, straight
+from scvi_codegen.methods.stage_system import Table, straight
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.features import warn_of_formulas
-from scvi_codegen.systems.constraints import constraint_rates, position_conditions
-from scvi_codegen.systems.derived_expressions import forms_of
+from scvi_codegen.systems.constraints import constraint_rates
 from scvi_codegen.systems.formulas.expressions import CONSTANTS, FUNCTIONS
-from scvi_codegen.systems.formulas.grammar import parse_expression
 from scvi_codegen.systems.formulas.intermediates import written_out
-from scvi_codegen.systems.formulas.symbols import PARTS, input_parameters, symbol
-from scvi_codegen.systems.system import SYSTEM, MechanicalSystem
+from scvi_codegen.systems.formulas.symbols import PARTS
+from scvi_codegen.systems.system import SYSTEM
 
 FLOW_ARGUMENTS = ("q", "p", "parameters", "t", "h")
 
 
-@checks_arguments(StateError, stepper=of("a compiled stepper", Stepper))
+@checks_arguments(StateError, stepper=Kind.of("a compiled stepper", Stepper))
 def casadi_flow(stepper: Stepper, *, steps: int, save_every: int | None = None, hessian: bool = False) -> Any:
     """Return a fixed number of steps of a stepper as a ``casadi.Function``.
 
@@ -181,7 +180,7 @@ HIGHEST = len(PARTS) - 2
 """Highest degree of inputs within a step; compiled steps have cubics."""
 
 
-@checks_arguments(ArgumentError, system=SYSTEM, along=TEXTS)
+@checks_arguments(ArgumentError, system=SYSTEM, along=Kind.TEXTS)
 def casadi_step(
     system: MechanicalSystem, method: Method | str, *, degree: int = 0, along: Sequence[str] = (), solved: bool = False
 ) -> Any:

@@ -14,16 +14,16 @@ from typing import Any, Self
 
 import numpy as np
 
+from scvi_codegen.api.checks import Kind, checked_count, checks_arguments
+from scvi_codegen.api.program import Source
+from scvi_codegen.api.states import check_inputs_given, require
 from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.native.binding import Binding
-from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.common.errors import StateError, imported
 from scvi_codegen.common.representation import LONGEST, clipped
-from scvi_codegen.common.validation import checked_count, checks_arguments, of
 from scvi_codegen.extras.frameworks.sources import XLA_PARTS, XLA_SECOND_ORDER, with_flow_of_rows, with_xla_flow
-from scvi_codegen.runs.states.validation import check_inputs_given, parameter_index
+from scvi_codegen.runs.states.validation import parameter_index
 from scvi_codegen.runs.stepper import Stepper
-from scvi_codegen.runs.stepping.features import require
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +177,7 @@ class FlowOfRows(Flow):
 _registered: set[str] = set()
 
 
-@checks_arguments(StateError, stepper=of("a compiled stepper", Stepper))
+@checks_arguments(StateError, stepper=Kind.of("a compiled stepper", Stepper))
 def jax_flow(stepper: Stepper, *, steps: int, save_every: int | None = None) -> JaxFlow:
     """Return a fixed number of steps of a stepper as a function of JAX.
 

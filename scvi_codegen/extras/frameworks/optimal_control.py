@@ -14,16 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from scvi_codegen.codegen.native.arguments import checked_number, real_array
+from scvi_codegen.api.checks import Kind, checked_count, checks_arguments
+from scvi_codegen.api.methods import Method, discretise
+from scvi_codegen.api.states import Array, checked_number, real_array
+from scvi_codegen.api.systems import MechanicalSystem
 from scvi_codegen.common.errors import ControlError, MethodError, StateError, closest, imported
-from scvi_codegen.common.validation import MAPPING, checked_count, checks_arguments
 from scvi_codegen.extras.frameworks.casadi import EndConditions, casadi_step, own_parameters
 from scvi_codegen.methods import as_method
-from scvi_codegen.methods.discretise import discretise
-from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import straight
-from scvi_codegen.runs.states.validation import Array
-from scvi_codegen.systems.system import SYSTEM, MechanicalSystem
+from scvi_codegen.systems.system import SYSTEM
 
 if TYPE_CHECKING:
     from scipy.interpolate import PPoly
@@ -309,7 +308,7 @@ def _resampled(name: str, values: Any, times: Array) -> Array:
     )
 
 
-@checks_arguments(StateError, system=SYSTEM, start=MAPPING, end=MAPPING, bounds=MAPPING)
+@checks_arguments(StateError, system=SYSTEM, start=Kind.MAPPING, end=Kind.MAPPING, bounds=Kind.MAPPING)
 def optimal_control(
     system: MechanicalSystem,
     method: Method | str,

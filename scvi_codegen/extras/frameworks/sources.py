@@ -1,7 +1,7 @@
 """C sources of flows, with derivatives, for JAX, PyTorch and CasADi."""
 
+from scvi_codegen.api.program import Source
 from scvi_codegen.codegen.rendering.program_source import with_flow
-from scvi_codegen.codegen.rendering.source import Source
 
 XLA_PARTS = ("states", "jvp", "vjp")
 """XLA handlers: states, tangent vectors of states (JVP), gradients with respect to inputs (VJP)."""

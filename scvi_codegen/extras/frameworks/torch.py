@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from scvi_codegen.api.checks import Kind, checks_arguments
 from scvi_codegen.common.errors import StateError, imported
-from scvi_codegen.common.validation import checks_arguments, of
 from scvi_codegen.extras.frameworks.flow import ArrayFlow, FlowOfRows
 from scvi_codegen.runs.stepper import Stepper
 
 
-@checks_arguments(StateError, stepper=of("a compiled stepper", Stepper))
+@checks_arguments(StateError, stepper=Kind.of("a compiled stepper", Stepper))
 def torch_flow(stepper: Stepper, *, steps: int, save_every: int | None = None) -> TorchFlow:
     """Return a fixed number of steps of a stepper as a differentiable function of PyTorch.
 

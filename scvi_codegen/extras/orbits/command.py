@@ -7,16 +7,15 @@ from typing import Any
 import click
 import numpy as np
 
+from scvi_codegen.api.commands import check_writable, model_arguments, read_model, reporting, tell, with_known_sizes
+from scvi_codegen.api.text import counted
 from scvi_codegen.common.errors import ModelFileError
 from scvi_codegen.common.registry import part
-from scvi_codegen.common.representation import counted
 from scvi_codegen.extras.orbits import family as families
 from scvi_codegen.extras.orbits.continuation import Formula
 from scvi_codegen.extras.orbits.equilibrium import Equilibrium, equilibrium
 from scvi_codegen.extras.orbits.solver import PeriodicOrbit, periodic_orbit
 from scvi_codegen.extras.pictures.services import check_picture
-from scvi_codegen.interfaces.cli.command_group import check_writable, reporting, tell
-from scvi_codegen.interfaces.cli.model_options import model_arguments, read_model, with_known_sizes
 from scvi_codegen.interfaces.cli.recording import check_resumed
 from scvi_codegen.interfaces.cli.supervision import progress_bar
 from scvi_codegen.interfaces.models.model import Model

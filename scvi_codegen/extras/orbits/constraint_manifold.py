@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from scvi_codegen.api.states import Array, Reduction
 from scvi_codegen.common.errors import OrbitError, StateError
-from scvi_codegen.runs.states.reduction import Reduction
-from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.projection import linearised, projected
 

@@ -31,6 +31,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.api.formulas import parse_expression, symbol
+from scvi_codegen.api.runs import without_accuracy_warnings
+from scvi_codegen.api.states import RESOLVED, Array, roundoff
 from scvi_codegen.common.errors import EventError, OrbitError, StepFailedError
 from scvi_codegen.extras.orbits.equilibrium import Equilibrium
 from scvi_codegen.extras.orbits.solver import (
@@ -47,12 +50,7 @@ from scvi_codegen.extras.orbits.solver import (
     block_diagonal,
 )
 from scvi_codegen.extras.orbits.step_sequence import StepSequence
-from scvi_codegen.runs.accuracy.size import RESOLVED, roundoff
-from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
-from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.systems.formulas.expressions import evaluate
-from scvi_codegen.systems.formulas.grammar import parse_expression
-from scvi_codegen.systems.formulas.symbols import symbol
 
 MOST_CORRECTIONS, FEW_CORRECTIONS, CONTRACTION = 10, 4, 0.7
 """Newton iterations after which a prediction was too far, those up to which the next one may be farther, and the factor

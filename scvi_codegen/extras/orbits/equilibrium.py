@@ -14,17 +14,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from scvi_codegen.api.checks import checks_arguments
+from scvi_codegen.api.runs import STEPPER
+from scvi_codegen.api.states import RESOLVED, Array, Parameters, Reduction, require, roundoff
+from scvi_codegen.api.text import summary
 from scvi_codegen.common.errors import OrbitError, StateError, StepFailedError
-from scvi_codegen.common.representation import summary
-from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.extras.fits.fixed_steps import tangents_along
 from scvi_codegen.extras.orbits.constraint_manifold import reduction_of
-from scvi_codegen.runs.accuracy.size import RESOLVED, roundoff
 from scvi_codegen.runs.events.saltation import check_sides
-from scvi_codegen.runs.states.reduction import Reduction
-from scvi_codegen.runs.states.validation import Array, Parameters, check_step_given
-from scvi_codegen.runs.stepper import STEPPER, Stepper
-from scvi_codegen.runs.stepping.features import require
+from scvi_codegen.runs.states.validation import check_step_given
+from scvi_codegen.runs.stepper import Stepper
 
 LEAST_CHANGE = 0.1
 """Least |mu - 1| of the steps, whose eigenvalues have the error of one short step."""

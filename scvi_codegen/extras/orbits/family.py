@@ -12,9 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.codegen.native.arguments import checked_number
+from scvi_codegen.api.checks import Kind, checked_count, checks_arguments
+from scvi_codegen.api.runs import STEPPER
+from scvi_codegen.api.states import Array, checked_number, require
+from scvi_codegen.api.text import counted, summary, write_atomically
 from scvi_codegen.codegen.native.options import SolverOptions
-from scvi_codegen.common.atomic import write_atomically
 from scvi_codegen.common.errors import (
     AccuracyWarning,
     EventError,
@@ -24,8 +26,6 @@ from scvi_codegen.common.errors import (
     closest,
     warn,
 )
-from scvi_codegen.common.representation import counted, summary
-from scvi_codegen.common.validation import WHOLE, ArgumentType, check_kind, checked_count, checks_arguments, of
 from scvi_codegen.extras.fits.measurements import state_names
 from scvi_codegen.extras.orbits.continuation import Continuation, FamilyPoint, Formula
 from scvi_codegen.extras.orbits.equilibrium import Equilibrium
@@ -33,9 +33,7 @@ from scvi_codegen.extras.orbits.reversor import Reversor
 from scvi_codegen.extras.orbits.solver import OrbitSearch, PeriodicOrbit, bound_of, checked_part, gains_of, indices_of
 from scvi_codegen.extras.orbits.step_sequence import StepSequence
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
-from scvi_codegen.runs.states.validation import Array
-from scvi_codegen.runs.stepper import STEPPER, Stepper
-from scvi_codegen.runs.stepping.features import require
+from scvi_codegen.runs.stepper import Stepper
 
 SAME_ORBIT = 1e-6
 """Relative distance, far above errors of orbits, from which an orbit of a file is another one than the recomputed."""
@@ -283,11 +281,11 @@ Until = str | Callable[[PeriodicOrbit], bool] | None
 Progress = Callable[[int], None] | None
 
 
-START = of("a periodic orbit or an equilibrium", PeriodicOrbit, Equilibrium)
-UNTIL = ArgumentType("a condition as text, or a function", lambda value: isinstance(value, str) or callable(value))
+START = Kind.of("a periodic orbit or an equilibrium", PeriodicOrbit, Equilibrium)
+UNTIL = Kind("a condition as text, or a function", lambda value: isinstance(value, str) or callable(value))
 
 
-@checks_arguments(StateError, stepper=STEPPER, start=START, mode=WHOLE)
+@checks_arguments(StateError, stepper=STEPPER, start=START, mode=Kind.WHOLE)
 def family(
     stepper: Stepper,
     start: PeriodicOrbit | Equilibrium,
@@ -424,7 +422,7 @@ def _state_at(
 def _reason(until: Until, stepper: Stepper) -> Callable[[PeriodicOrbit], str]:
     """Return why an orbit is the last one by a condition, ``""`` for others."""
     if until is not None:
-        check_kind(UNTIL, until, "until", StateError)
+        Kind.check(UNTIL, until, "until", StateError)
     if not isinstance(until, str):
         return lambda orbit: "the condition of until holds" if until is not None and until(orbit) else ""
     states = state_names(stepper)

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from scvi_codegen.api.runs import without_accuracy_warnings
+from scvi_codegen.api.states import Array
 from scvi_codegen.common.errors import MethodError
 from scvi_codegen.extras.orbits.solver import PeriodicOrbit
 from scvi_codegen.extras.pictures.canvas import COLORS, check_plot_path, color, new_figure, save, style
-from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
-from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.trajectory import Trajectory
 
 if TYPE_CHECKING:

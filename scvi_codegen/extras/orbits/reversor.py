@@ -15,11 +15,10 @@ from itertools import islice, product
 
 import numpy as np
 
+from scvi_codegen.api.formulas import parse_expression, symbol
+from scvi_codegen.api.states import Array
 from scvi_codegen.common.errors import ScviCodegenError, StateError
-from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.systems.formulas.expressions import evaluate
-from scvi_codegen.systems.formulas.grammar import parse_expression
-from scvi_codegen.systems.formulas.symbols import symbol
 
 AT_ZERO = 1e-6
 """Positions and momenta, relative to the largest ones, below which they are those of a crossing of the fixed set, by

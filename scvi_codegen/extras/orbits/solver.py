@@ -29,7 +29,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.api.checks import checked_count, checks_arguments
+from scvi_codegen.api.runs import STEPPER, without_accuracy_warnings
+from scvi_codegen.api.states import (
+    RESOLVED,
+    Array,
+    Fixed,
+    Parameters,
+    Reduction,
+    check_inputs_given,
+    checked_number,
+    checked_step,
+    require,
+    roundoff,
+)
+from scvi_codegen.api.text import summary
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import (
     AccuracyWarning,
@@ -41,23 +55,17 @@ from scvi_codegen.common.errors import (
     closest,
     warn,
 )
-from scvi_codegen.common.representation import summary
-from scvi_codegen.common.validation import checked_count, checks_arguments
 from scvi_codegen.extras.fits.fixed_steps import tangents_along
 from scvi_codegen.extras.fits.measurements import state_names
 from scvi_codegen.extras.orbits.constraint_manifold import reduction_of
 from scvi_codegen.extras.orbits.reversor import Reversor
 from scvi_codegen.extras.orbits.step_sequence import StepSequence
 from scvi_codegen.extras.paths.size import SizeOfMotion
-from scvi_codegen.runs.accuracy.size import RESOLVED, roundoff
-from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
+from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runs.states.layout import InitialData
-from scvi_codegen.runs.states.reduction import Reduction
 from scvi_codegen.runs.states.times import steps_within
-from scvi_codegen.runs.states.validation import Array, Parameters, check_inputs_given
-from scvi_codegen.runs.stepper import STEPPER, Stepper
-from scvi_codegen.runs.stepping.features import require
-from scvi_codegen.runs.stepping.step_plan import ErrorControl, Fixed
+from scvi_codegen.runs.stepper import Stepper
+from scvi_codegen.runs.stepping.step_plan import ErrorControl
 from scvi_codegen.runs.trajectory import Trajectory
 
 SYMPLECTIC = 1e-9

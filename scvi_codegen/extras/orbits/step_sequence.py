@@ -11,9 +11,9 @@ from functools import cached_property
 
 import numpy as np
 
+from scvi_codegen.api.runs import without_accuracy_warnings
+from scvi_codegen.api.states import Array
 from scvi_codegen.codegen.native.options import SolverOptions
-from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
-from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
 
 LEAST_STEPS = 8

@@ -5,9 +5,9 @@ from typing import Any
 
 import click
 
+from scvi_codegen.api.commands import check_writable, model_arguments, read_model, reporting, tell
 from scvi_codegen.extras.pages.page import page_of
-from scvi_codegen.interfaces.cli.command_group import check_writable, reporting, tell
-from scvi_codegen.interfaces.cli.model_options import model_arguments, read_model, sections_of
+from scvi_codegen.interfaces.cli.model_options import sections_of
 from scvi_codegen.interfaces.models.model_files.document import document_of
 from scvi_codegen.interfaces.models.model_files.model_file import document_in
 

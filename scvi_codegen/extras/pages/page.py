@@ -21,13 +21,15 @@ from typing import Any
 import numpy as np
 import sympy
 
+from scvi_codegen.api.checks import Kind, checks_arguments
+from scvi_codegen.api.formulas import Rotation, RotationNames, input_parameters, parse_expression, symbol
+from scvi_codegen.api.program import Interface, Source
+from scvi_codegen.api.systems import SYSTEM_OR_ARRAYS, ArraySystem
+from scvi_codegen.api.text import summary, write_text
 from scvi_codegen.codegen.rendering.environment import template_environment
-from scvi_codegen.codegen.rendering.source import Interface, Source
-from scvi_codegen.common.atomic import write_text
 from scvi_codegen.common.display.mathml import mathml_terms
 from scvi_codegen.common.errors import ArgumentError, ExpressionError, MethodError, StateError, closest
-from scvi_codegen.common.representation import summary
-from scvi_codegen.common.validation import ArgumentType, checks_arguments, keyword_hint, of
+from scvi_codegen.common.validation import keyword_hint
 from scvi_codegen.extras.derivation.writing import mathematics_font
 from scvi_codegen.extras.orbits.family import Family
 from scvi_codegen.extras.orbits.picture import sizes_of
@@ -44,11 +46,7 @@ from scvi_codegen.interfaces.models.packages.example import absolute_tolerances_
 from scvi_codegen.interfaces.models.packages.package import integrator_of
 from scvi_codegen.runs.stepping.array_interface import read_arrays
 from scvi_codegen.runs.stepping.noise import Noise
-from scvi_codegen.systems.arrays.system import ArraySystem
-from scvi_codegen.systems.formulas.grammar import parse_expression
-from scvi_codegen.systems.formulas.rotations import Rotation, RotationNames, Spin
-from scvi_codegen.systems.formulas.symbols import input_parameters, symbol
-from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS
+from scvi_codegen.systems.formulas.rotations import Spin
 from scvi_codegen.version import __version__
 
 CAUSES = (
@@ -85,8 +83,8 @@ HEIGHT = 760
 """Height of a page in a notebook, in pixels."""
 WHOLE = 24
 """Number of coordinates up to which plots show each of them; of more, two nodes."""
-FAMILY = of("a family of periodic orbits, of scvi_codegen.family", Family)
-MODEL = ArgumentType(
+FAMILY = Kind.of("a family of periodic orbits, of scvi_codegen.family", Family)
+MODEL = Kind(
     "a Model, a system or the path of a model file",
     lambda value: isinstance(value, Model | str | os.PathLike) or SYSTEM_OR_ARRAYS.accepts(value),
 )

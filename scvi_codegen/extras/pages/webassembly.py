@@ -9,7 +9,7 @@ import importlib.util
 import sys
 from pathlib import Path
 
-from scvi_codegen.codegen.native.announcements import announced
+from scvi_codegen.api.text import announced
 from scvi_codegen.codegen.native.building import run_compiler
 from scvi_codegen.common.cache import cached_source
 from scvi_codegen.common.errors import BuildError

@@ -9,20 +9,12 @@ from typing import Any, TypeAlias
 
 import click
 
-from scvi_codegen.common.atomic import write_text
-from scvi_codegen.common.representation import counted
+from scvi_codegen.api.commands import check_writable, reporting, tell
+from scvi_codegen.api.text import counted, write_text
 from scvi_codegen.extras.paper.experiment import Experiment, Result, report_html, tally, write_result
 from scvi_codegen.extras.paper.runner import CATALOGUE, Failure, Watch, catalogue, run_experiments, with_needs
 from scvi_codegen.extras.pictures.canvas import check_plot_path
-from scvi_codegen.interfaces.cli.command_group import (
-    FAILURE,
-    INTERRUPTED,
-    CommandFailure,
-    check_writable,
-    is_quiet,
-    reporting,
-    tell,
-)
+from scvi_codegen.interfaces.cli.command_group import FAILURE, INTERRUPTED, CommandFailure, is_quiet
 
 EVERYTHING = "all"
 Report: TypeAlias = Callable[[str], None]

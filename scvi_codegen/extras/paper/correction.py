@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import sympy
 
+from scvi_codegen.api.methods import Method
 from scvi_codegen.common.display.tables import TableBlock
 from scvi_codegen.extras.derivation.equations import derive
 from scvi_codegen.extras.paper.experiment import Comparison, Experiment, Panel, Picture, Result, Series, comparison
@@ -14,7 +15,6 @@ from scvi_codegen.extras.paper.runs import KEPLER, ROUNDOFF, MeasuredRun, RunSet
 from scvi_codegen.extras.verification.system_under_test import canonical_form
 from scvi_codegen.interfaces.models.problems import problem
 from scvi_codegen.methods import SCVI, SVI, SpectralCollocation
-from scvi_codegen.methods.method import Method
 
 ROWS = ((2, 2), (3, 2), (4, 3), (5, 4), (6, 5), (7, 6), (9, 7))
 """Numbers of points and of Gauss points."""

@@ -23,7 +23,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.common.atomic import write_atomically
+from scvi_codegen.api.text import write_atomically
 from scvi_codegen.common.display.tables import TableBlock
 from scvi_codegen.common.toml_text import package_table
 from scvi_codegen.extras.derivation.writing import SPACE, page_template, style_sheet

@@ -15,9 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.api.formulas import Number, mp
+from scvi_codegen.api.methods import Method
+from scvi_codegen.api.systems import MechanicalSystem
 from scvi_codegen.common.display.tables import Cell, TableBlock
 from scvi_codegen.common.errors import StepFailedError
-from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.common.toml_text import package_table
 from scvi_codegen.extras.exact.step import derived_step
 from scvi_codegen.extras.paper.experiment import (
@@ -32,8 +34,6 @@ from scvi_codegen.extras.paper.experiment import (
 )
 from scvi_codegen.extras.paper.runs import KEPLER, ROUNDOFF, stepper_of, system_of
 from scvi_codegen.methods import SVI, SpectralCollocation
-from scvi_codegen.methods.method import Method
-from scvi_codegen.systems.system import MechanicalSystem
 
 SCHEMES = ("SVI", "SC")
 LEGEND = (2, 4, 6)

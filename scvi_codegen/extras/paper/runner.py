@@ -18,9 +18,9 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Any, TypeAlias
 
+from scvi_codegen.api.runs import without_accuracy_warnings
 from scvi_codegen.common.errors import MethodWarning, StateError, closest
 from scvi_codegen.extras.paper.experiment import Experiment, Result
-from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 
 CATALOGUE = "scvi_codegen.extras.paper.catalogue"
 PATIENCE = 10.0

@@ -19,6 +19,8 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
+from scvi_codegen.api.methods import Method, method_from_specification
+from scvi_codegen.api.systems import MechanicalSystem
 from scvi_codegen.codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.display.tables import TableBlock
@@ -37,12 +39,10 @@ from scvi_codegen.extras.paper.experiment import (
     thinned,
 )
 from scvi_codegen.interfaces.models.problems import problem
-from scvi_codegen.methods import SCVI, SVI, as_method, method_from_specification
-from scvi_codegen.methods.method import Method
+from scvi_codegen.methods import SCVI, SVI, as_method
 from scvi_codegen.runs.compiler import compile_stepper
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.trajectory import Trajectory
-from scvi_codegen.systems.system import MechanicalSystem
 
 SECTION_3 = SolverOptions(tolerance=1e-14, max_iterations=1000, absolute=True)
 ROUNDOFF = SolverOptions(max_iterations=1000)

@@ -9,12 +9,11 @@ from typing import Any
 import click
 import numpy as np
 
+from scvi_codegen.api.commands import check_writable, model_arguments, read_model, reporting, tell, with_known_sizes
+from scvi_codegen.api.text import counted
 from scvi_codegen.common.errors import MethodError, ModelFileError
-from scvi_codegen.common.representation import counted
 from scvi_codegen.extras.paths.path import Path, different_paths
 from scvi_codegen.extras.pictures.services import check_picture
-from scvi_codegen.interfaces.cli.command_group import check_writable, reporting, tell
-from scvi_codegen.interfaces.cli.model_options import model_arguments, read_model, with_known_sizes
 from scvi_codegen.interfaces.cli.recording import check_output
 from scvi_codegen.interfaces.models.model import Model
 from scvi_codegen.interfaces.models.options import options_of

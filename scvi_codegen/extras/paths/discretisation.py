@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from scvi_codegen.api.states import RESOLVED, Array, roundoff
 from scvi_codegen.common.errors import StepFailedError
 from scvi_codegen.extras.paths.intervals import Intervals
 from scvi_codegen.extras.paths.solver import Solution
-from scvi_codegen.runs.accuracy.size import RESOLVED, roundoff
-from scvi_codegen.runs.states.validation import Array
 
 FINER = 3
 """Number of steps by which each interval is solved again."""

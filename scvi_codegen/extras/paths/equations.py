@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from scvi_codegen.api.states import Array
 from scvi_codegen.common.errors import PathError
 from scvi_codegen.extras.paths.intervals import Intervals, Linearised
-from scvi_codegen.runs.states.validation import Array
 
 NULL_EIGENVALUE = 1e-7
 """Fraction of the largest eigenvalue below which others belong to symmetries of a closed path, which is not unique."""

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from scvi_codegen.api.states import Array
 from scvi_codegen.codegen.native.options import SolverOptions, step_failure
 from scvi_codegen.common.errors import PathError, StateError
 from scvi_codegen.extras.paths.size import size_for_updates
 from scvi_codegen.runs.states.rotations import members_of
-from scvi_codegen.runs.states.validation import Array
 
 CONVERGED, MOST_ITERATIONS = 1e-13, 20
 """Largest miss, relative to the range of the path, of a step that is solved by shooting, and most Newton iterations."""
@@ -374,8 +374,8 @@ class ReducedIntervals(Intervals):
             return np.zeros(basis.shape[1])
 
     def _action(self, q: Array, p: Array, step: dict[str, Any]) -> float:
+        from scvi_codegen.api.states import Starts
         from scvi_codegen.runs.derivatives.actions import actions_of_steps
-        from scvi_codegen.runs.stepping.step_derivatives import Starts
 
         rows = Starts(np.array([step["t"]]), np.array([step["h"]]), q[np.newaxis].copy(), p[np.newaxis].copy())
         return float(actions_of_steps(self.stepper, rows, step["parameters"], self.options)[0][0])

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from scvi_codegen.api.checks import checks_arguments
+from scvi_codegen.api.states import Parameters, States
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.extras.paths.path import ArrayOrFunction, Path, path_of
-from scvi_codegen.runs.states.validation import Parameters, States
 
 
 class OfSteppers:

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.codegen.native.arguments import checked_number, real_array
+from scvi_codegen.api.checks import checked_count
+from scvi_codegen.api.states import Array, Parameters, States, checked_number, real_array, require
+from scvi_codegen.api.text import summary
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import AccuracyWarning, MethodError, PathError, StateError, warn
-from scvi_codegen.common.representation import summary
-from scvi_codegen.common.validation import checked_count
 from scvi_codegen.extras.paths import solver
 from scvi_codegen.extras.paths.discretisation import Discretisation, discretisation_of, kinetic_energy_is_positive
 from scvi_codegen.extras.paths.equations import Band, condensed_hessian, hessian_blocks, negative_pivots
@@ -24,8 +24,7 @@ from scvi_codegen.extras.paths.size import largest_range, size_for_updates
 from scvi_codegen.extras.paths.starts import curves_around, curves_at_random
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runs.states.layout import StateLayout
-from scvi_codegen.runs.states.validation import Array, Parameters, States, columns_of_inputs
-from scvi_codegen.runs.stepping.features import require
+from scvi_codegen.runs.states.validation import columns_of_inputs
 
 if TYPE_CHECKING:
     from scvi_codegen.runs.trajectory import Trajectory
@@ -460,8 +459,8 @@ def _described(
 
 def _parameters_of_steps(stepper: Any, parameters: Parameters, inputs: Mapping[str, Any] | None, times: Array) -> Array:
     """Return the (k,) parameters of all steps, or (N, k) with inputs, those of the piece in the middle of each step."""
+    from scvi_codegen.api.states import check_inputs_given
     from scvi_codegen.runs.driver.segments import checked_inputs
-    from scvi_codegen.runs.states.validation import check_inputs_given
 
     if inputs is None:
         check_inputs_given(stepper.interface, parameters)

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scvi_codegen.runs.accuracy.size import relative, roundoff
-from scvi_codegen.runs.states.validation import Array
+from scvi_codegen.api.states import Array, roundoff
+from scvi_codegen.runs.accuracy.size import relative
 
 UPDATE_ROUNDING = 4.0
 """Newton updates of so many roundings of the largest value cannot be reduced."""

@@ -13,12 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from scvi_codegen.api.states import RESOLVED, Array, roundoff
 from scvi_codegen.common.errors import PathError, StateError, StepFailedError
 from scvi_codegen.extras.paths.equations import Bordered, BorderedClosed, Closed, closed_residual, factors_of
 from scvi_codegen.extras.paths.intervals import Intervals, Linearised
 from scvi_codegen.extras.paths.size import SizeOfMotion, largest_range, size_for_updates
-from scvi_codegen.runs.accuracy.size import RESOLVED, roundoff
-from scvi_codegen.runs.states.validation import Array
 
 TOLERANCE = 1e-11
 """Newton correction, relative to the range of the path, at which the iteration ends."""

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.runs.states.validation import Array
+from scvi_codegen.api.states import Array
 
 WAVES = 3
 """Number of sine waves of a curve at random."""

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from scvi_codegen.api.checks import Kind, checks_arguments
+from scvi_codegen.api.text import summary
 from scvi_codegen.common.atomic import replaced
 from scvi_codegen.common.errors import PlotError, StateError
-from scvi_codegen.common.representation import summary
-from scvi_codegen.common.validation import REAL, checks_arguments
 from scvi_codegen.extras.pictures.canvas import (
     MOTIONS,
     Array,
@@ -103,7 +103,7 @@ SIZE = 4.8
 """Width and height of the figure in inches."""
 
 
-@checks_arguments(trajectory=MOTIONS, seconds=REAL)
+@checks_arguments(trajectory=MOTIONS, seconds=Kind.REAL)
 def animate(
     trajectory: Motions,
     path: str | os.PathLike[str] | None = None,

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.api.checks import Kind, checks_arguments
 from scvi_codegen.common.errors import StateError, closest
-from scvi_codegen.common.validation import CANVAS, ArgumentType, checks_arguments
 from scvi_codegen.extras.pictures.canvas import color, panel, plain
 from scvi_codegen.runs.states.words import NamedState
 from scvi_codegen.runs.trajectory import Trajectory
@@ -21,9 +21,7 @@ IN_SPACE = (2, 3)
 """Lengths of the last axis of arrays of positions in space."""
 
 
-ARRAYS = ArgumentType(
-    "a trajectory of arrays", lambda value: isinstance(value, Trajectory) and isinstance(value.q, NamedState)
-)
+ARRAYS = Kind("a trajectory of arrays", lambda value: isinstance(value, Trajectory) and isinstance(value.q, NamedState))
 
 
 def mesh_of(motion: Trajectory) -> Any:
@@ -43,7 +41,7 @@ def array_values(motion: Trajectory, name: str | None) -> tuple[str, NDArray[np.
     return name, arrays[name]
 
 
-@checks_arguments(trajectory=ARRAYS, ax=CANVAS)
+@checks_arguments(trajectory=ARRAYS, ax=Kind.CANVAS)
 def plot_arrays(
     trajectory: Trajectory,
     path: str | os.PathLike[str] | None = None,
@@ -115,7 +113,7 @@ def _draw_positions(axes: Axes, values: NDArray[np.float64], name: str) -> None:
     axes.legend()
 
 
-@checks_arguments(trajectory=ARRAYS, ax=CANVAS)
+@checks_arguments(trajectory=ARRAYS, ax=Kind.CANVAS)
 def plot_spectrum(
     trajectory: Trajectory,
     path: str | os.PathLike[str] | None = None,

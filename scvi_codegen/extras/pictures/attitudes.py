@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from scvi_codegen.api.checks import Kind, checks_arguments
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.common.validation import CANVAS, WHOLE, checks_arguments
 from scvi_codegen.extras.pictures.canvas import MOTIONS, Array, Motions, color, panel, plain, several, smooth
 from scvi_codegen.runs.trajectory import Trajectory
 
@@ -30,7 +30,7 @@ def unit_vectors(motion: Trajectory, axis: int = 3) -> dict[str, Array]:
     return result
 
 
-@checks_arguments(trajectory=MOTIONS, axis=WHOLE, ax=CANVAS)
+@checks_arguments(trajectory=MOTIONS, axis=Kind.WHOLE, ax=Kind.CANVAS)
 def plot_attitude(
     trajectory: Motions, path: str | os.PathLike[str] | None = None, *, axis: int = 3, ax: Axes | None = None
 ) -> Axes:

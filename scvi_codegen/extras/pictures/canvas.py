@@ -12,9 +12,9 @@ from typing import IO, TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.common.atomic import write_atomically
+from scvi_codegen.api.checks import Kind
+from scvi_codegen.api.text import write_atomically
 from scvi_codegen.common.errors import PlotError, StateError, StepFailedError
-from scvi_codegen.common.validation import ArgumentType
 from scvi_codegen.runs.recording import RecordedRun
 from scvi_codegen.runs.results.recorded import changed
 from scvi_codegen.runs.stepping.step_plan import FixedSteps
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from scvi_codegen.codegen.rendering.source import Interface
+    from scvi_codegen.api.program import Interface
 
 PICTURES = (".png", ".svg", ".pdf")
 COLORS = ("#1f5fa8", "#d1495b", "#2e8b57", "#b8860b", "#7a4fa3", "#2b8c9e", "#8c564b", "#555555")
@@ -132,7 +132,7 @@ def _is_motion(value: Any) -> bool:
     return isinstance(value, Trajectory | RecordedRun)
 
 
-MOTIONS = ArgumentType(
+MOTIONS = Kind(
     "a trajectory or a list of them",
     lambda value: _is_motion(value) or (isinstance(value, Sequence) and all(map(_is_motion, value))),
 )

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from scvi_codegen.api.checks import Kind, checks_arguments
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.common.validation import CANVAS, checks_arguments
 from scvi_codegen.extras.pictures.canvas import MOTIONS, Array, Motions, color, panel, plain, several
 from scvi_codegen.runs.results.energy import energy_account
 from scvi_codegen.runs.trajectory import Trajectory
@@ -52,7 +52,7 @@ LOWEST = 1e-16
 """Error drawn on a logarithmic axis if all are 0."""
 
 
-@checks_arguments(trajectories=MOTIONS, ax=CANVAS)
+@checks_arguments(trajectories=MOTIONS, ax=Kind.CANVAS)
 def plot_energy(trajectories: Motions, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
     """Draw the energy error ``|H - H_0| / |H_0|`` over time (absolute if H_0 = 0), a colour a trajectory.
 
@@ -74,7 +74,7 @@ def plot_energy(trajectories: Motions, path: str | os.PathLike[str] | None = Non
     return axes
 
 
-@checks_arguments(trajectory=MOTIONS, ax=CANVAS)
+@checks_arguments(trajectory=MOTIONS, ax=Kind.CANVAS)
 def plot_momentum_maps(
     trajectory: Motions, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None
 ) -> Axes:

@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping
 from os import PathLike
 from typing import Any
 
+from scvi_codegen.api.states import Array
 from scvi_codegen.extras.pictures.animation import Film, animate
 from scvi_codegen.extras.pictures.overview import Plots
 from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
-from scvi_codegen.runs.states.validation import Array
 
 MOST_DRAWN = 64
 """Number of trajectories of an ensemble that are drawn."""

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from scvi_codegen.api.checks import Kind, checks_arguments
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.common.validation import CANVAS, NAMES, checks_arguments
 from scvi_codegen.extras.pictures.animation import drawn_shape, positions_of
 from scvi_codegen.extras.pictures.arrays import plot_arrays, plot_spectrum
 from scvi_codegen.extras.pictures.attitudes import draw_unit_vectors, plot_attitude
@@ -119,7 +119,7 @@ FEW_POINTS = 2000
 DIRECTION_TEXT = {1: ", rising", 0: "", -1: ", falling"}
 
 
-@checks_arguments(trajectories=MOTIONS, ax=CANVAS, axes=NAMES)
+@checks_arguments(trajectories=MOTIONS, ax=Kind.CANVAS, axes=Kind.NAMES)
 def plot_section(
     trajectories: Motions,
     path: str | os.PathLike[str] | None = None,
@@ -244,7 +244,7 @@ MAX_POINTS = 20_000
 MAX_CURVES = 6
 
 
-@checks_arguments(trajectory=MOTIONS, ax=CANVAS)
+@checks_arguments(trajectory=MOTIONS, ax=Kind.CANVAS)
 def plot_motion(trajectory: Motions, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
     """Draw the path of a trajectory: orbits, a plane of coordinates, or coordinates over time.
 
@@ -268,7 +268,7 @@ def plot_motion(trajectory: Motions, path: str | os.PathLike[str] | None = None,
     return panel_axes
 
 
-@checks_arguments(trajectories=MOTIONS, ax=CANVAS, axes=NAMES)
+@checks_arguments(trajectories=MOTIONS, ax=Kind.CANVAS, axes=Kind.NAMES)
 def plot_phase(
     trajectories: Motions,
     path: str | os.PathLike[str] | None = None,

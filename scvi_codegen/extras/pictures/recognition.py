@@ -12,12 +12,10 @@ import numpy as np
 import sympy
 from sympy import Expr, Matrix
 
+from scvi_codegen.api.formulas import Rotation, RotationNames, parse_expression, symbol
 from scvi_codegen.common.errors import ExpressionError, StateError
 from scvi_codegen.extras.pictures.shape import DrawnSystem, MovingShape, PointProgram, graph_of
-from scvi_codegen.systems.formulas.grammar import parse_expression
 from scvi_codegen.systems.formulas.intermediates import intermediate
-from scvi_codegen.systems.formulas.rotations import Rotation, RotationNames
-from scvi_codegen.systems.formulas.symbols import symbol
 from scvi_codegen.systems.symmetry.sampling import bodies
 
 NUMBERED = re.compile(r"(.*?)_?(\d+)")

@@ -20,13 +20,12 @@ import sympy
 from numpy.typing import NDArray
 from sympy import Expr
 
+from scvi_codegen.api.formulas import DOT, TIME, Array, RotationNames, symbol
 from scvi_codegen.common.errors import ExpressionError, ModelFileError, SystemDefinitionError, closest
 from scvi_codegen.systems.formulas.array_statements import formula_of_entries, is_indexed
 from scvi_codegen.systems.formulas.expressions import PIECEWISE_CONSTANT
-from scvi_codegen.systems.formulas.indices import Array, Size
+from scvi_codegen.systems.formulas.indices import Size
 from scvi_codegen.systems.formulas.intermediates import Intermediate, intermediates
-from scvi_codegen.systems.formulas.rotations import RotationNames
-from scvi_codegen.systems.formulas.symbols import DOT, TIME, symbol
 
 Values = NDArray[np.float64]
 

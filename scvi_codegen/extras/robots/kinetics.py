@@ -33,10 +33,10 @@ import sympy
 from sympy import Add, Dummy, Expr, Matrix, Pow, Symbol
 from sympy.integrals.manualintegrate import manualintegrate
 
+from scvi_codegen.api.formulas import RotationNames, jacobian
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.extras.robots.variables import Variables
-from scvi_codegen.systems.formulas.expressions import NEGLIGIBLE, jacobian, samples, unsupported_part
-from scvi_codegen.systems.formulas.rotations import RotationNames
+from scvi_codegen.systems.formulas.expressions import NEGLIGIBLE, samples, unsupported_part
 
 if TYPE_CHECKING:
     from sympy.physics.mechanics import Particle, ReferenceFrame, RigidBody

@@ -11,11 +11,11 @@ import sympy
 from sympy import Expr, Symbol
 from sympy.physics.mechanics import KanesMethod, LinearSpring, dynamicsymbols
 
+from scvi_codegen.api.formulas import Rotation
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.extras.robots.kinetics import gyroscopic_forces, kinetic_energy, load_forces, motions_of, potential_of
 from scvi_codegen.extras.robots.turning import with_rotations
 from scvi_codegen.extras.robots.variables import Variables, independent_of, solved_for_speeds
-from scvi_codegen.systems.formulas.rotations import Rotation
 
 if TYPE_CHECKING:
     from sympy.physics.mechanics import LagrangesMethod, ReferenceFrame, System

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 from sympy import Expr, Matrix, sympify
 from sympy.physics.mechanics import RigidBody, SphericalJoint, Vector, dynamicsymbols
 
+from scvi_codegen.api.formulas import Rotation
 from scvi_codegen.extras.robots.kinetics import are_zero
 from scvi_codegen.extras.robots.trees.tree import identifier
 from scvi_codegen.extras.robots.variables import Variables
-from scvi_codegen.systems.formulas.rotations import Rotation
 
 if TYPE_CHECKING:
     from sympy.physics.mechanics import ReferenceFrame, System

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from sympy import Dummy, Expr, Matrix, Symbol
 from sympy.core.function import AppliedUndef
 
+from scvi_codegen.api.formulas import Rotation, jacobian
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.systems.derived_expressions import coupled_blocks, dense, inverse_by_minors, row_rank
-from scvi_codegen.systems.formulas.expressions import evaluated, gradient, jacobian, samples, unsupported_part
-from scvi_codegen.systems.formulas.rotations import Rotation
+from scvi_codegen.systems.formulas.expressions import evaluated, gradient, samples, unsupported_part
 from scvi_codegen.systems.rotations.points import torque_of
 
 MOST_COUPLED = 6

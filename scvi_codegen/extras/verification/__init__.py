@@ -20,9 +20,12 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.api.checks import checks_arguments
+from scvi_codegen.api.methods import Method
+from scvi_codegen.api.runs import STEPPER, without_accuracy_warnings
+from scvi_codegen.api.states import Array, checked_number, checked_step
+from scvi_codegen.api.systems import SYSTEM_OR_ARRAYS, ArraySystem, MechanicalSystem
 from scvi_codegen.common.errors import StateError, StepFailedError
-from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.extras.verification.arrays import state_of_fields, verify_arrays
 from scvi_codegen.extras.verification.certificate import Certificate, Check, Outcome, issued
 from scvi_codegen.extras.verification.convergence import convergence_checks, identity_checks
@@ -35,16 +38,11 @@ from scvi_codegen.extras.verification.system_under_test import State, SystemUnde
 from scvi_codegen.extras.verification.variable_steps import VariableSteps, at_fixed_energy, variable_step_checks
 from scvi_codegen.methods import as_method, sliding
 from scvi_codegen.methods.discretise import discretised_form
-from scvi_codegen.methods.method import Method
-from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runs.compiler import compile_stepper
 from scvi_codegen.runs.results.saved_states import parameters_on_sides
-from scvi_codegen.runs.states.validation import Array
-from scvi_codegen.runs.stepper import STEPPER, Stepper
-from scvi_codegen.systems.arrays.system import ArraySystem
+from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.systems.contacts.modes import in_all_modes
 from scvi_codegen.systems.kinks import located_kinks
-from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS, MechanicalSystem
 
 __all__ = ["Certificate", "Check", "Outcome", "verify"]
 

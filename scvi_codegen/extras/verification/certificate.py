@@ -11,11 +11,8 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any, NamedTuple
 
-from scvi_codegen.codegen.native.announcements import announced
-from scvi_codegen.common.atomic import write_text
-from scvi_codegen.common.display.cards import Html, card, grid, plain
+from scvi_codegen.api.text import Html, announced, card, grid, plain, summary, write_text
 from scvi_codegen.common.errors import EventError, MethodError, StateError, StepFailedError, SystemDefinitionError
-from scvi_codegen.common.representation import summary
 from scvi_codegen.extras.verification.system_under_test import State
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.version import __version__

@@ -7,17 +7,12 @@ from typing import Any
 
 import click
 
+from scvi_codegen.api.commands import check_writable, model_arguments, read_model, reporting, tell, with_known_sizes
 from scvi_codegen.common.errors import PackageError
 from scvi_codegen.extras import verification
 from scvi_codegen.extras.verification import Certificate
-from scvi_codegen.interfaces.cli.command_group import FAILURE, CommandFailure, check_writable, note, reporting, tell
-from scvi_codegen.interfaces.cli.model_options import (
-    Choices,
-    model_arguments,
-    read_model,
-    sections_of,
-    with_known_sizes,
-)
+from scvi_codegen.interfaces.cli.command_group import FAILURE, CommandFailure, note
+from scvi_codegen.interfaces.cli.model_options import Choices, sections_of
 from scvi_codegen.interfaces.models.model import DEFAULT_METHOD, Model
 from scvi_codegen.interfaces.models.model_files.model_file import load_model
 from scvi_codegen.interfaces.models.options import METHOD_KEYS

@@ -14,8 +14,10 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from scvi_codegen.api.formulas import Number, mp
+from scvi_codegen.api.methods import Method, method_from_specification
+from scvi_codegen.api.systems import MechanicalSystem, forms_of
 from scvi_codegen.common.errors import MethodError, StateError
-from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.extras.exact.solution import exact_motion, numbers
 from scvi_codegen.extras.exact.step import derived_step
 from scvi_codegen.extras.verification.certificate import Check, Finding, checked
@@ -26,11 +28,9 @@ from scvi_codegen.methods import (
     CollocationRK,
     Composition,
     Gauss,
-    Method,
     RungeKutta,
     SpectralCollocation,
     StoermerVerlet,
-    method_from_specification,
 )
 from scvi_codegen.methods.tables.quadrature import (
     Quadrature,
@@ -40,11 +40,9 @@ from scvi_codegen.methods.tables.quadrature import (
     gauss_lobatto,
     gauss_radau,
 )
-from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 from scvi_codegen.systems.legendre.transform import hamiltonian_of, lagrangian_of
-from scvi_codegen.systems.system import MechanicalSystem
 
 TARGET_ERROR = mp.mpf(10) ** -17
 """Error at which the order is measured: below the round-off of doubles, so that errors of that size show."""

@@ -10,17 +10,16 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.api.formulas import Number, mp
+from scvi_codegen.api.states import Array, Starts
 from scvi_codegen.common.errors import MethodError
-from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.extras.exact.solution import exact_motion
 from scvi_codegen.extras.exact.step import compiled_equations
 from scvi_codegen.extras.verification.certificate import Check, Finding, checked
 from scvi_codegen.extras.verification.system_under_test import BOUND, ROUND_OFF, State, SystemUnderTest, canonical_form
 from scvi_codegen.extras.verification.variable_steps import VariableSteps
 from scvi_codegen.methods.discretise import is_symplectic
-from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
-from scvi_codegen.runs.stepping.step_derivatives import Starts
 
 WIDTH = mp.mpf(10) ** -15
 """Relative perturbation of the arguments for differences in 60 digits."""

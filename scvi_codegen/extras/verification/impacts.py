@@ -10,9 +10,10 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 import sympy
 
+from scvi_codegen.api.formulas import TIME, Tape, mp, symbol
+from scvi_codegen.api.states import Array
 from scvi_codegen.codegen.rendering.events import EventFormulas
 from scvi_codegen.common.errors import EventWarning, StateError
-from scvi_codegen.common.precision import mp
 from scvi_codegen.extras.exact.solution import ExactMotion, Numbers, exact_motion, numbers, solved
 from scvi_codegen.extras.verification.certificate import Check, Finding, checked
 from scvi_codegen.extras.verification.convergence import MAX_HALVINGS
@@ -31,13 +32,10 @@ from scvi_codegen.extras.verification.system_under_test import (
 from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.runs.results.recomputation import changes_by_events
 from scvi_codegen.runs.results.saved_states import parameters_on_sides
-from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.trajectory import Trajectory
 from scvi_codegen.systems.contact import coefficients
 from scvi_codegen.systems.event import Crossings, Kink
-from scvi_codegen.systems.formulas.expressions import Tape
-from scvi_codegen.systems.formulas.symbols import TIME, symbol
 
 STEPS = 2000
 """Number of steps of the run."""

@@ -16,9 +16,12 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from scvi_codegen.api.formulas import mp
+from scvi_codegen.api.runs import EnsembleSettings
+from scvi_codegen.api.states import Array
+from scvi_codegen.api.systems import forms_of
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.common.precision import mp
 from scvi_codegen.extras.exact.solution import numbers
 from scvi_codegen.extras.verification.certificate import Check, Finding, ViolationError, checked
 from scvi_codegen.extras.verification.system_under_test import (
@@ -29,12 +32,10 @@ from scvi_codegen.extras.verification.system_under_test import (
     SystemUnderTest,
 )
 from scvi_codegen.methods import SCVI
-from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings
+from scvi_codegen.runs.ensembles.ensemble import Ensemble
 from scvi_codegen.runs.ensembles.individual import runs_of
 from scvi_codegen.runs.ensembles.lanes import CommonRuns, LaneRuns
-from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
-from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.splittings.kinetic import kinetic_splitting
 
 SHORT = 2.0**-40

@@ -11,9 +11,11 @@ from functools import partial
 
 import numpy as np
 
+from scvi_codegen.api.formulas import mp
+from scvi_codegen.api.methods import discretise
+from scvi_codegen.api.states import Array
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import StateError, StepFailedError
-from scvi_codegen.common.precision import mp
 from scvi_codegen.extras.exact.solution import Numbers, numbers
 from scvi_codegen.extras.exact.step import SolvedStep, compiled_equations
 from scvi_codegen.extras.verification.certificate import Check, Finding, ViolationError, checked
@@ -27,8 +29,7 @@ from scvi_codegen.extras.verification.system_under_test import (
     State,
     SystemUnderTest,
 )
-from scvi_codegen.methods.discretise import discretise, in_moving_frame
-from scvi_codegen.runs.states.validation import Array
+from scvi_codegen.methods.discretise import in_moving_frame
 from scvi_codegen.runs.stepper import Stepper
 
 ANY_UPDATE = SolverOptions(tolerance=1e300)

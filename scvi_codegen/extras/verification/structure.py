@@ -6,8 +6,9 @@ from functools import partial
 
 import numpy as np
 
+from scvi_codegen.api.formulas import mp
+from scvi_codegen.api.states import Array, Reduction
 from scvi_codegen.common.errors import StateError, StepFailedError
-from scvi_codegen.common.precision import mp
 from scvi_codegen.extras.exact.solution import numbers
 from scvi_codegen.extras.verification.certificate import Check, Finding, checked, information
 from scvi_codegen.extras.verification.system_under_test import (
@@ -23,8 +24,6 @@ from scvi_codegen.extras.verification.system_under_test import (
     canonical_form,
 )
 from scvi_codegen.methods.discretise import is_conformally_symplectic, is_symplectic
-from scvi_codegen.runs.states.reduction import Reduction
-from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.trajectory import Trajectory
 
 SPREAD = 10.0

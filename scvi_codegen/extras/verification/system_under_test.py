@@ -6,16 +6,16 @@ from functools import cached_property
 
 import numpy as np
 
+from scvi_codegen.api.formulas import Number, mp
+from scvi_codegen.api.methods import Method
+from scvi_codegen.api.states import Array
+from scvi_codegen.api.systems import MechanicalSystem
 from scvi_codegen.codegen.native.announcements import tell
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import EventError, StateError, StepFailedError
-from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.extras.exact.solution import ExactMotion, exact_motion, numbers
 from scvi_codegen.extras.exact.step import DerivedStep, SolvedStep, derived_step
-from scvi_codegen.methods.method import Method
-from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
-from scvi_codegen.systems.system import MechanicalSystem
 
 Map = Callable[[Array], Array]
 

@@ -7,16 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.common.precision import mp
+from scvi_codegen.api.formulas import Tape, mp
+from scvi_codegen.api.states import Array
+from scvi_codegen.api.systems import MechanicalSystem
 from scvi_codegen.extras.exact.solution import ExactMotion, exact_motion, numbers
 from scvi_codegen.extras.verification.certificate import Check, Finding, checked
 from scvi_codegen.extras.verification.structure import momentum_error
 from scvi_codegen.extras.verification.system_under_test import EPSILON, ROUNDINGS, STEP_DIVISOR, State, SystemUnderTest
-from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.trajectory import Trajectory
-from scvi_codegen.systems.formulas.expressions import Tape
-from scvi_codegen.systems.system import MechanicalSystem
 from scvi_codegen.systems.time_transformation import time_rescaling_function
 
 ERROR_RATIO = 100.0

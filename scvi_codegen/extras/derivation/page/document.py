@@ -8,13 +8,16 @@ import sympy
 from sympy import Function as Applied
 from sympy import Symbol
 
+from scvi_codegen.api.formulas import gradient_tuple
+from scvi_codegen.api.methods import Method, StageGroup, StageSystem, discretise
+from scvi_codegen.api.systems import MechanicalSystem, forms_of
+from scvi_codegen.api.text import counted
 from scvi_codegen.codegen.ir.kernel import Kernel
 from scvi_codegen.codegen.ir.program import Program
 from scvi_codegen.codegen.lowering.program import step_texts
 from scvi_codegen.codegen.pipeline import c_identifier, program_of
 from scvi_codegen.codegen.rendering.program_source import render
 from scvi_codegen.common.display.tables import TableBlock
-from scvi_codegen.common.representation import counted
 from scvi_codegen.extras.derivation.equations import StepEquations, derive
 from scvi_codegen.extras.derivation.notation import contact_lines, events_text, table_entries
 from scvi_codegen.extras.derivation.outline import Function, functions_of, reached
@@ -34,15 +37,11 @@ from scvi_codegen.extras.derivation.writing import (
     page_template,
     style_sheet,
 )
-from scvi_codegen.methods.discretise import check_regular, discretise, paper_equations
-from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.stage_system import StageGroup, StageSystem
+from scvi_codegen.methods.discretise import check_regular, paper_equations
 from scvi_codegen.systems.constraints import with_constraint_forces
 from scvi_codegen.systems.contacts.modes import in_all_modes
-from scvi_codegen.systems.derived_expressions import auxiliary_multipliers, forms_of, multipliers
+from scvi_codegen.systems.derived_expressions import auxiliary_multipliers, multipliers
 from scvi_codegen.systems.event import Event
-from scvi_codegen.systems.formulas.expressions import gradient_tuple
-from scvi_codegen.systems.system import MechanicalSystem
 from scvi_codegen.version import __version__
 
 

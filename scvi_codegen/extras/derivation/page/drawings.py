@@ -9,20 +9,19 @@ from itertools import accumulate
 import sympy
 from sympy import Function, Identity, KroneckerProduct, MatrixSymbol, Symbol
 
+from scvi_codegen.api.formulas import Vector, jacobian
+from scvi_codegen.api.methods import Method, StageSystem
+from scvi_codegen.api.systems import MechanicalSystem
+from scvi_codegen.api.text import counted
 from scvi_codegen.codegen.ir.program import Program
 from scvi_codegen.common.display.tables import Cell, TableBlock
-from scvi_codegen.common.precision import Vector
-from scvi_codegen.common.representation import counted
 from scvi_codegen.extras.derivation.equations import StepEquations
 from scvi_codegen.extras.derivation.notation import TableEntry
 from scvi_codegen.extras.derivation.writing import Content, Drawing, Formula, Paragraph, Section, formulas
-from scvi_codegen.methods import SCVI, SVI, Composition, Method, RungeKutta, SpectralCollocation, StoermerVerlet
-from scvi_codegen.methods.stage_system import StageSystem
+from scvi_codegen.methods import SCVI, SVI, Composition, RungeKutta, SpectralCollocation, StoermerVerlet
 from scvi_codegen.methods.tables.number_tables import Part, decimal, number_table, positions, short
 from scvi_codegen.methods.tables.quadrature import Quadrature
 from scvi_codegen.methods.tables.tableau import Tableau
-from scvi_codegen.systems.formulas.expressions import jacobian
-from scvi_codegen.systems.system import MechanicalSystem
 
 WIDTH, MARGIN, ROW, RADIUS = 640, 30, 74, 5
 TALLEST = 30

@@ -15,19 +15,14 @@ from itertools import groupby
 import sympy
 from sympy import Symbol
 
+from scvi_codegen.api.formulas import Number
+from scvi_codegen.api.methods import StageGroup, StageSystem
+from scvi_codegen.api.systems import MechanicalSystem, forms_of, position_conditions
 from scvi_codegen.codegen.lowering.stage_groups import argument_name
 from scvi_codegen.common.display.mathml import RAISED
-from scvi_codegen.common.precision import Number
 from scvi_codegen.extras.derivation.writing import Formula
-from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table
-from scvi_codegen.systems.constraints import (
-    constraint_rates,
-    idle_multipliers,
-    position_conditions,
-    velocity_conditions,
-)
-from scvi_codegen.systems.derived_expressions import forms_of
-from scvi_codegen.systems.system import MechanicalSystem
+from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, Table
+from scvi_codegen.systems.constraints import constraint_rates, idle_multipliers, velocity_conditions
 
 ARGUMENTS = {"v": "q_dot", "a": "q_ddot", "j": "q_d3", "s": "q_d4"}
 """Time derivatives of the curve as they are typeset."""

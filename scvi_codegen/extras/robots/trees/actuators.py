@@ -14,6 +14,7 @@ from itertools import chain
 import numpy as np
 from sympy import Add, Expr, Matrix, S
 
+from scvi_codegen.api.formulas import DOT, input_parameters, symbol
 from scvi_codegen.extras.robots.trees.closures import frames_in_common
 from scvi_codegen.extras.robots.trees.document import Element
 from scvi_codegen.extras.robots.trees.energies import (
@@ -30,7 +31,6 @@ from scvi_codegen.extras.robots.trees.tendons import Tendon, length_of, rate_of
 from scvi_codegen.extras.robots.trees.tree import SINGLE, Joint, Link, Pose, Vector, identifier, numbered, symbols_of
 from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.formulas.kinks import positive_part
-from scvi_codegen.systems.formulas.symbols import DOT, input_parameters, symbol
 
 Motion = tuple[Expr, Expr]
 """Length of an actuator and its rate, times the gear."""

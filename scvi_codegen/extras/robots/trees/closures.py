@@ -14,15 +14,12 @@ from itertools import chain
 import numpy as np
 from sympy import Add, Expr, Matrix, cos, eye, sin
 
+from scvi_codegen.api.formulas import RotationNames, Tape, jacobian, mp, symbol
 from scvi_codegen.common.errors import SystemDefinitionWarning, warn
-from scvi_codegen.common.precision import mp
 from scvi_codegen.extras.robots.trees.energies import exact_matrix, exact_number, exact_vector, position_of, rotation_of
 from scvi_codegen.extras.robots.trees.tree import SINGLE, Link, Pose, Vector, hat, rounded
 from scvi_codegen.systems.derived_expressions import DEPENDENT, dense
-from scvi_codegen.systems.formulas.expressions import Tape, jacobian
 from scvi_codegen.systems.formulas.intermediates import intermediate
-from scvi_codegen.systems.formulas.rotations import RotationNames
-from scvi_codegen.systems.formulas.symbols import symbol
 
 ATTEMPTS, ITERATIONS = 4, 20
 """Random points, and iterations from each, for states of the loop; half turns of welds are states of lower rank."""

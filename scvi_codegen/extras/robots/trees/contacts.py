@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from sympy import Matrix
 
+from scvi_codegen.api.formulas import symbol
 from scvi_codegen.extras.robots.trees.closures import at_reference, frames_in_common
 from scvi_codegen.extras.robots.trees.document import Element
 from scvi_codegen.extras.robots.trees.energies import exact_number
@@ -26,7 +27,6 @@ from scvi_codegen.extras.robots.trees.tendons import rate_of
 from scvi_codegen.extras.robots.trees.tree import Link, Pose, Vector
 from scvi_codegen.systems.contact import ContactLike, contact
 from scvi_codegen.systems.formulas.intermediates import intermediate
-from scvi_codegen.systems.formulas.symbols import symbol
 
 PARTS = {"capsule": "end", "box": "corner"}
 """Names of the spheres of geoms that have several."""

@@ -43,6 +43,7 @@ from typing import Any
 import numpy as np
 from sympy import Abs, Add, Expr, Matrix, Rational, S, Symbol, atan2, cos, eye, sin, sqrt, zeros
 
+from scvi_codegen.api.formulas import DOT, Rotation, RotationNames, gradient_tuple, symbol
 from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
 from scvi_codegen.extras.robots.trees.tree import (
     SINGLE,
@@ -55,11 +56,9 @@ from scvi_codegen.extras.robots.trees.tree import (
     without_fixed,
 )
 from scvi_codegen.systems.contact import MOST_ROWS, ContactLike, contact, friction, rows_of
-from scvi_codegen.systems.formulas.expressions import gradient_tuple
 from scvi_codegen.systems.formulas.intermediates import intermediate, product, total
 from scvi_codegen.systems.formulas.kinks import positive_part
-from scvi_codegen.systems.formulas.rotations import Rotation, RotationNames
-from scvi_codegen.systems.formulas.symbols import DOT, default_momenta, symbol
+from scvi_codegen.systems.formulas.symbols import default_momenta
 from scvi_codegen.systems.reading import system_from_sympy
 
 

@@ -6,13 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.common.precision import mp
+from scvi_codegen.api.formulas import Rotation, Tape, mp, symbol
 from scvi_codegen.extras.robots.trees.document import NAMED
 from scvi_codegen.extras.robots.trees.tree import rotation_by
 from scvi_codegen.systems.contact import Contact
-from scvi_codegen.systems.formulas.expressions import Tape
-from scvi_codegen.systems.formulas.rotations import Rotation
-from scvi_codegen.systems.formulas.symbols import symbol
 
 SMALL = 1e-9
 """Size of negative gaps with which runs begin."""

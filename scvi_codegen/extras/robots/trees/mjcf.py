@@ -17,6 +17,7 @@ from xml.etree import ElementTree
 import numpy as np
 from sympy import Expr, S
 
+from scvi_codegen.api.formulas import symbol
 from scvi_codegen.extras.robots.trees.actuators import (
     ACTED,
     JOINTED,
@@ -49,7 +50,6 @@ from scvi_codegen.extras.robots.trees.shapes import (
 from scvi_codegen.extras.robots.trees.sources import document_of, merged
 from scvi_codegen.extras.robots.trees.tendons import Tendon, length_of, mean_inverses, reference_length
 from scvi_codegen.extras.robots.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, named
-from scvi_codegen.systems.formulas.symbols import symbol
 
 PARTS = {"limits": "limits", "friction": "dry friction"}
 SLIDING = 3

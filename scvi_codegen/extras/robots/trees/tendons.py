@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from sympy import Abs, Add, Expr, Matrix, S, sqrt
 
+from scvi_codegen.api.formulas import DOT, symbol
 from scvi_codegen.extras.robots.trees.closures import frames_in_common
 from scvi_codegen.extras.robots.trees.energies import (
     Tree,
@@ -23,7 +24,7 @@ from scvi_codegen.systems.contact import ContactLike, friction
 from scvi_codegen.systems.formulas.expressions import derivative_along, evaluate, gradient
 from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.formulas.kinks import positive_part
-from scvi_codegen.systems.formulas.symbols import DOT, default_momenta, symbol
+from scvi_codegen.systems.formulas.symbols import default_momenta
 from scvi_codegen.systems.rotations.points import torque_of
 
 

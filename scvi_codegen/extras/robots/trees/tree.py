@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.api.formulas import DOT, TIME
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.systems.formulas.expressions import FUNCTIONS
 from scvi_codegen.systems.formulas.rotations import matrix_of
-from scvi_codegen.systems.formulas.symbols import C_KEYWORDS, DOT, TIME
+from scvi_codegen.systems.formulas.symbols import C_KEYWORDS
 from scvi_codegen.systems.formulas.symbols import identifier as spelled
 
 Vector = NDArray[np.float64]

@@ -13,7 +13,10 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.codegen.rendering.source import Interface
+from scvi_codegen.api.formulas import Array
+from scvi_codegen.api.methods import Method
+from scvi_codegen.api.program import Interface
+from scvi_codegen.api.systems import ArraySystem
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.extras.verification.arrays.whole import WholeStart, whole_checks
 from scvi_codegen.extras.verification.certificate import Certificate, Check, Finding, checked, information, issued
@@ -23,12 +26,9 @@ from scvi_codegen.extras.verification.stepping import step_checks
 from scvi_codegen.extras.verification.structure import structure_checks
 from scvi_codegen.extras.verification.system_under_test import State, SystemUnderTest
 from scvi_codegen.methods import SVI, StoermerVerlet
-from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.compiler import compile_stepper
 from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
 from scvi_codegen.runs.stepping.array_interface import RunArrays, check_accesses, read_arrays
-from scvi_codegen.systems.arrays.system import ArraySystem
-from scvi_codegen.systems.formulas.indices import Array
 from scvi_codegen.systems.rolling import unroll_sums
 
 __all__ = ["state_of_fields", "verify_arrays"]

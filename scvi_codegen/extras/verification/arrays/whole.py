@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 from sympy import Expr
 
+from scvi_codegen.api.formulas import DOT
+from scvi_codegen.api.methods import Method
+from scvi_codegen.api.systems import ArraySystem
 from scvi_codegen.common.errors import StepFailedError
 from scvi_codegen.extras.verification.certificate import Check, Finding, Outcome, checked, information
-from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.driver.run import Run
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.array_interface import RunArrays
-from scvi_codegen.systems.arrays.system import ArraySystem
 from scvi_codegen.systems.formulas.indices import Access, Loop
 from scvi_codegen.systems.formulas.numpy_values import Elements, convolved
-from scvi_codegen.systems.formulas.symbols import DOT
 
 Numbers = NDArray[np.float64]
 
