@@ -1,7 +1,6 @@
 """Command ``scvi-codegen run``: integrate a model or an ensemble, in memory or into a folder, and print a summary."""
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -279,11 +278,10 @@ def _run_one(
     account = known_account(outcome.trajectory)
     tell(summary(model, outcome, final_error, account), **run_numbers(model, outcome, final_error, account))
     result = outcome.trajectory
-    draw = result.plot if model.array_system is None else result.plot.field
+    with_error = {"error": True} if error_bars else {}
     if error_bars:
         _tell_error(result)
-        draw = partial(result.plot, error=True) if model.array_system is None else draw
-    written = _write_outputs(model, result, output, plot, draw=draw, **{"error": True} if error_bars else {})
+    written = _write_outputs(model, result, output, plot, **with_error)
     tell(written=written)
     if outcome.failure is not None:
         raise CommandFailure(f"{outcome.failure}\n{_kept(outcome, written)}", FAILURE) from outcome.failure
@@ -314,7 +312,7 @@ def _run_ensemble(
     outcome = integrate_states(states)
     balance = energy_balance(outcome.result)
     tell(ensemble_summary(model, outcome, balance), **ensemble_numbers(model, outcome, balance))
-    written = _write_outputs(model, outcome.result, *outputs, draw=outcome.result.plot)
+    written = _write_outputs(model, outcome.result, *outputs, overview=True)
     stored = f"written: {' and '.join(written)}" if written else "not written to a file (-o)"
     continuation = f"the computed states were {stored}"
     if outcome.interrupted:
@@ -341,15 +339,18 @@ def _tell_error(trajectory: Any) -> None:
 
 
 def _write_outputs(
-    model: Model, result: Any, output: str | None, plot: str | None, *, draw: Any, **saved: bool
+    model: Model, result: Any, output: str | None, plot: str | None, *, overview: bool = False, **saved: bool
 ) -> list[str]:
+    """Write states and picture; of arrays a picture is one of their fields, unless an ``overview`` is drawn."""
     if output is not None:
         result.save(output, **saved)
     if plot is not None and part("services", "is_film")(plot):
         progress = (lambda *_: None) if is_quiet() else None
         result.animate(plot, picture=model.picture or None, progress=progress)
+    elif plot is not None and (overview or model.array_system is None):
+        result.plot(plot, **saved)
     elif plot is not None:
-        draw(plot)
+        result.plot.field(plot)
     return [path for path in (output, plot) if path is not None]
 
 
