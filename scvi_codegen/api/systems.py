@@ -8,14 +8,12 @@
 ``SYSTEM_OR_ARRAYS``
     Kind of an argument that is one of these.
 ``forms_of(system)``
-    Derived expressions, each computed once: mass matrix, equations of motion, energy, momentum maps, Dirac brackets.
-``position_conditions(system)``
-    (c,) conditions g(q, t) = 0 of constraints, 0 for those on velocities alone.
+    Derived expressions, each computed once: mass matrix, equations of motion, energy, conditions and
+    forces of constraints.
 """
 
 from scvi_codegen.systems.arrays.system import ArraySystem
-from scvi_codegen.systems.constraints import position_conditions
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS, MechanicalSystem
 
-__all__ = ["SYSTEM_OR_ARRAYS", "ArraySystem", "MechanicalSystem", "forms_of", "position_conditions"]
+__all__ = ["SYSTEM_OR_ARRAYS", "ArraySystem", "MechanicalSystem", "forms_of"]

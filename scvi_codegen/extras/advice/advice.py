@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from scvi_codegen.api.checks import checks_arguments
-from scvi_codegen.api.methods import Method, method_from_specification
+from scvi_codegen.api.methods import Discretisation, Method, method_from_specification
 from scvi_codegen.api.runs import without_accuracy_warnings
 from scvi_codegen.api.states import Array, States, checked_number
 from scvi_codegen.api.systems import SYSTEM_OR_ARRAYS, MechanicalSystem
@@ -35,7 +35,6 @@ from scvi_codegen.common.errors import (
 )
 from scvi_codegen.extras.advice.size import distances_from_mean, relative_to_motion
 from scvi_codegen.methods import ARGUMENTS, as_method
-from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.runs.accuracy.run_error import DEVIATIONS, LOST
 from scvi_codegen.runs.compiler import compile_stepper
 from scvi_codegen.runs.ensembles.ensemble import momenta_of_each, start_of_ensemble
@@ -194,7 +193,9 @@ def advise(
     for candidate in _candidates(method, words) if degree else [method]:
         for stepper in _steppers(compiled, system, candidate, solver):
             try:
-                result.append(_advised(stepper, candidate, is_symplectic(candidate, system), q, state, length, target))
+                result.append(
+                    _advised(stepper, candidate, Discretisation(system, candidate).symplectic, q, state, length, target)
+                )
             except StateError as failure:
                 failures.append(failure)
                 continue

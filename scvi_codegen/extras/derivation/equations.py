@@ -25,7 +25,7 @@ import sympy
 
 from scvi_codegen.api.checks import checks_arguments
 from scvi_codegen.api.formulas import Number, jacobian
-from scvi_codegen.api.methods import Method, StageGroup, StageSystem
+from scvi_codegen.api.methods import Discretisation, Method, StageGroup, StageSystem
 from scvi_codegen.api.systems import SYSTEM_OR_ARRAYS, ArraySystem, MechanicalSystem
 from scvi_codegen.api.text import card, counted, plain
 from scvi_codegen.codegen.lowering.program import step_texts
@@ -44,7 +44,6 @@ from scvi_codegen.extras.derivation.notation import (
     text_lines,
 )
 from scvi_codegen.methods import as_method
-from scvi_codegen.methods.discretise import discretised_form, in_moving_frame, paper_equations
 from scvi_codegen.methods.stage_system import Block, EntryName, Row, Table
 from scvi_codegen.systems.contacts.modes import in_all_modes
 from scvi_codegen.systems.first_order import FirstOrderSystem
@@ -135,7 +134,7 @@ class StepEquations:
         q, p = self.state
         yield f"{self.system.name}: {self.method.title}"
         yield from (rotation.description for rotation in (*self.system.rotations, *axial_turns(self.system)[1]))
-        if in_moving_frame(self.system, self.method):
+        if Discretisation(self.system, self.method).in_moving_frame:
             yield from (MOVING_FRAME, FREE_ROTATION)
         yield f"{'H' if self.system.auxiliaries else 'L'} = {formula_text(self.system.formula)}"
         for g in self.system.constraints:
@@ -208,11 +207,11 @@ def derive(
         sites = site_hamiltonian(system) if system.coupled_terms else None
         return ArrayStepEquations(sites.system if sites else system, as_method(method, system))
     method = as_method(method, system)
-    system = discretised_form(in_all_modes(system), method)
+    system = Discretisation(in_all_modes(system), method).form
     if inner_of(system.formula):
         kind = "hamiltonian" if system.auxiliaries else "lagrangian"
         system = replace(system, **{kind: written_out(system.formula)})
-    stages = paper_equations(system, method)
+    stages = Discretisation(system, method).paper
     writer = _Writer(system, stages)
     equations = writer.equations()
     end_position, end_momentum = writer.end_state()

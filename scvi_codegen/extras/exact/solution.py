@@ -17,11 +17,10 @@ import numpy as np
 import sympy
 
 from scvi_codegen.api.formulas import Number, Tape, jacobian, mp
-from scvi_codegen.api.systems import MechanicalSystem, position_conditions
+from scvi_codegen.api.systems import MechanicalSystem, forms_of
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.extras.exact.newton import Array as Numbers
 from scvi_codegen.extras.exact.newton import Floats, NotConvergedError, Solve, newton, solver
-from scvi_codegen.systems.constraints import force_directions, velocity_conditions
 from scvi_codegen.systems.first_order import FirstOrderSystem
 
 __all__ = ["ExactMotion", "Numbers", "exact_motion", "numbers"]
@@ -116,10 +115,10 @@ class ExactMotion:
         def rate(f: sympy.Expr) -> sympy.Expr:
             return sympy.Add(f.diff(t), *(f.diff(x) * y for x, y in zip(q, v, strict=True)))
 
-        positions = position_conditions(self.system)
-        rates = list(map(sympy.Add, map(rate, positions), velocity_conditions(self.system)))
+        positions = forms_of(self.system).position_conditions
+        rates = list(map(sympy.Add, map(rate, positions), forms_of(self.system).velocity_conditions))
         derivatives = [moving.diff(x) for moving in rates for x in v]
-        directions, reactions = force_directions(self.system), self.system.reactions
+        directions, reactions = forms_of(self.system).force_directions, self.system.reactions
         forces = [directions.get(place, sympy.S.Zero) for place in np.ndindex(len(rates), len(v))]
         idle = [sympy.S.Zero] * (len(rates) - len(reactions)) + [1 - reaction.active for reaction in reactions]
         return Tape([*derivatives, *forces, *map(rate, rates), *positions, *rates, *idle], self.symbols)

@@ -19,12 +19,11 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.api.formulas import Number, Tape, mp
-from scvi_codegen.api.methods import Method, StageGroup, StageSystem, discretise
+from scvi_codegen.api.methods import Discretisation, Method, StageGroup, StageSystem
 from scvi_codegen.api.systems import MechanicalSystem
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.extras.exact.newton import NotConvergedError, Solve, newton
 from scvi_codegen.extras.exact.solution import Numbers, exact_motion, numbers
-from scvi_codegen.methods.discretise import MIDDLE, reference_equations
 from scvi_codegen.methods.stage_system import Velocities, straight
 
 DIGITS = 45
@@ -65,7 +64,9 @@ class DerivedStep:
 
     def __init__(self, system: MechanicalSystem, stages: StageSystem) -> None:
         self.system, self.stages, self.motion = system, stages, exact_motion(system)
-        symbols = [(*group.arguments, system.time, *system.parameters, MIDDLE) for group in stages.stage_groups]
+        symbols = [
+            (*group.arguments, system.time, *system.parameters, Discretisation.MIDDLE) for group in stages.stage_groups
+        ]
         self.kernels = [
             Tape(group.results, arguments) for group, arguments in zip(stages.stage_groups, symbols, strict=True)
         ]
@@ -317,10 +318,10 @@ def _slices(sizes: Sequence[int]) -> tuple[slice, ...]:
 @lru_cache(maxsize=64)
 def derived_step(system: MechanicalSystem, method: Method) -> DerivedStep:
     """Return the paper's equations of a method for a system, cached."""
-    return DerivedStep(system, reference_equations(system, method))
+    return DerivedStep(system, Discretisation(system, method).reference)
 
 
 @lru_cache(maxsize=64)
 def compiled_equations(system: MechanicalSystem, method: Method) -> DerivedStep:
     """Return the equations in the unknowns of the compiled code, cached."""
-    return DerivedStep(system, discretise(system, method))
+    return DerivedStep(system, Discretisation(system, method).equations)

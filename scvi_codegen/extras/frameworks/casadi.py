@@ -21,8 +21,8 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.api.checks import Kind, checked_count, checks_arguments
 from scvi_codegen.api.formulas import input_parameters, parse_expression, symbol
-from scvi_codegen.api.methods import Method, StageGroup, StageSystem, discretise
-from scvi_codegen.api.systems import MechanicalSystem, forms_of, position_conditions
+from scvi_codegen.api.methods import Discretisation, Method, StageGroup, StageSystem
+from scvi_codegen.api.systems import MechanicalSystem, forms_of
 from scvi_codegen.codegen.native import building
 from scvi_codegen.common.errors import ArgumentError, MethodError, StateError, imported
 from scvi_codegen.extras.frameworks.flow import Flow
@@ -31,7 +31,6 @@ from scvi_codegen.methods import as_method
 from scvi_codegen.methods.stage_system import Table, straight
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.features import warn_of_formulas
-from scvi_codegen.systems.constraints import constraint_rates
 from scvi_codegen.systems.formulas.expressions import CONSTANTS, FUNCTIONS
 from scvi_codegen.systems.formulas.intermediates import written_out
 from scvi_codegen.systems.formulas.symbols import PARTS
@@ -113,7 +112,7 @@ class EndConditions:
     @cached_property
     def constraint_residual(self) -> Any:
         """Residual of the constraints g(q) = 0 and of their time derivatives; MethodError if they contain an input."""
-        conditions = (*position_conditions(self.system), *constraint_rates(self.system))
+        conditions = (*forms_of(self.system).position_conditions, *forms_of(self.system).constraint_rates)
         residuals = [condition for condition in conditions if condition != 0]
         if any(residual.free_symbols - {*self.symbols} for residual in residuals):
             raise MethodError("a constraint depends on an input and would jump with it: use inputs only in forces")
@@ -219,7 +218,7 @@ def casadi_step(
     if checked_count(degree, "degree", least=0) > HIGHEST:
         raise MethodError(f"degree must be at most {HIGHEST} (polynomial inputs), not {degree}")
     warn_of_formulas(system, "casadi_step or optimal_control")
-    stages = discretise(system, as_method(method, system))
+    stages = Discretisation(system, as_method(method, system)).equations
     written = _StageExpressions(ca, system, stages, degree)
     *rows, p1 = written.rows()
     values, weights = written.along(along) if along else (ca.SX(0, 0), ca.SX(0, 1))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scvi_codegen.api.checks import Kind, checked_count, checks_arguments
-from scvi_codegen.api.methods import Method, discretise
+from scvi_codegen.api.methods import Discretisation, Method
 from scvi_codegen.api.states import Array, checked_number, real_array
 from scvi_codegen.api.systems import MechanicalSystem
 from scvi_codegen.common.errors import ControlError, MethodError, StateError, closest, imported
@@ -233,7 +233,7 @@ class Task:
         moving = zip(q.T, v.T, times, strict=True)
         p = np.hstack([self.ends.momentum(self.ca.DM(x), x_dot, t, self.parameters).full() for x, x_dot, t in moving])
         spots = (np.arange(n)[:, np.newaxis] + (np.linspace(0.0, 1.0, self.degree + 1) if self.degree else 0.5)).ravel()
-        stages = discretise(system, self.method)
+        stages = Discretisation(system, self.method).equations
         return {
             "states": np.concatenate([q, p]),
             "stages": np.concatenate(straight(stages, q[:, :-1], np.diff(q) * n / duration, p[:, :-1], duration / n)),

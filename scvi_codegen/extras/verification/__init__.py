@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.api.checks import checks_arguments
-from scvi_codegen.api.methods import Method
+from scvi_codegen.api.methods import Discretisation, Method
 from scvi_codegen.api.runs import STEPPER, without_accuracy_warnings
 from scvi_codegen.api.states import Array, checked_number, checked_step
 from scvi_codegen.api.systems import SYSTEM_OR_ARRAYS, ArraySystem, MechanicalSystem
@@ -37,7 +37,6 @@ from scvi_codegen.extras.verification.structure import largest_step, structure_c
 from scvi_codegen.extras.verification.system_under_test import State, SystemUnderTest
 from scvi_codegen.extras.verification.variable_steps import VariableSteps, at_fixed_energy, variable_step_checks
 from scvi_codegen.methods import as_method, sliding
-from scvi_codegen.methods.discretise import discretised_form
 from scvi_codegen.runs.compiler import compile_stepper
 from scvi_codegen.runs.results.saved_states import parameters_on_sides
 from scvi_codegen.runs.stepper import Stepper
@@ -111,7 +110,7 @@ def verify(
         return verify_arrays(system, method, stepper, (q, p, cast(float, h), t), began, **of_run)
     if stepper is None or stepper.interface.contacts:
         system = sliding(system, method)
-    form = discretised_form(in_all_modes(system), method)
+    form = Discretisation(in_all_modes(system), method).form
     located, _ = located_kinks(form)
     stepper = stepper or compile_stepper(system, method, solver=solver)
     if stepper.interface.masked != len(form.reactions):

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.api.formulas import Number, mp
+from scvi_codegen.api.methods import Discretisation
 from scvi_codegen.api.states import Array, Starts
 from scvi_codegen.common.errors import MethodError
 from scvi_codegen.extras.exact.solution import exact_motion
@@ -18,7 +19,6 @@ from scvi_codegen.extras.exact.step import compiled_equations
 from scvi_codegen.extras.verification.certificate import Check, Finding, checked
 from scvi_codegen.extras.verification.system_under_test import BOUND, ROUND_OFF, State, SystemUnderTest, canonical_form
 from scvi_codegen.extras.verification.variable_steps import VariableSteps
-from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.runs.stepper import Stepper
 
 WIDTH = mp.mpf(10) ** -15
@@ -201,7 +201,7 @@ def time_transformation_derivative_checks(runs: VariableSteps) -> Iterator[Check
     yield from checked("energy surface", statement, partial(_energy_derivative, runs))
     statement = "VJP is the transpose of JVP, times included"
     yield from checked("adjoint in tau", statement, partial(_in_tau, runs, _Map.transpose_error))
-    if is_symplectic(runs.tested.method, runs.transformed) and not runs.transformed.constraints:
+    if Discretisation(runs.transformed, runs.tested.method).symplectic and not runs.transformed.constraints:
         statement = "J^T Omega J = Omega, J the compiled Jacobian of a step of tau at fixed energy"
         yield from checked("symplecticity in tau", statement, partial(_symplecticity, runs))
 

@@ -11,6 +11,7 @@ import numpy as np
 import sympy
 
 from scvi_codegen.api.formulas import TIME, Tape, mp, symbol
+from scvi_codegen.api.methods import Discretisation
 from scvi_codegen.api.states import Array
 from scvi_codegen.codegen.rendering.events import EventFormulas
 from scvi_codegen.common.errors import EventWarning, StateError
@@ -29,7 +30,6 @@ from scvi_codegen.extras.verification.system_under_test import (
     canonical_form,
     linearised,
 )
-from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.runs.results.recomputation import changes_by_events
 from scvi_codegen.runs.results.saved_states import parameters_on_sides
 from scvi_codegen.runs.stepper import Stepper
@@ -78,7 +78,7 @@ def impact_checks(tested: SystemUnderTest, stepper: Stepper, parameters: Any = N
             yield from checked("reversal, impacts", statement, partial(_reversal, *crossings))
         statement = "p + (1 + e)/2 lambda n, H(p + lambda n) - H(p) = -lambda g_t, symmetries of walls, to round-off"
         yield from checked("impacts", statement, partial(_impacts, *crossings))
-        if is_symplectic(tested.method, tested.system):
+        if Discretisation(tested.system, tested.method).symplectic:
             statement = "J^T Omega J = Omega of a step with an elastic impact, up to the error of the method"
             yield from checked("symplecticity, impacts", statement, partial(_symplecticity, *crossings))
 

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from scvi_codegen.api.formulas import mp
-from scvi_codegen.api.methods import discretise
+from scvi_codegen.api.methods import Discretisation
 from scvi_codegen.api.states import Array
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import StateError, StepFailedError
@@ -29,7 +29,6 @@ from scvi_codegen.extras.verification.system_under_test import (
     State,
     SystemUnderTest,
 )
-from scvi_codegen.methods.discretise import in_moving_frame
 from scvi_codegen.runs.stepper import Stepper
 
 ANY_UPDATE = SolverOptions(tolerance=1e300)
@@ -260,13 +259,15 @@ def predictor_checks(tested: SystemUnderTest) -> Iterator[Check]:
     s, q = method.exactness.curve, method.exactness.quadrature
     if 0 <= q < 2 * s - 2:
         return
-    if method.implicit and s != 1 and len(discretise(tested.system, method).blocks) > 1:
+    if method.implicit and s != 1 and len(Discretisation(tested.system, method).equations.blocks) > 1:
         statement = "one iteration leaves a smaller error from the predictor than from a straight line, at small h"
         yield from checked("predictor", statement, partial(_predictor, tested))
 
 
 def _predictor(tested: SystemUnderTest) -> Finding | None:
-    framed = in_moving_frame(tested.system, tested.method)  # whose fixed-point iteration has no predictor
+    framed = Discretisation(
+        tested.system, tested.method
+    ).in_moving_frame  # whose fixed-point iteration has no predictor
     steppers = tested.steppers[1:] if framed else tested.steppers
     ratios = [ratio for ratio in (_worst(tested, stepper) for stepper in steppers) if ratio is not None]
     if not ratios:

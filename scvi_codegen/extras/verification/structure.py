@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 
 from scvi_codegen.api.formulas import mp
+from scvi_codegen.api.methods import Discretisation
 from scvi_codegen.api.states import Array, Reduction
 from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.extras.exact.solution import numbers
@@ -23,7 +24,6 @@ from scvi_codegen.extras.verification.system_under_test import (
     SystemUnderTest,
     canonical_form,
 )
-from scvi_codegen.methods.discretise import is_conformally_symplectic, is_symplectic
 from scvi_codegen.runs.trajectory import Trajectory
 
 SPREAD = 10.0
@@ -37,16 +37,16 @@ LENGTH, PHASE = 1.7, complex(np.exp(0.7j))
 
 def structure_checks(tested: SystemUnderTest) -> Iterator[Check]:
     """Yield the checks that apply to method and system."""
-    if is_symplectic(tested.method, tested.system):
+    if Discretisation(tested.system, tested.method).symplectic:
         statement = "J^T Omega J = Omega, J by finite differences of the compiled step"
         yield from checked("symplecticity", statement, partial(_symplecticity, tested))
-    elif is_conformally_symplectic(tested.method, tested.system):
+    elif Discretisation(tested.system, tested.method).conformally_symplectic:
         statement = "J^T Omega J = exp(-gamma h) Omega, gamma the damping, J by finite differences of the compiled step"
         yield from checked("conformal symplecticity", statement, partial(_symplecticity, tested))
     if rotations := tested.stepper.interface.rotations:
         statement = "a step commutes with changes of the lengths of quaternions and directions, and of phases of spins"
         yield from checked("gauge invariance", statement, partial(_gauge_invariance, tested))
-        if is_symplectic(tested.method, tested.system) and not tested.system.constraints:
+        if Discretisation(tested.system, tested.method).symplectic and not tested.system.constraints:
             kinds = " and ".join(dict.fromkeys(SPACES[declaration.split()[0]] for declaration in rotations))
             statement = f"A^T Omega A = Omega of the derivative A of the step on the reduced space ({kinds})"
             yield from checked("reduced symplecticity", statement, partial(_reduced_symplecticity, tested))

@@ -9,7 +9,7 @@ from sympy import Function as Applied
 from sympy import Symbol
 
 from scvi_codegen.api.formulas import gradient_tuple
-from scvi_codegen.api.methods import Method, StageGroup, StageSystem, discretise
+from scvi_codegen.api.methods import Discretisation, Method, StageGroup, StageSystem
 from scvi_codegen.api.systems import MechanicalSystem, forms_of
 from scvi_codegen.api.text import counted
 from scvi_codegen.codegen.ir.kernel import Kernel
@@ -37,10 +37,7 @@ from scvi_codegen.extras.derivation.writing import (
     page_template,
     style_sheet,
 )
-from scvi_codegen.methods.discretise import check_regular, paper_equations
-from scvi_codegen.systems.constraints import with_constraint_forces
 from scvi_codegen.systems.contacts.modes import in_all_modes
-from scvi_codegen.systems.derived_expressions import auxiliary_multipliers, multipliers
 from scvi_codegen.systems.event import Event
 from scvi_codegen.version import __version__
 
@@ -100,7 +97,9 @@ def _euler_lagrange(system: MechanicalSystem) -> Iterator[Content]:
         "The Euler-Lagrange equations (2), d/dt dL/dv - dL/dq = 0, by the chain rule. They are linear in the "
         "accelerations; neither the derivation nor the C solves for these."
     )
-    motion = [-f for f in with_constraint_forces(system, [-residual for residual in forms_of(system).euler_lagrange])]
+    motion = [
+        -f for f in forms_of(system).with_constraint_forces([-residual for residual in forms_of(system).euler_lagrange])
+    ]
     yield from formulas([Formula(value, sympy.S.Zero, "2") for value in motion], "equation")
 
 
@@ -237,7 +236,7 @@ def _place(group: StageGroup) -> str:
 def derivation_html(system: MechanicalSystem, method: Method, *, events: Sequence[Event] = ()) -> str:
     """Return the derivation of ``method`` for ``system``, with ``events`` of runs, as a self-contained page of HTML."""
     system = in_all_modes(system)
-    check_regular(method, system)
+    Discretisation(system, method).check()
     more = [Section(name="events", title="Events", contents=(Listing(events_text(events, system)),))] if events else []
     return page_template("derivation.html.jinja").render(
         title=f"{system.name}: {method.title}",
@@ -253,7 +252,7 @@ def derivation_html(system: MechanicalSystem, method: Method, *, events: Sequenc
 def _sections(system: MechanicalSystem, method: Method) -> Iterator[Section]:
     program = program_of(system, method, prefix=c_identifier(system.name))
     functions = functions_of(render(program).amalgamated().code)
-    stages = paper_equations(system, method)
+    stages = Discretisation(system, method).paper
     derived = component_equations(system, method, stages)
     yield system_section(system)
     yield motion_section(system)
@@ -336,7 +335,7 @@ def kernels_section(system: MechanicalSystem, program: Program, functions: Mappi
 
 def _names(system: MechanicalSystem) -> dict[Symbol, Symbol]:
     """Return short symbols for the multipliers: lambda and nu with the name of their coordinate."""
-    named = ((multipliers(system), "lambda"), (auxiliary_multipliers(system), "nu"))
+    named = ((forms_of(system).multipliers, "lambda"), (forms_of(system).auxiliary_multipliers, "nu"))
     return {
         symbol: Symbol(f"{letter}_{q.name}")
         for symbols, letter in named
@@ -386,7 +385,7 @@ def functions_section(
     system: MechanicalSystem, method: Method, program: Program, functions: Mapping[str, Function]
 ) -> Section:
     """Return the section on functions, from the loop over the steps down: formulas or words left, C right."""
-    stages = discretise(system, method)
+    stages = Discretisation(system, method).equations
     kernels = {kernel.name for kernel in kernels_of(program)}
     start = f"{program.prefix}_advance"
     pairs = [

@@ -17,12 +17,11 @@ from sympy import Symbol
 
 from scvi_codegen.api.formulas import Number
 from scvi_codegen.api.methods import StageGroup, StageSystem
-from scvi_codegen.api.systems import MechanicalSystem, forms_of, position_conditions
+from scvi_codegen.api.systems import MechanicalSystem, forms_of
 from scvi_codegen.codegen.lowering.stage_groups import argument_name
 from scvi_codegen.common.display.mathml import RAISED
 from scvi_codegen.extras.derivation.writing import Formula
 from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, Table
-from scvi_codegen.systems.constraints import constraint_rates, idle_multipliers, velocity_conditions
 
 ARGUMENTS = {"v": "q_dot", "a": "q_ddot", "j": "q_d3", "s": "q_d4"}
 """Time derivatives of the curve as they are typeset."""
@@ -54,14 +53,14 @@ def argument_symbol(system: MechanicalSystem, gather: Gather, suffix: str) -> Sy
 
 def result_symbol(system: MechanicalSystem, group: StageGroup, scatter: Scatter, suffix: str) -> Symbol:
     """Return the symbol of the results of a scatter at a point; for gradients, scatters are parallel to gathers."""
-    if system.constraints and scatter.results == position_conditions(system):
+    forms = forms_of(system)
+    if system.constraints and scatter.results == forms.position_conditions:
         return Symbol(f"g_{suffix}")
-    if system.constraints and scatter.results in (velocity_conditions(system), constraint_rates(system)):
+    if system.constraints and scatter.results in (forms.velocity_conditions, forms.constraint_rates):
         return Symbol(f"g_dot_{suffix}")
-    if system.constraints and scatter.results == idle_multipliers(system):
+    if system.constraints and scatter.results == forms.idle_multipliers:
         return Symbol(f"lambda_open_{suffix}")
     if group.scalar is None:
-        forms = forms_of(system)
         letters = {forms.force: "L_q", forms.momentum: "L_v", forms.euler_lagrange: "E", forms.constitutive: "L_p"}
         return Symbol(f"{letters[scatter.results]}_{suffix}")
     name = argument_name(system, group.gathers[group.scatters.index(scatter)])
