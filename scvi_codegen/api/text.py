@@ -2,8 +2,8 @@
 
 ``summary(*names)``
     A ``__repr__`` that shows attributes, ``Family(parameter='mu', orbits=<12>)``, in at most 100 characters.
-``counted(count, noun)``
-    ``"3 orbits"``, ``"1 orbit"``.
+``counted(count, noun)``, ``clipped(text, length)``
+    ``"3 orbits"``, ``"1 orbit"``; the beginning of a text, with "..", in at most 100 characters.
 ``Html``, ``plain(text)``, ``card(title, facts, *parts)``, ``grid(rows, *, head)``
     HTML, which text becomes by ``plain``; a card of facts by name; a table. For ``_repr_html_``.
 ``announced(message)``
@@ -16,6 +16,17 @@
 from scvi_codegen.codegen.native.announcements import announced
 from scvi_codegen.common.atomic import write_atomically, write_text
 from scvi_codegen.common.display.cards import Html, card, grid, plain
-from scvi_codegen.common.representation import counted, summary
+from scvi_codegen.common.representation import clipped, counted, summary
 
-__all__ = ["Html", "announced", "card", "counted", "grid", "plain", "summary", "write_atomically", "write_text"]
+__all__ = [
+    "Html",
+    "announced",
+    "card",
+    "clipped",
+    "counted",
+    "grid",
+    "plain",
+    "summary",
+    "write_atomically",
+    "write_text",
+]

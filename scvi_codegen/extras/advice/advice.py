@@ -24,7 +24,6 @@ from scvi_codegen.api.states import Array, States, checked_number
 from scvi_codegen.api.systems import SYSTEM_OR_ARRAYS, MechanicalSystem
 from scvi_codegen.api.text import Html, card, grid, plain, summary
 from scvi_codegen.codegen.native.options import SolverOptions
-from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.common.errors import (
     ArgumentError,
     MethodError,
@@ -187,9 +186,9 @@ def advise(
     length, target = _checked_request(span, tolerance)
     state = {"p": p, "velocity": velocity, "t": t, "parameters": parameters, "options": options}
     result, failures = list[Advice](), list[StateError]()
-    if precision not in PRECISIONS[:2]:
+    if precision not in ("double", "double-double"):
         raise MethodError(f"advise requires precision='double' or 'double-double', not {precision!r}")
-    compiled, words = partial(compile_stepper, precision=precision), 2 if precision == DOUBLE_DOUBLE else 1
+    compiled, words = partial(compile_stepper, precision=precision), 2 if precision == "double-double" else 1
     for candidate in _candidates(method, words) if degree else [method]:
         for stepper in _steppers(compiled, system, candidate, solver):
             try:

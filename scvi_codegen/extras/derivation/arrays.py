@@ -7,11 +7,11 @@ from sympy import latex
 
 from scvi_codegen.api.methods import Method
 from scvi_codegen.api.systems import ArraySystem
+from scvi_codegen.api.text import clipped
 from scvi_codegen.codegen.ir.equations import FixedPointIteration, Splitting
 from scvi_codegen.codegen.ir.kernel import Number
 from scvi_codegen.codegen.ir.program import ArrayProgram
 from scvi_codegen.codegen.lowering.program import lower_arrays
-from scvi_codegen.common.representation import LONGEST, clipped
 from scvi_codegen.systems.arrays.symmetry import momentum_maps
 from scvi_codegen.systems.arrays.system import constraint_text, force_of
 from scvi_codegen.systems.formulas.array_statements import latex_entry, latex_sums
@@ -27,7 +27,7 @@ class ArrayStepEquations:
     method: Method
 
     def __repr__(self) -> str:
-        return clipped(f"<equations of {self.system.name} by {self.method.name}>", LONGEST)
+        return clipped(f"<equations of {self.system.name} by {self.method.name}>")
 
     @property
     def program(self) -> ArrayProgram:

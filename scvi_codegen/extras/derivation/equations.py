@@ -27,10 +27,9 @@ from scvi_codegen.api.checks import checks_arguments
 from scvi_codegen.api.formulas import Number, jacobian
 from scvi_codegen.api.methods import Discretisation, Method, StageGroup, StageSystem
 from scvi_codegen.api.systems import SYSTEM_OR_ARRAYS, ArraySystem, MechanicalSystem
-from scvi_codegen.api.text import card, counted, plain
+from scvi_codegen.api.text import card, clipped, counted, plain
 from scvi_codegen.codegen.lowering.program import step_texts
 from scvi_codegen.common.display.cards import listed
-from scvi_codegen.common.representation import LONGEST, clipped
 from scvi_codegen.extras.derivation.notation import (
     LARGEST_DENOMINATOR,
     LARGEST_SHOWN,
@@ -162,7 +161,7 @@ class StepEquations:
 
     def __repr__(self) -> str:
         count = counted(len(self.equations), "equation")
-        return clipped(f"<{count} of {self.system.name} by {self.method.name}>", LONGEST)
+        return clipped(f"<{count} of {self.system.name} by {self.method.name}>")
 
     def _repr_latex_(self) -> str | None:
         """Return the LaTeX of all equations, nothing if a notebook could not show them."""

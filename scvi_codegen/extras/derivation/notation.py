@@ -14,7 +14,6 @@ from scvi_codegen.api.systems import MechanicalSystem
 from scvi_codegen.api.text import Html, plain
 from scvi_codegen.common.display.mathml import latex_name, mathml_terms
 from scvi_codegen.common.errors import ExpressionError
-from scvi_codegen.common.precision import DIGITS
 from scvi_codegen.methods.stage_system import EntryName
 from scvi_codegen.methods.tables.closed_forms import exact_points, exact_rule, exact_tableau
 from scvi_codegen.methods.tables.quadrature import Quadrature
@@ -46,7 +45,7 @@ def recognised(value: Number, basis: tuple[sympy.Expr, ...]) -> sympy.Expr | Non
         return sympy.S.Zero
     if not basis:
         return None
-    tolerance = mp.mpf(10) ** (SLACK - DIGITS)
+    tolerance = mp.mpf(10) ** (SLACK - mp.dps)
     relation = mp.pslq([value, *in_digits(basis)], tol=tolerance, maxcoeff=LARGEST_COEFFICIENT, maxsteps=10**5)
     if not relation or relation[0] == 0:
         return None
@@ -57,7 +56,7 @@ def recognised(value: Number, basis: tuple[sympy.Expr, ...]) -> sympy.Expr | Non
 @lru_cache(maxsize=64)
 def in_digits(basis: tuple[sympy.Expr, ...]) -> Vector:
     """Return the elements in 60 digits."""
-    return tuple(mp.mpf(str(sympy.N(element, DIGITS + 5))) for element in basis)
+    return tuple(mp.mpf(str(sympy.N(element, mp.dps + 5))) for element in basis)
 
 
 def square_free(root: sympy.Expr) -> sympy.Expr:

@@ -38,7 +38,6 @@ from sympy import Expr, Rational
 from scvi_codegen.api.checks import checked_count
 from scvi_codegen.api.formulas import Number, Vector, mp, symbol
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.common.precision import Matrix
 from scvi_codegen.extras.fields.density import Density
 from scvi_codegen.methods.tables.basis import differentiation_matrix, identity_matrix, matrix_product
 from scvi_codegen.methods.tables.nodes import point_count
@@ -73,7 +72,7 @@ class Cells:
     table: str | None = None
     interior: bool = False
     edge: bool = False
-    operators: tuple[Matrix, ...] = ()
+    operators: tuple[tuple[Vector, ...], ...] = ()
     weight: float = 1.0
 
 
@@ -167,7 +166,7 @@ class Axis(ABC):
     weights: Array
     length: float
     quadrature: Vector = ()
-    operators: tuple[Matrix, ...] = ()
+    operators: tuple[tuple[Vector, ...], ...] = ()
     cells: tuple[Cells, ...] = ()
     jacobians: Array = field(default_factory=lambda: np.zeros(0))
     cell_points: Array = field(default_factory=lambda: np.zeros((0, 0)))

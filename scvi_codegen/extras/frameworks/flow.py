@@ -17,10 +17,10 @@ import numpy as np
 from scvi_codegen.api.checks import Kind, checked_count, checks_arguments
 from scvi_codegen.api.program import Source
 from scvi_codegen.api.states import check_inputs_given, require
+from scvi_codegen.api.text import clipped
 from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.native.binding import Binding
 from scvi_codegen.common.errors import StateError, imported
-from scvi_codegen.common.representation import LONGEST, clipped
 from scvi_codegen.extras.frameworks.sources import XLA_PARTS, XLA_SECOND_ORDER, with_flow_of_rows, with_xla_flow
 from scvi_codegen.runs.states.validation import parameter_index
 from scvi_codegen.runs.stepper import Stepper
@@ -57,7 +57,7 @@ class Flow:
         return (type(self), (self.stepper, self.steps, self.save_every))  # without cached libraries
 
     def __repr__(self) -> str:
-        return clipped(f"<{type(self).__name__} of {self.steps} steps: {self.stepper.title}>", LONGEST)
+        return clipped(f"<{type(self).__name__} of {self.steps} steps: {self.stepper.title}>")
 
     @property
     def spacing(self) -> int:

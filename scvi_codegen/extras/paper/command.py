@@ -14,7 +14,7 @@ from scvi_codegen.api.text import counted, write_text
 from scvi_codegen.extras.paper.experiment import Experiment, Result, report_html, tally, write_result
 from scvi_codegen.extras.paper.runner import CATALOGUE, Failure, Watch, catalogue, run_experiments, with_needs
 from scvi_codegen.extras.pictures.canvas import check_plot_path
-from scvi_codegen.interfaces.cli.command_group import FAILURE, INTERRUPTED, CommandFailure, is_quiet
+from scvi_codegen.interfaces.cli.command_group import INTERRUPTED, CommandFailure, is_quiet
 
 EVERYTHING = "all"
 Report: TypeAlias = Callable[[str], None]
@@ -62,7 +62,7 @@ def reproduce(names: tuple[str, ...], output: str, html: str | None, jobs: int |
     if done.interrupted:
         raise CommandFailure("interrupted; files written before remain", INTERRUPTED)
     if done.failures:
-        raise CommandFailure(done.failed(), FAILURE)
+        raise CommandFailure(done.failed())
 
 
 @dataclass(kw_only=True)

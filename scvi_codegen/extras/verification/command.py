@@ -11,7 +11,7 @@ from scvi_codegen.api.commands import check_writable, model_arguments, read_mode
 from scvi_codegen.common.errors import PackageError
 from scvi_codegen.extras import verification
 from scvi_codegen.extras.verification import Certificate
-from scvi_codegen.interfaces.cli.command_group import FAILURE, CommandFailure, note
+from scvi_codegen.interfaces.cli.command_group import CommandFailure, note
 from scvi_codegen.interfaces.cli.model_options import Choices, sections_of
 from scvi_codegen.interfaces.models.model import DEFAULT_METHOD, Model
 from scvi_codegen.interfaces.models.model_files.model_file import load_model
@@ -51,7 +51,7 @@ def verify(model_name: str, output: str | None, **choices: Any) -> None:
         certificate.save(path)
         note(f"wrote {path}")
     if not certificate.passed:
-        raise CommandFailure(f"violated: {', '.join(check.name for check in certificate.violated)}", FAILURE)
+        raise CommandFailure(f"violated: {', '.join(check.name for check in certificate.violated)}")
 
 
 def _verified(name: str, choices: Choices) -> Certificate:

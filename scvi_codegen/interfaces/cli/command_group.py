@@ -47,7 +47,7 @@ FAILURE, USAGE, INTERRUPTED = 1, 2, 130
 class CommandFailure(click.ClickException):
     """Error of a command: a message for the user and an exit status."""
 
-    def __init__(self, message: str, status: int) -> None:
+    def __init__(self, message: str, status: int = FAILURE) -> None:
         super().__init__(message)
         self.status = status
 
@@ -141,7 +141,7 @@ def errors_as_messages() -> Iterator[None]:
         with _warnings_as_lines():
             yield
     except (StepFailedError, UnresolvedError, PathError, BuildError, RecordingError) as error:
-        raise CommandFailure(str(error), FAILURE) from error
+        raise CommandFailure(str(error)) from error
     except ScviCodegenError as error:
         cause = error.__cause__
         unwritten = isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError)
@@ -149,9 +149,9 @@ def errors_as_messages() -> Iterator[None]:
     except BrokenPipeError:
         raise
     except OSError as error:
-        raise CommandFailure(str(error), FAILURE) from error
+        raise CommandFailure(str(error)) from error
     except MemoryError as error:
-        raise CommandFailure("not enough memory", FAILURE) from error
+        raise CommandFailure("not enough memory") from error
     except KeyboardInterrupt as error:
         raise CommandFailure("interrupted", INTERRUPTED) from error
 

@@ -10,7 +10,6 @@ from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE
 from scvi_codegen.common.errors import ScviCodegenError
 from scvi_codegen.common.registry import part
 from scvi_codegen.interfaces.cli.command_group import (
-    FAILURE,
     INTERRUPTED,
     CommandFailure,
     check_writable,
@@ -215,7 +214,7 @@ def _fail_for(missed: str, where: str = "") -> None:
     """End with exit status 1 if a run misses an error bound; ``missed``: how, or ""."""
     if missed:
         tell(missed=missed)
-        raise CommandFailure(f"{where}{missed}", FAILURE)
+        raise CommandFailure(f"{where}{missed}")
 
 
 def _with_steps(
@@ -284,11 +283,11 @@ def _run_one(
     written = _write_outputs(model, result, output, plot, **with_error)
     tell(written=written)
     if outcome.failure is not None:
-        raise CommandFailure(f"{outcome.failure}\n{_kept(outcome, written)}", FAILURE) from outcome.failure
+        raise CommandFailure(f"{outcome.failure}\n{_kept(outcome, written)}") from outcome.failure
     if outcome.interrupted:
         raise CommandFailure(f"interrupted at t = {outcome.run.t:g}\n{_kept(outcome, written)}", INTERRUPTED)
     if outcome.missed is not None:
-        raise CommandFailure(f"{outcome.missed}\n{_kept(outcome, written)}", FAILURE)
+        raise CommandFailure(f"{outcome.missed}\n{_kept(outcome, written)}")
     for path in written:
         tell(f"wrote {path}")
     if advised is not None:
@@ -299,7 +298,7 @@ def _finish_recording(outcome: RecordedOutcome) -> None:
     """Print the summary of a run in a folder, and how to continue it."""
     tell(outcome.summary(), **outcome_numbers(outcome))
     if outcome.failure is not None:
-        raise CommandFailure(f"{outcome.failure}\n{outcome.continuation()}", FAILURE) from outcome.failure
+        raise CommandFailure(f"{outcome.failure}\n{outcome.continuation()}") from outcome.failure
     if outcome.interrupted:
         raise CommandFailure(f"interrupted at t = {outcome.run.t:g}\n{outcome.continuation()}", INTERRUPTED)
     tell(f"wrote {outcome.recorded.folder}", written=[outcome.recorded.folder])
@@ -320,7 +319,7 @@ def _run_ensemble(
             f"interrupted after {outcome.result.steps.mean():.0f} steps on average\n{continuation}", INTERRUPTED
         )
     if not outcome.result.ok.any():
-        raise CommandFailure(f"every trajectory failed\n{continuation}", FAILURE)
+        raise CommandFailure(f"every trajectory failed\n{continuation}")
     for path in written:
         tell(f"wrote {path}", written=written)
     if advised is not None and outcome.result.ok[member]:
@@ -333,7 +332,7 @@ def _tell_error(trajectory: Any) -> None:
     try:
         error = trajectory.error
     except ScviCodegenError as unknown:
-        raise CommandFailure(f"--error-bars: {unknown}", FAILURE) from unknown
+        raise CommandFailure(f"--error-bars: {unknown}") from unknown
     numbers = {"relative": error.relative[-1], "signed": error.signed, "lost": error.lost, "reason": error.reason}
     tell(str(error), error=numbers | {"q": error.q[-1].tolist(), "p": error.p[-1].tolist()})
 
