@@ -43,7 +43,7 @@ from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
 from scvi_codegen.runs.events.contacts import in_first_modes
 from scvi_codegen.runs.events.refinement import WithEventsInDouble, constantly
 from scvi_codegen.runs.forwarding import Forwarded, OfSteppers
-from scvi_codegen.runs.results.dense_output import times_of_run
+from scvi_codegen.runs.results.dense_output import check_has_end, times_of_run
 from scvi_codegen.runs.results.output import ALL_STATES, Output
 from scvi_codegen.runs.states.layout import InitialData
 from scvi_codegen.runs.states.times import times_after
@@ -218,11 +218,12 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
             save_every = checked_count(save_every, "save_every", least=1)
         stepper: Stepper = self if events is None and not action else self._for_run(events, action=action)
         interface = self.interface
-        noise = Noise.checked(stepper, seed, metropolis, inputs=inputs) if seed or metropolis else DEFAULT_NOISE
+        noise = Noise.checked(stepper, seed, metropolis, inputs=inputs) if seed != 0 or metropolis else DEFAULT_NOISE
         if not (inputs is None and t_eval is None and observe is None and tables is None and threads is None):
             self._check_not_of_run(tables, threads)
             stride = None if save_every == 1 else save_every
             check_together(inputs=inputs, t_eval=t_eval, observe=observe, save_every=stride, error=error)
+            check_has_end(t_eval, t, h, t_end)
             if inputs is not None:
                 end = partial(final_time, t, h, steps, t_end)
                 inputs = checked_inputs(interface, with_sequences(interface.inputs, inputs, seed, t=t, h=h, end=end))

@@ -99,8 +99,8 @@ class Trajectory(
             each is the last of the previous one. ``parameters`` are then those of the first.
         bath: seed of the noise, heat and acceptance up to the end in a heat bath, else ``None``.
 
-    Trajectories of ensembles have no ``iterations``, ``bath`` and numbers of rejected steps, and raise
-    :class:`StateError`.
+    Trajectories of ensembles have no ``iterations``, ``bath``, ``step_error``, ``worst_step_time``, ``transitions`` and
+    numbers of rejected steps, and raise :class:`StateError`, unless there is nothing to record.
 
     Positions and momenta of arrays are also indexed by name: ``q["u"]`` has the axes n and those of u.
     """
@@ -170,8 +170,12 @@ class Trajectory(
             actions=None if self.actions is None else self.actions[rows],
             step_sizes=lengths,
             events=tuple(crossings.chosen((crossings.t >= low) & (crossings.t <= high)) for crossings in self.events),
-            transitions=tuple(of.chosen((of.t >= low) & (of.t <= high)) for of in self.transitions),
             modes=None if self.modes is None else self.modes.between(low, high),
+            **(
+                {"transitions": tuple(of.chosen((of.t >= low) & (of.t <= high)) for of in self.transitions)}
+                if hasattr(self, "transitions")
+                else {}
+            ),
         )
 
     def _slice_of_pieces(self, first: int, last: int, stride: int, rows: slice) -> Self:
@@ -523,6 +527,8 @@ class Trajectory(
         return f"h = {self.h:g}"
 
     def _worst(self) -> str:
+        if not hasattr(self, "step_error"):
+            return "not recorded: ensembles estimate no errors of steps"
         if math.isnan(self.step_error):
             return "unknown: the method has no error estimate here"
         message = f"about {self.step_error:.1e} relative in the step from t = {self.worst_step_time:g}, the worst"

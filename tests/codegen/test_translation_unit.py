@@ -12,7 +12,7 @@ from programs import needs
 from samples import QUICK_FLAGS
 from strict_c import STRICT, run
 
-from scvi_codegen import SVI, compile_stepper, generate_source
+from scvi_codegen import SVI, LagrangianSystem, compile_stepper, generate_source
 from scvi_codegen.codegen.native.compilers import find_compiler
 from scvi_codegen.codegen.pipeline import ArraySources, c_identifier
 from scvi_codegen.codegen.rendering.own_names import with_exported_names, with_own_names
@@ -103,6 +103,20 @@ def test_single_file_defines_no_macro_that_it_does_not_use():
     assert "#undef" not in plain
     for name in re.findall(r"^#define (\w+)$", plain, re.MULTILINE):
         assert len(re.findall(rf"\b{name}\b", plain)) > 1, name
+
+
+@pytest.mark.second
+def test_names_that_occur_in_the_templates_are_names_of_integrators(tmp_path):
+    """An integrator ``finish`` exports ``finish_step``, and constraints have a function of that name."""
+    rod = LagrangianSystem.from_text("rod", ["x", "y"], "x_dot**2/2 + y_dot**2/2 - y", constraints=["x**2 + y**2 = 1"])
+    source = generate_source(rod, "svi:2", prefix="r_0")[0]
+    words = {word for text in source.files.values() for word in re.findall(r"\b[a-z][a-z_]*_[a-z_]+\b", text)}
+    exported = re.findall(r"\br_0_(\w+)\(", source.header)
+    names = {word.removesuffix(f"_{end}") for word in words for end in exported if word.endswith(f"_{end}")}
+    assert {"finish", "find"} < names
+    for name in ("finish", "find", *random.Random(20).sample(sorted(names - {"finish", "find"}), 8)):
+        written(generate_source(rod, "svi:2", prefix=c_identifier(name))[0], tmp_path)
+    run([*find_compiler(), *STRICT, "-Wno-psabi", "-fsyntax-only", *tmp_path.glob("*.c")], tmp_path)
 
 
 OF_C = "pendulum max status int double run step dbl solver"

@@ -164,6 +164,7 @@ class TestChoices:
             ("kepler --method gauss:", "the colon must be followed by a number, its stages, as in gauss:8"),
             ("kepler --method collocation:2", "collocation does not take a number; its arguments are abscissae, form"),
             ("kepler --method gaus:2", "did you mean 'gauss'?"),
+            ("kepler --span -10", "a negative step, --step -0.25 --span 10"),
             ("kepler --event q3", "unknown name 'q3'. Known here: q1, q2"),
             ("kepler --event q1;z=3", "'z' is not a coordinate, a momentum, a velocity or a parameter"),
             ("kepler --event q1;p_q1", "'p_q1' in the event 'q1;p_q1' is not of the form NAME=VALUE"),

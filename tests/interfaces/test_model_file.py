@@ -57,6 +57,7 @@ def test_model_file_is_read():
 
 
 def test_vectors_may_be_tables_by_coordinate():
+    assert parse_model(PENDULUM.replace("q_dot = [0]", "velocity = [0]")) == parse_model(PENDULUM)
     by_name = PENDULUM.replace("q = [0.5]\nq_dot = [0]\nt = 1.5", "t = 1.5\nq = {q = 0.5}\n[initial.q_dot]\nq = 0")
     assert parse_model(by_name) == parse_model(PENDULUM)
 
@@ -140,6 +141,7 @@ def test_a_catalogue_reference_may_be_changed():
         ("q = [0.5]\n", "", "there is no q in [initial]"),
         ("q_dot = [0]\n", "", "there is no p or q_dot in [initial]"),
         ("q_dot = [0]\n", "q_dot = [0]\np = [0]\n", "[initial] has both p and q_dot"),
+        ("q_dot = [0]\n", "q_dot = [0]\nvelocity = [0]\n", "velocity and q_dot are two names of one key"),
         ("span = 10\n", "", "there is no span or steps in [run]"),
         ("span = 10\n", "span = 10\nsteps = 40\n", "[run] has both span and steps"),
         ("span = 10\n", "span = 10\ntolerance = 1e-9\n", "[run] has both step and tolerance"),
@@ -164,7 +166,7 @@ def test_a_catalogue_reference_may_be_changed():
         ("m = 2.0", "m = 1" + "0" * 400, "[parameters] m is inf"),
         ("step = 0.25", "step = 0", "the step size is 0"),
         ("step = 0.25", "step = 1e-300", "less than 2^53 steps"),
-        ("span = 10", "span = -10", "it must be positive"),
+        ("span = 10", "span = -10", "--step -0.25 --span 10"),
         ("save_every = 4", "save_every = 0", "[run] save_every must be at least 1"),
         ("save_every = 4", "save_every = 1.5", "[run] save_every must be a whole number, not 1.5"),
         ("span = 10", "steps = -1", "[run] steps must be at least 0"),

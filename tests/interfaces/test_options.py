@@ -29,7 +29,7 @@ RUNS = {
     "max_iterations": 30,
     "threads": 2,
     "action": True,
-    "seed": 7,
+    "seed": 2**64 - 1,
     "metropolis": True,
     "q": [0.5],
     "p": [0.25],

@@ -247,6 +247,18 @@ def test_a_requested_check_is_of_every_tolerance_and_of_fixed_steps(steps):
             assert warned == (grows and requested is True)
 
 
+def test_rounding_far_from_the_origin_is_no_amplification():
+    """A million amplitudes away numbers are rounded by 1e-10 of the motion; the same motion around 0 is accurate."""
+    system = sc.LagrangianSystem.from_text("far", ["x"], "x_dot**2/2 - (x - c)**4/4", parameters={"c": 0.0})
+    stepper = sc.compile_stepper(system, "svi:4")
+    for c, words in ((0.0, []), (1e6, ["x, of size 1e+06, moves by 2, so that numbers are rounded by 5.6e-11"])):
+        with warnings.catch_warnings(record=True, action="always") as heard:
+            stepper.integrate([c + 1.0], [0.0], t_end=300.0, tolerance=1e-12, parameters={"c": c})
+        assert [str(warning.message)[: len(word)] for warning, word in zip(heard, words, strict=True)] == words
+    run = stepper.integrate([0.0], [0.0], h=0.1, steps=3)
+    assert str(run.error).startswith("t = 0.3: no error\nx = 0.0")
+
+
 def test_the_check_does_not_change_the_motion_and_only_integrate_makes_it():
     stepper, arguments = stepper_of(PENDULUM), {"q": [2.5, -2.0], "p": [0.0, 0.0], "t_end": 20.0}
     run = stepper.start(**arguments)

@@ -309,31 +309,7 @@ CELLS: dict[str, Callable[..., Made]] = {
 }
 
 
-TIMED: dict[str, Callable[..., Made]] = {
-    "fast_kepler": partial(KEPLER, method="svi:8", steps=10000),
-    "fast_kepler_adaptive": partial(KEPLER, method="svi:8", kind="adaptive", t_end=2000.0, steps=100000),
-    "fast_kepler_many": partial(KEPLER, method="svi:8", kind="ensemble", steps=3000),
-    "fast_pendulum": partial(PENDULUM, method="svi:8", steps=10000),
-    "fast_chain": partial(CHAIN, method="svi:8", steps=3000),
-    "fast_solar": partial(SOLAR, method="svi:8", steps=2000),
-    "fast_solar_many": partial(SOLAR, method="svi:6", kind="ensemble", steps=300),
-    "fast_double": partial(DOUBLE, method="svi:6", steps=3000),
-    "fast_vibration": partial(VIBRATION, method="svi:6", steps=3000),
-    "fast_rubbed": partial(RUBBED, method="svi:6", steps=3000),
-    "fast_newton": partial(KEPLER, method="svi:4", solver="newton"),
-    "fast_composition": partial(KEPLER, method="composition:8", steps=3000),
-    "fast_ring": partial(RING, method="svi:8", sizes=(1000,), steps=100),
-    "fast_ring_adaptive": partial(RING, method="svi:8", sizes=(1000,), adaptive=True, steps=100),
-    "fast_ring_100000": partial(RING, method="svi:8", sizes=(100000,), steps=4),
-    "fast_rubbed_ring": partial(RUBBED_RING, method="svi:8", sizes=(1000,), steps=100),
-    "fast_rotors": partial(ROTORS, method="svi:8", sizes=(1000,), steps=100),
-    "fast_ring_newton": partial(RING, method="svi:8", sizes=(1000,), solver="newton", steps=30),
-    "fast_ring_composition": partial(RING, method="composition:8", sizes=(1000,), steps=300),
-}
-"""Longer runs, of which times are compared (``golden_speed.py``)."""
-
-
-RECORDED_CELLS = CELLS | TIMED | {name: scene.made for name, scene in SCENES.items()}
+RECORDED_CELLS = CELLS | {name: scene.made for name, scene in SCENES.items()}
 
 
 def program(name: str) -> Program:

@@ -7,7 +7,7 @@ layout of the templates, where a declaration at file scope begins in the first c
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 
 from scvi_codegen.codegen.rendering.text import CONTINUATION, WIDTH, wrapped_prototype
@@ -23,10 +23,30 @@ SAME = re.compile(r"^typedef (\w+) \1;\n", re.MULTILINE)
 """Type that already has its name, as ``solver_options`` of the integrator ``solver``."""
 TOKEN = re.compile(r'/\*(?:[^*]|\*(?!/))*\*/|"(?:\\.|[^"\\])*"|#include .*|##\w+|\bFMI\(\w+\)|\b[A-Za-z_]\w*')
 """Comments, strings, words, and words pasted to the end of others, which are no names by themselves."""
+EXPORTED_OR_TOKEN = re.compile(rf"{EXPORTED.pattern}|{TOKEN.pattern}")
+DECLARATION = re.compile(r"^typedef struct (\w+) \{|^\} (\w+);|(\w+)\(", re.MULTILINE)
+"""Types and functions that a header declares; macros with the prefix are written as such in the code."""
 HEAD = re.compile(r'^(?P<head>[A-Za-z_][^;{}#/"]*\))(?=\n\{)', re.MULTILINE)
 """Head of the definition of a function."""
 CONTINUED = re.compile(r"^#define .*\\\n(?:.*\\\n)*.*$", re.MULTILINE)
 BREAK = re.compile(r'(?:[^" ]|"(?:\\.|[^"\\])*")+ ')
+
+
+def with_distinct_names(texts: Mapping[str, str], header: str, prefix: str) -> dict[str, str]:
+    """Return texts whose own names are none of those they export, as ``finish_step`` of an integrator ``finish``."""
+    if not any(f"{of}_" in text for of in (prefix, prefix.upper()) for text in texts.values()):
+        return dict(texts)
+    exported = {
+        name for names in DECLARATION.findall(header) for name in names if name.lower().startswith(f"{prefix}_")
+    }
+    for kind, word in (export for text in texts.values() for export in EXPORTED.findall(text)):
+        exported.add(f"{prefix if kind == 'NAME' else prefix.upper()}_{word}")
+
+    def distinct(match: re.Match[str]) -> str:
+        name = match[0]
+        return f"{'LOCAL' if name.isupper() else 'local'}_{name}" if name in exported else name
+
+    return {file: EXPORTED_OR_TOKEN.sub(distinct, text) for file, text in texts.items()}
 
 
 def with_exported_names(code: str) -> str:

@@ -479,7 +479,7 @@ def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") 
         features = [name.lower() for name in program.rattle.macros]
         headers["support/constraints/iterate.h"] = wrapped_functions(rattle_functions(program.rattle.part, features))
         headers["support/double_double/correct_points.h"] = wrapped_functions(pair_rattle_functions())
-    return Source(
+    source = Source(
         prefix=prefix,
         header=environment.get_template(f"{entry}.h.jinja").render(context | {"declarations": declarations}),
         code=code,
@@ -492,6 +492,7 @@ def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") 
             **CONTENTS[entry](context),
         ),
     )
+    return source.with_distinct_names(cast(str, context["prefix"]))
 
 
 def _contents_of_step(context: Mapping[str, Any]) -> dict[str, Any]:
@@ -784,7 +785,8 @@ def with_fmu(
         declarations="",
         support=included(code, support_text),
     )
-    return replace(source, beside=replace(beside, beside=source.beside))
+    beside = replace(beside.with_distinct_names(interface.prefix), beside=source.beside)
+    return replace(source, beside=beside)
 
 
 def with_flow(source: Source, text: str, headers: Sequence[str], declarations: str, *, second: bool) -> Source:

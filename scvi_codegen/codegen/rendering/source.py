@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from scvi_codegen.codegen.rendering.own_names import with_exported_names, with_own_names
+from scvi_codegen.codegen.rendering.own_names import with_distinct_names, with_exported_names, with_own_names
 from scvi_codegen.codegen.rendering.preprocessor import preprocessed
 from scvi_codegen.codegen.rendering.reachable import readable
 from scvi_codegen.systems.contact import Impacts
@@ -172,6 +172,11 @@ class Source:
         """Files without what no exported function uses, by name; that of the step first."""
         files = readable(self.amalgamated().code)
         return dict(zip(files, with_exported_names("\f".join(files.values())).split("\f"), strict=True))
+
+    def with_distinct_names(self, prefix: str) -> Source:
+        """Return the source with names of its own beside the exported ones, which have the prefix."""
+        code, *support = with_distinct_names({"": self.code, **dict(self.support)}, self.header, prefix).items()
+        return replace(self, code=code[1], support=tuple(support))
 
     def readable(self) -> Source:
         """Return the source without what no exported function uses, the step first; the code includes what follows."""

@@ -16,9 +16,10 @@ from typing import Any, NamedTuple
 from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.codegen.variants import SUMS
 from scvi_codegen.common.errors import ModelFileError
-from scvi_codegen.common.validation import NUMERAL, TOLERANCE_RANGE, ExactNumber, checked_count
+from scvi_codegen.common.validation import LARGEST_COUNT, NUMERAL, TOLERANCE_RANGE, ExactNumber, checked_count
 from scvi_codegen.methods.controllers import CONTROLLERS, SYMPLECTIC
 from scvi_codegen.runs.ensembles.observation import OBSERVED
+from scvi_codegen.runs.stepping.noise import LARGEST_SEED
 
 NUMBER, COUNT, TEXT, CHOICE, SWITCH, METHOD = "number", "count", "text", "choice", "switch", "method"
 NUMBERS, NUMBERS_OR_NAME, NUMBER_OR_NAMED = "numbers", "numbers or name", "number, or numbers by name"
@@ -53,7 +54,7 @@ class Option:
         key, field: key in the section and field of a model, by default the name.
         determines: what this option and its alternatives determine.
         brief: its name among alternatives in messages, by default the field.
-        least: smallest value of a count.
+        least, most: smallest and largest value of a count.
         choices: values of a choice.
         default: value that means the same as no value.
         valid, invalid: condition on a number, and the message with ``{value:g}`` if it is not met.
@@ -73,6 +74,7 @@ class Option:
     determines: Alternatives | None = None
     brief: str = ""
     least: int = 0
+    most: int = LARGEST_COUNT
     choices: tuple[str, ...] = ()
     default: str | None = None
     valid: Callable[[float], bool] = math.isfinite
@@ -95,7 +97,7 @@ class Option:
     def read(self, value: Any, where: str) -> Any:
         """Return a value of the kind of the option, or raise :class:`ModelFileError` that begins with ``where``."""
         if self.kind == COUNT:
-            return checked_count(value, where, least=self.least, error=ModelFileError)
+            return checked_count(value, where, least=self.least, most=self.most, error=ModelFileError)
         if self.kind == SWITCH:
             if not isinstance(value, bool):
                 raise ModelFileError(f"{where} must be true or false, not {value!r}")
@@ -222,7 +224,9 @@ class RunOptions:
         common=False,
     )
     action: bool = run_option("run", SWITCH, "", "Sum the action along the run.", default=False, common=False)
-    seed: int = run_option("run", COUNT, "N", "Key of the noise of a heat bath [0].", default=0, common=False)
+    seed: int = run_option(
+        *("run", COUNT, "N", "Key of the noise of a heat bath [0]."), default=0, most=LARGEST_SEED, common=False
+    )
     metropolis: bool = run_option(
         "run", SWITCH, "", "Accept or reject each step in a heat bath.", default=False, common=False
     )

@@ -79,10 +79,12 @@ class TimeSpan(RunOptions):
                 raise ModelFileError("span is 0: it must be positive, or negative for a run backward in time")
             return
         if self.span is not None and not 0.0 < self.span / abs(self.h) <= LARGEST_COUNT:
-            raise ModelFileError(
-                f"span is {self.span:g} with a step size of {self.h:g}: it must be positive, also for a run "
-                "backward in time, and less than 2^53 steps"
+            backward = (
+                f"a run backward in time has a negative step, --step {-abs(self.h):g} --span {abs(self.span):g} "
+                f"(step = {-abs(self.h):g} and span = {abs(self.span):g} in files, h={-abs(self.h):g} in Python)"
             )
+            remedy = backward if self.span < 0.0 else "give a positive span of less than 2^53 steps"
+            raise ModelFileError(f"span is {self.span:g} with a step size of {self.h:g}: {remedy}")
 
     def _check_controller(self) -> None:
         """Raise an error if a controller of adaptive steps is given beside a step size."""

@@ -183,10 +183,10 @@ def warn_of_unconfirmed_run(trajectory: Any) -> None:
     until = "at no time" if at_start else f"until t = {result.confirmed_until:.6g} only"
     why = f" ({result.reason})" if result.reason else f": that of the run is up to about {result.estimate:.1e}"
     remedy = "Give a larger error" if at_start else "End the run there, or give a larger error"
-    warn(
-        f"the global error {result.requested:g} is confirmed {until}{why}. {remedy}{_alternative(trajectory, result)}",
-        AccuracyWarning,
-    )
+    remedy += _alternative(trajectory, result)
+    if (trajectory.stepper.origin or trajectory.stepper)._finer is None:  # loaded: no bound is confirmed
+        remedy = "A package has a model.toml: load_model(..).stepper()"
+    warn(f"the global error {result.requested:g} is confirmed {until}{why}. {remedy}", AccuracyWarning)
 
 
 def _alternative(trajectory: Any, result: GlobalError) -> str:

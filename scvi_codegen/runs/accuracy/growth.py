@@ -8,12 +8,15 @@ import math
 
 from scvi_codegen.common.errors import AccuracyWarning, warn
 from scvi_codegen.common.representation import counted
+from scvi_codegen.runs.accuracy.size import roundoff
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runs.stepping.features import require
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.memory import Memory
 from scvi_codegen.runs.stepping.step_plan import Adaptive, StepPlan
 
+ROUNDINGS = 100
+"""Roundings of a number by which steps of round-off err: positions ten motions away are no cause."""
 UNCHECKED, MEANINGLESS = 1e-4, 1e-2
 """Tolerance from which on only a requested check is made, and error beyond which no digit is left."""
 
@@ -47,8 +50,23 @@ def warn_of_error_growth(run: Memory, t_end: float, *, requested: bool) -> None:
     else:
         left = counted(math.floor(-math.log10(error)), "digit")
         what = f"they grow far above the tolerance after t = {accurate_until:g}, which leaves {left} at t = {t_end:g}"
+    cause = _rounding_far_from_origin(run) or f"the motion amplifies errors: {what} (estimated)."
     warn(
-        f"the motion amplifies errors: {what} (estimated). Use error= to find the time until which digits are "
-        "confirmed, or check_growth=False to skip this check",
+        f"{cause} Use error= to find the time until which digits are confirmed, or check_growth=False to skip this "
+        "check",
         AccuracyWarning,
     )
+
+
+def _rounding_far_from_origin(run: Memory) -> str:
+    """Return the cause where positions are rounded by more than the error of steps: no motion amplifies that."""
+    memory, allowed = run._memory, max(getattr(run.plan, "tolerance", None) or 0.0, ROUNDINGS * roundoff(1))
+    for i, name in enumerate(run.stepper.interface.coordinates):
+        low, high = memory.lowest[i], memory.highest[i]
+        size, motion = max(abs(low), abs(high)), high - low
+        if motion > 0.0 and (rounding := roundoff(1) * size / motion) > allowed:
+            return (
+                f"{name}, of size {size:.3g}, moves by {motion:.3g}, so that numbers are rounded by {rounding:.1e} of "
+                f"the motion, more than the steps err: choose an origin of {name} near the motion."
+            )
+    return ""

@@ -27,11 +27,11 @@ MOST_CHECKED: Final = 1000
 """Largest number of trajectories of an ensemble whose energy is checked."""
 
 ERROR_AMPLIFIED: Final = (
-    "although every step met the tolerance: errors of steps accumulate, and close encounters amplify them. Reduce the "
-    "tolerance, or use regularised coordinates"
+    "although every step met the tolerance: errors of steps accumulate, and unstable motions amplify them. Reduce the "
+    "tolerance; near collisions use regularised coordinates, too"
 )
 FIXED_STEP_REMEDY: Final = (
-    "although the system conserves it: h is too large, perhaps for a close encounter. Reduce h, or use an SVI with "
+    "although the system conserves it: h is too large for the fastest part of the motion. Reduce h, or use an SVI with "
     "adaptive steps (t_end=)"
 )
 

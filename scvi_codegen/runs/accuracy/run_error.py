@@ -111,7 +111,8 @@ class RunError:
         k, interface = int(known[-1]) if len(known) else 0, self._run.stepper.interface
         names = interface.coordinates, interface.momentum_columns
         values, bounds = (np.asarray(self._run.q)[k], np.asarray(self._run.p)[k]), [part[k] for part in self.bounds]
-        lines = [f"t = {float(self.t[k]):g}: relative error {self.relative[k]:.1e}"]
+        size = f"relative error {self.relative[k]:.1e}" if self.relative[k] != 0.0 else "no error"
+        lines = [f"t = {float(self.t[k]):g}: {size}"]
         for group in zip(names, values, bounds, strict=True):
             lines += [f"{name} = {with_uncertainty(*of)}" for name, *of in zip(*group, strict=True)]
         if self.lost is not None:
@@ -183,7 +184,8 @@ class WithErrors:
     def corrected(self: Any) -> CorrectedStates:
         """States minus their errors, usually more accurate than the states by several digits.
 
-        They are NaN at events and where the states have no meaningful digits.
+        They are NaN at events and from ``run.error.lost`` on, where the states have no meaningful digits: errors above
+        the motion are no correction. ``error=`` or a smaller tolerance postpone that time.
 
         Raises:
             StateError: if the errors have no sign.

@@ -27,7 +27,7 @@ from scvi_codegen.runs.driver.segments import (
 )
 from scvi_codegen.runs.ensembles.schedule import CommonSteps, common_steps
 from scvi_codegen.runs.events.contacts import in_first_modes
-from scvi_codegen.runs.results.dense_output import times_of_run
+from scvi_codegen.runs.results.dense_output import check_has_end, times_of_run
 from scvi_codegen.runs.states.validation import (
     Array,
     EnsembleParameters,
@@ -188,6 +188,7 @@ class EnsembleSettings:
         check_together(inputs=self.inputs, t_eval=self.t_eval)
         if words > 1:
             check_doubles(t_end=t_end, t_eval=self.t_eval)
+        check_has_end(self.t_eval, t, h, t_end)
         if h is not None and self.t_eval is not None:
             raise StateError("t_eval requires adaptive steps: give t_end without h and steps")
         if h is not None and t_end is not None and np.ndim(t_end):

@@ -25,7 +25,7 @@ from scvi_codegen.runs.forwarding import OfEnsembles
 from scvi_codegen.runs.results.export import FORMATS, LABELLED, check_format, write_whole
 from scvi_codegen.runs.results.joining import joined, relative_changes
 from scvi_codegen.runs.results.quantities import quantities, short_title
-from scvi_codegen.runs.results.recorded import OfMethod, changed, not_recorded, without
+from scvi_codegen.runs.results.recorded import NotRecordedError, OfMethod, changed, not_recorded, without
 from scvi_codegen.runs.results.saved_states import ModeHistory, checked_row
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.rotation_quantities import named_quantities
@@ -103,8 +103,12 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, OfEnsembles, TwoWor
 
     def __getattr__(self, name: str) -> Any:
         """Raise an error that says whether a trajectory has what an ensemble lacks."""
-        if name in ("acceptance", "heat", "bath", "iterations", "rejected_steps", "step_error", "worst_step_time"):
+        from scvi_codegen.runs.trajectory import Trajectory  # imported here: it makes ensembles
+
+        if name in ("heat", *Trajectory.OPTIONAL):
             raise not_recorded(name)
+        if not name.startswith("_") and hasattr(Trajectory, name):
+            raise NotRecordedError(f"an ensemble has no {name}: read that of one of its trajectories, runs[0].{name}")
         raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'")
 
     @property
@@ -171,6 +175,9 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, OfEnsembles, TwoWor
             "rejected_steps": self.h is None,
             "bath": self.stepper.interface.temperature is not None,
             "fallback_steps": self.fallback_steps is None,
+            "step_error": True,
+            "worst_step_time": True,
+            "transitions": bool(self.stepper.interface.contacts or self.stepper.interface.kinks),
         }
         return tuple(name for name, is_unset in conditions.items() if is_unset)
 

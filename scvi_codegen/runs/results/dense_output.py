@@ -167,11 +167,32 @@ def times_of_run(t_eval: ArrayLike, t: float, t_end: float) -> Array:
         raise StateError(f"t_eval must be a one-dimensional array of times, not of shape {times.shape}")
     if not times.size:
         raise StateError("t_eval is empty: give output times, or omit it to save every step")
+    check_one_side(times, t)
     if (np.diff(times) * (t_end - t) < 0.0).any():
         raise StateError(
             "t_eval must be sorted in the direction of the run: ascending, or descending for a backward run"
         )
     return within(times, t, t_end)
+
+
+def check_one_side(times: Array, t: float) -> None:
+    """Raise ``StateError`` for output times before and after the initial one: a run has one direction."""
+    if times.size and times.min() < t < times.max():
+        first, last = times.min(), times.max()
+        raise StateError(
+            f"t_eval has times before and after t = {t:g}, from {first:g} to {last:g}, but a run has one direction: "
+            f"make two, with t_end={first:g} and t_end={last:g}, with the times of t_eval on each side"
+        )
+
+
+def check_has_end(t_eval: ArrayLike | None, t: float, h: float | None, t_end: ArrayLike | None) -> None:
+    """Raise ``StateError`` for output times of a run without h and t_end."""
+    if t_eval is None or h is not None or t_end is not None:
+        return
+    times = checked_times(t_eval, "t_eval")
+    check_one_side(times, t)
+    last = f"t_end={times.flat[np.abs(times - t).argmax()]:g}" if times.size else "t_end"
+    raise StateError(f"t_eval has times of a run whose end is missing: give {last}, or h and steps, too")
 
 
 def within(times: Array, first: float, last: float) -> Array:

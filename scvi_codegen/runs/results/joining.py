@@ -34,7 +34,11 @@ def joined(pieces: Sequence[Result]) -> Result:
         step_sizes=np.concatenate([*(piece.step_sizes[:-1] for piece in every), last.step_sizes[-1:]]),
         actions=accumulated([piece.actions for piece in every]),
         events=tuple(map(joined_crossings, zip(*(piece.events for piece in every), strict=True))),
-        transitions=tuple(map(joined_crossings, zip(*(piece.transitions for piece in every), strict=True))),
+        **(
+            {"transitions": tuple(map(joined_crossings, zip(*(piece.transitions for piece in every), strict=True)))}
+            if hasattr(first, "transitions")
+            else {}
+        ),
         modes=None if first.modes is None else ModeHistory.joined([piece.modes for piece in every]),
         pieces=tuple(pieces),
     )

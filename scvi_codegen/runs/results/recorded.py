@@ -30,7 +30,10 @@ class WithUnsetAttributes:
 
     __slots__ = ()
 
-    OPTIONAL = ("iterations", "rejected_steps", "fallback_steps", "bath", "acceptance")
+    OPTIONAL = (
+        *("iterations", "rejected_steps", "fallback_steps", "bath", "acceptance"),
+        *("step_error", "worst_step_time", "transitions"),
+    )
 
     def __getattr__(self, name: str) -> Any:
         """Raise an error that says what records an attribute; Python calls this for those that are not set."""

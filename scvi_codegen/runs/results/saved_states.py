@@ -135,9 +135,10 @@ def parameters_on_sides(states: SavedStates, t: float) -> Array:
 
 def times_of_changes(states: Any) -> Array:
     """Return the sorted times of events that change the state, and of transitions of contacts and kinks."""
-    if not (states.events or states.transitions or states.modes):
+    transitions = getattr(states, "transitions", ())
+    if not (states.events or transitions or states.modes):
         return np.empty(0)
-    times = [of.t for of in states.events if of.event.changes_state] + [of.t for of in states.transitions]
+    times = [of.t for of in states.events if of.event.changes_state] + [of.t for of in transitions]
     times += [] if states.modes is None else [states.modes.t]
     values = np.concatenate([np.asarray(of, float) for of in times]) if times else np.empty(0)
     return np.asarray(states.forward * np.unique(states.forward * values))

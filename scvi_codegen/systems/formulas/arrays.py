@@ -423,7 +423,7 @@ class ArrayParser(_Indices):
             return Place(base=self.size())
         bound = self.in_scope.get(token.text)
         if bound is None:
-            indices = ", ".join(self.in_scope) or "none here"
+            indices = ", ".join(self.in_scope) or "none here, outside sums"
             message = (
                 f"'{token.text}' is not an index{closest(token.text, self.in_scope)} Indices: {indices}. An "
                 "array is accessed by"

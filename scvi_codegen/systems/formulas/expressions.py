@@ -86,6 +86,57 @@ KINKED: Mapping[str, Callable[..., Expr]] = {
 }
 """Further functions; a coordinate, parameter or array of one of these names replaces it."""
 FUNCTIONS = {**RESERVED, **KINKED}
+REWRITTEN: Mapping[str, Callable[..., Expr]] = {
+    "sec": lambda x: 1 / sympy.cos(x),
+    "csc": lambda x: 1 / sympy.sin(x),
+    "cot": lambda x: sympy.cos(x) / sympy.sin(x),
+    "sech": lambda x: 1 / sympy.cosh(x),
+    "csch": lambda x: 1 / sympy.sinh(x),
+    "coth": lambda x: 1 / sympy.tanh(x),
+    "asec": lambda x: sympy.acos(1 / x),
+    "acsc": lambda x: sympy.asin(1 / x),
+    "acot": lambda x: sympy.pi / 2 * sign(x) - sympy.atan(x),
+    "asech": lambda x: sympy.acosh(1 / x),
+    "acsch": lambda x: sympy.asinh(1 / x),
+    "acoth": lambda x: sympy.atanh(1 / x),
+}
+"""Functions that are written by others at once, as SymPy defines them: acot is odd and jumps at 0, where it is pi/2.
+
+A coordinate, parameter or array of one of these names replaces it.
+"""
+REWRITTEN_CONSTANTS = {"GoldenRatio": (1 + sympy.sqrt(5)) / 2}
+"""Constants that are written by others at once."""
+WRITTEN_OTHERWISE = {
+    **dict.fromkeys(("Abs", "fabs"), "abs(x)"),
+    **dict.fromkeys(("Max", "fmax"), "max(x, y)"),
+    **dict.fromkeys(("Min", "fmin"), "min(x, y)"),
+    **dict.fromkeys(("Heaviside", "heaviside"), "unit_step(x)"),
+    "sgn": "sign(x)",
+    "Piecewise": "where(x > 0, a, b)",
+    "clip": "min(max(x, a), b)",
+    "ln": "log(x)",
+    "log10": "log(x)/log(10)",
+    "log2": "log(x)/log(2)",
+    "log1p": "log(1 + x)",
+    "exp2": "2**x",
+    "expm1": "exp(x) - 1",
+    "pow": "x**y",
+    "square": "x**2",
+    "hypot": "sqrt(x**2 + y**2)",
+    "cbrt": "x**(1/3), for x < 0 -(-x)**(1/3)",
+    "root": "x**(1/n)",
+    **{f"arc{name}": f"a{name}(x)" for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
+    "arctan2": "atan2(y, x)",
+    "tg": "tan(x)",
+    "ctg": "cot(x)",
+    "sinc": "sin(x)/x",
+    **dict.fromkeys(("floor", "ceil", "ceiling", "round", "trunc"), "rint(x), the nearest whole number"),
+    **dict.fromkeys(("mod", "Mod", "fmod"), "wrap(x, length), which is between -length/2 and length/2"),
+    **dict.fromkeys(
+        ("erf", "erfc", "gamma", "besselj", "lambertw", "LambertW", "zeta"), "a table: functions={'f': sc.Table(x, y)}"
+    ),
+}
+"""What stands for functions of SymPy, C and NumPy that have another name here, or none."""
 ARGUMENTS = {"atan2": 2, "wrap": 2, "min": 2, "max": 2, "where": 3}
 """Numbers of arguments of functions with more than one; min and max take any more, too."""
 PIECEWISE_CONSTANT: Mapping[str, tuple[Callable[[Number], Number], Callable[..., Any]]] = {
@@ -252,7 +303,11 @@ def _node_problem(node: Any) -> str | None:
         return exponent_problem(node.exp) if node.is_Pow else None
     kind = type(node).__name__
     reason = ": the formulas of a system are real" if kind == "ImaginaryUnit" else ""
-    names = ", ".join([*FUNCTIONS, *CONSTANTS])
+    names = ", ".join([*FUNCTIONS, *REWRITTEN, *CONSTANTS, *REWRITTEN_CONSTANTS])
+    if not node.args and node.is_number and not reason:
+        reason = f": make it a parameter, parameters={{'{kind}': {float(node)!r}}}"
+    elif kind in WRITTEN_OTHERWISE:
+        reason = f": write {WRITTEN_OTHERWISE[kind]}"
     return f"{kind} ('{shortened(node)}') is not supported{reason}. Use + - * / ** and {names}"
 
 
@@ -263,7 +318,8 @@ def exponent_problem(exponent: Expr) -> str | None:
         return None
     return (
         f"the constant {shortened(constant)} in an exponent is not supported: it must lie between "
-        f"-{MAX_EXPONENT} and {MAX_EXPONENT}, with a denominator of at most {MAX_EXPONENT_DENOMINATOR}"
+        f"-{MAX_EXPONENT} and {MAX_EXPONENT}, with a denominator of at most {MAX_EXPONENT_DENOMINATOR}; "
+        f"make it a parameter: x**n, parameters={{'n': {float(constant)!r}}}"
     )
 
 
@@ -301,6 +357,10 @@ def evaluated(expression: Expr, replacements: Mapping[Expr, Expr] | None = None)
     return expression
 
 
+_BUILT = {**OF_SYMPY, **{getattr(sympy, name): function for name, function in REWRITTEN.items()}}
+"""How functions of SymPy are made of those of the grammar."""
+
+
 def _rebuilt(expression: Expr, replacements: dict[Expr, Expr]) -> Expr:
     if expression not in replacements:
         replacements[expression] = _rebuilt_node(expression, replacements)
@@ -312,12 +372,14 @@ def _rebuilt_node(expression: Expr, replacements: dict[Expr, Expr]) -> Expr:
     if expression.is_Float:
         value = float(expression)
         return Rational(repr(value) if expression == value else str(expression))
+    if expression.is_number and not expression.args:
+        return REWRITTEN_CONSTANTS.get(str(expression), expression)
     if not expression.args or isinstance(expression, (sympy.Derivative, AppliedUndef)):
         return expression
     arguments = [_rebuilt(argument, replacements) for argument in expression.args]
     if isinstance(expression, Intermediate):
         return intermediate(arguments[0])
-    rebuilt = OF_SYMPY.get(expression.func, expression.func)(*arguments)
+    rebuilt = _BUILT.get(expression.func, expression.func)(*arguments)
     return without_abs(rebuilt) if expression.is_Pow and not expression.exp.is_integer else rebuilt
 
 

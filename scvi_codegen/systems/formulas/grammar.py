@@ -30,6 +30,9 @@ from scvi_codegen.systems.formulas.expressions import (
     MAX_BITS,
     MAX_DIGITS,
     NODES,
+    REWRITTEN,
+    REWRITTEN_CONSTANTS,
+    WRITTEN_OTHERWISE,
     beyond_double,
     bits,
     evaluated,
@@ -57,7 +60,8 @@ _SPACE = re.compile(r"[ \t\r\n\f]*")
 
 _HINTS = {
     ".": "attribute access is not part of the grammar",
-    "[": 'subscripts require arrays: declare coordinates=["q[N]"] or parameters={"m[N]": 1.0} (of a rotation: R_11)',
+    "[": 'subscripts require arrays: declare coordinates=["q[3]"], or parameters={"m[2]": [1.0, 2.0]}, whose entries '
+    "m[0] and m[1] systems of named coordinates may use, too (of a rotation: R_11)",
     "^": "powers are written x**2",
     "=": "write the right-hand side only; equalities, assignments and keyword arguments are not part of the grammar",
     "'": "write the velocity of q as q_dot; strings are not part of the grammar",
@@ -75,16 +79,9 @@ _HINTS = {
 }
 
 
-_FUNCTIONS_ELSEWHERE = {
-    "Abs": "abs",
-    "fabs": "abs",
-    "fmax": "max",
-    "fmin": "min",
-    "sgn": "sign",
-    "heaviside": "unit_step",
-}
-_FUNCTIONS_ELSEWHERE |= {"Max": "max", "Min": "min", "Heaviside": "unit_step", "Piecewise": "where"}
-"""Functions of SymPy, C and NumPy that have other names here."""
+_CONSTANTS_ELSEWHERE = {"E": "exp(1)", "Pi": "pi", "PI": "pi", "M_PI": "pi"}
+_VALUES_ELSEWHERE = {"EulerGamma": 0.5772156649015329, "Catalan": 0.915965594177219}
+"""Constants of SymPy, C and NumPy that are written otherwise here, or are parameters."""
 
 
 class Token(NamedTuple):
@@ -361,22 +358,25 @@ class Parser:
 
     def name(self, name: str, column: int) -> Expr:
         """Return the symbol, constant or function call of a name."""
-        function = self.symbols.get(name) or FUNCTIONS.get(name)
+        function = self.symbols.get(name) or FUNCTIONS.get(name) or REWRITTEN.get(name)
         if callable(function):
             return self.call(name, function, column)
         if self.tokens[self.position][:2] == ("operator", "("):
             if name in KINKED:
                 self.refuse(f"'{name}' is a name of this system, not the function {name}(..): rename it", column)
-            names = f"{closest(_FUNCTIONS_ELSEWHERE.get(name, name), FUNCTIONS)} Known: {', '.join(FUNCTIONS)}"
+            written = WRITTEN_OTHERWISE.get(name)
+            hint = f": write {written}." if written else closest(name, [*FUNCTIONS, *REWRITTEN])
+            names = f"{hint} Known: {', '.join([*FUNCTIONS, *REWRITTEN])}"
             self.refuse(f"'{name}' is not a function of the grammar{names}", column)
-        value = self.symbols.get(name, CONSTANTS.get(name))
+        value = self.symbols.get(name, CONSTANTS.get(name, REWRITTEN_CONSTANTS.get(name)))
         if value is None:
-            names = ", ".join([*self.symbols, *CONSTANTS])
+            names, constant = ", ".join([*self.symbols, *CONSTANTS]), _VALUES_ELSEWHERE.get(name, 1.0)
             declared = (
-                f"declare a constant as a parameter: parameters={{'{name}': 1.0}}, in files [parameters] {name} = 1.0"
+                f"declare a constant as a parameter: parameters={{'{name}': {constant}}}, in files [parameters] "
+                f"{name} = {constant}"
             )
-            velocity = next((symbol for symbol in self.symbols if name in _spellings(symbol)), "")
-            hint = f"; did you mean '{velocity}'?" if velocity else closest(name, self.symbols)
+            spelled = {other: symbol for symbol in self.symbols for other in _spellings(symbol)} | _CONSTANTS_ELSEWHERE
+            hint = f"; did you mean '{spelled[name]}'?" if name in spelled else closest(name, self.symbols)
             self.refuse(f"unknown name '{name}'{hint} Known here: {names}; {declared}", column)
         return value
 

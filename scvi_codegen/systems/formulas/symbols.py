@@ -54,6 +54,12 @@ def number(name: str, value: Any) -> float:
     """Convert a default value to float, also an exact one; text, complex and non-finite numbers are rejected."""
     if isinstance(value, ExactNumber) and math.isfinite(value):
         return value
+    if not isinstance(value, str) and hasattr(value, "__len__") and name.isidentifier():
+        count = len(value) if getattr(value, "ndim", 1) else 1
+        raise SystemDefinitionError(
+            f"the parameter '{name}' has {count} values, which requires its size beside the name: "
+            f"parameters={{'{name}[{count}]': ..}}, with entries {name}[0] to {name}[{max(count - 1, 0)}] in formulas"
+        )
     try:
         converted = math.nan if isinstance(value, (str, bytes, complex)) else float(value)
     except (TypeError, ValueError, OverflowError):

@@ -666,7 +666,7 @@ static SELDOM int is_free_flight(const step_data *step, stored_values of)
       const double change = fabs(end - start) + fabs(middle - start);
       flies |= KEPT_VELOCITIES ? bend <= UNBENT * change : change <= NEARLY_CONSTANT * (fabs(start) + fabs(end));
     }
-    add_block(&all, flies, 0.0);
+    add_block(&all, (real)flies, 0.0);
   }
   meet(step);
   return largest_over(&all, 0) > 0.0;
@@ -746,7 +746,7 @@ static SELDOM int force_sets_in(const trial *now, const solver_options *options)
           MATH(fabs)(whole[i] - flight) > ROUNDING_OF_HALVES * (MATH(fabs)(q[i]) + rounded) &&
           change > SPURIOUS * (MATH(fabs)(p[i]) + MATH(fabs)(now->dp[i])) + least;
     }
-    add_block(&all, sets_in, 0);
+    add_block(&all, (real)sets_in, 0);
   }
   meet(step);
   return largest_over(&all, 0) > 0;

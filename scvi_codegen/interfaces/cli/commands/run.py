@@ -149,9 +149,9 @@ def run(
     _check_outputs(output, plot, ensemble, checkpoint)
     requested = {name: choices.pop(name) for name in ERRORS}
     _check_combination(choices, plot=plot, ensemble=ensemble, requested=requested, folder=output if recorded else None)
-    is_controlled = any(choices.get(name) is not None for name in OF_ADAPTIVE_STEPS)
     errors = {name: requested[name] for name in ("tolerance", "error") if requested[name] is not None}
-    model = read_model(model_name, choices, errors if is_controlled else None)
+    is_adaptive = any(choices.get(name) is not None for name in (*OF_ADAPTIVE_STEPS, "span"))
+    model = read_model(model_name, choices, errors if is_adaptive else None)
     _check_output_of_words(model, output)
     if model.precision in (DOUBLE_DOUBLE, AUTO):
         model = model.with_known_sizes()

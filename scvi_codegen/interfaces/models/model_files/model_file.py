@@ -130,6 +130,11 @@ def parse_model(text: str, changes: Document | None = None, *, folder: str | os.
     for name, content in document.items():
         if not isinstance(content, dict) and name not in LISTS:
             raise ModelFileError(f"'{name}' must be a section, [{name}], not {content!r}")
+    initial = document.get("initial", {})
+    if "velocity" in initial:
+        if "q_dot" in initial:
+            raise ModelFileError("[initial] velocity and q_dot are two names of one key: give one of them")
+        initial["q_dot"] = initial.pop("velocity")
     for name, content in document.items():
         if name in KEYS or name in homes("sections"):
             check_keys(content, KEYS[name] if name in KEYS else part("sections", name).keys, "key", f"[{name}]")
