@@ -203,6 +203,7 @@ def describe(
         masked=len(system.reactions),
         conserves_energy=not system.changes_energy and not system.inputs,
         dissipates=bool(system.reactions) and dissipates(system),
+        has_unseen_growth=program.has_unseen_growth,
         arrays=_arrays_of(system),
         indices=tuple(f"{name} = {value}" for name, value in system.indices.items()),
         rotations=tuple(rotation.declaration for rotation in system.rotations),

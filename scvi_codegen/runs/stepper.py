@@ -74,6 +74,7 @@ from scvi_codegen.runs.stepping.step_plan import (
     Until,
     check_max_step,
     checked_plan,
+    duration_of,
     planned_steps,
 )
 from scvi_codegen.runs.trajectory import Trajectory
@@ -278,7 +279,7 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
         if begins_by is not None and segments is None:
             begins_by |= BY_VELOCITY * by_velocity
         else:
-            q, p = self._consistent_state(initial)
+            q, p = self._consistent_state(initial, plan)
             initial, begins_by = initial._replace(q=q, p=p, velocity=None), 0
         fixed = isinstance(plan, FixedSteps)
         growth = not (fixed and not check_growth) and measures_growth(self, plan, check_growth)
@@ -293,7 +294,7 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
             if (
                 output.times is not None and (trajectory.t[:1] != initial.t).any()
             ):  # errors are those since the initial state
-                start: Any = self._consistent_state(initial) if begins_by else initial[:2]
+                start: Any = self._consistent_state(initial, plan) if begins_by else initial[:2]
                 trajectory._initial = float(initial.t), *self._states.pair(*start)
         else:
             run._start_from(initial, begins_by, growth)
@@ -379,15 +380,15 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
     def _started(self, initial: InitialData, plan: StepPlan, noise: Noise = DEFAULT_NOISE) -> Run:
         """Return a run at its start, on the constraints."""
         stepper = self._at_tolerance(plan.tolerance) if isinstance(plan, Adaptive) else self
-        (q, p), (*_, t, parameters, options) = stepper._consistent_state(initial), initial
+        (q, p), (*_, t, parameters, options) = stepper._consistent_state(initial, plan), initial
         return Run.started(stepper, q, p, plan=plan, t=t, parameters=parameters, options=options, noise=noise)
 
-    def _consistent_state(self, initial: InitialData) -> tuple[States, States]:
+    def _consistent_state(self, initial: InitialData, plan: StepPlan) -> tuple[States, States]:
         """Return (q, p), or q and the momenta of a velocity, on the constraints."""
         q, p, velocity, t, parameters, _ = initial
         p = self._initial_momenta(q, p, velocity, t, parameters)
         if self.interface.contacts:
-            return in_first_modes(self, q, p, t, parameters)
+            return in_first_modes(self, q, p, t, parameters, duration_of(plan, t))
         if not self.interface.constraints:
             return q, p
         return consistent(self, q, p, t, parameters)
@@ -409,7 +410,8 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
 
     @property
     def _kind_of_steps(self) -> KindOfSteps:
-        return KindOfSteps(self.interface.time_transformation, self.in_tau, self.interface.words)
+        interface = self.interface
+        return KindOfSteps(interface.time_transformation, self.in_tau, interface.words, interface.has_unseen_growth)
 
     @cached_property
     def _planned(self) -> Any:

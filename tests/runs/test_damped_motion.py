@@ -27,7 +27,8 @@ SYSTEMS: dict[str, tuple[str, str, dict[str, Any]]] = {
 """Coordinates, Lagrangian and dissipation, with the parameters c, k and g."""
 TOLERANCES = (None, 1e-4, 1e-6, 1e-8, 1e-10)
 MULTIPLES = {"svi:2": 10.0, "gauss:2": 10.0, "scvi:3": 30.0}
-"""Further factors of methods whose estimates are of a lower power of the step size at tight tolerances."""
+"""Further factors of methods with many steps at tight tolerances, whose errors add up: of SVI(2) a twentieth of the
+tolerance each, at 1e-4, 1e-6 and 1e-8 alike."""
 ROUNDOFF = 1e-9
 """Largest error of runs without a tolerance, relative to the motion: low degrees take up to 1e6 steps."""
 
@@ -107,7 +108,7 @@ MANY = [
     for kind in SYSTEMS
     for method in (*(f"svi:{s}" for s in range(2, 9)), "gauss:2", "gauss:3", "scvi:3")
     for solver in ("auto", "newton")
-    if method != "scvi:3" or kind not in ("damping", "pendulum", "mass")  # refused; masses that grow are not seen
+    if method != "scvi:3" or kind not in ("damping", "pendulum")  # refused
 ]
 
 

@@ -13,6 +13,7 @@ from commands import error_of, output_of
 from exact_orbits import motion_stepper, on_an_ellipse
 from motions import MOTIONS, recorded
 from notation import lagrange
+from scipy.integrate import solve_ivp
 
 import scvi_codegen as sc
 from scvi_codegen.runs.accuracy.run_error import with_uncertainty
@@ -131,6 +132,20 @@ def test_files_pictures_and_the_command_line_show_errors(tmp_path):
     with np.load(tmp_path / "k.npz") as file:
         assert file["q_error"].shape == file["q"].shape
     assert "is not available" in error_of("run", "kepler", "--error-bars", "-o", tmp_path / "k.run", status=2)
+
+
+def test_errors_of_steps_that_no_method_resolves_are_right_or_lost():
+    """Pendulums that turn by up to 60 rad a step: single steps of any degree see nothing of the force."""
+    system = sc.LagrangianSystem.from_text("turning", ["x"], "m*(x_dot**2/2 + cos(x))", parameters={"m": 1.0})
+    stepper, random = sc.compile_stepper(system, "svi:4"), np.random.default_rng(0)
+    for _ in range(12):
+        h, x, turn = random.uniform([0.1, -3, 1], [1, 3, 60])
+        m = 2.0 ** random.choice([0, 600, -600])  # squares of momenta overflow
+        run = stepper.integrate([x], velocity=[turn / h], h=h, steps=30, parameters={"m": m})
+        args = (0, run.t[-1]), [x, turn / h], "DOP853"
+        exact = solve_ivp(lambda t, y: [y[1], -np.sin(y[0])], *args, rtol=1e-13, atol=1e-13).y[0, -1]
+        error, lost = run.q[-1, 0] - exact, run.error.lost
+        assert lost is not None or abs(run.error.q[-1, 0] - error) < abs(error) / 2 + 1e-9, f"{h}, {x}, {turn}, {m}"
 
 
 def test_lost_digits_are_reported_and_not_corrected():

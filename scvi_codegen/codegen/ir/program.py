@@ -274,6 +274,7 @@ class Program:
         rattle: the iteration for the multipliers, which is tried before Newton's method if applicable.
         damping: the rate of a uniform damping, if there is one.
         mass_growth: of masses relative to velocities; ``None`` if they are constant in time and not damped.
+        has_unseen_growth: whether masses grow in steps of accelerations, whose error estimate does not see that.
         summed: whether the action is summed also where it is no function of both ends of a step.
         acts_along: whether runs sum the action of their steps.
         bath: heat bath before and after each step of a run, or ``None``.
@@ -294,6 +295,7 @@ class Program:
     rattle: Rattle | None = None
     damping: Kernel | None = None
     mass_growth: MassGrowth | None = None
+    has_unseen_growth: bool = False
     summed: bool = False
     acts_along: bool = False
     bath: HeatBath | None = None

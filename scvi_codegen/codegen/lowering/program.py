@@ -220,6 +220,8 @@ def lower(
         rattle=rattle_of(system, stages, equations.extrapolation) if system.constraints and solver == "auto" else None,
         damping=damping_kernel(system),
         mass_growth=_mass_growth(system, stages),
+        has_unseen_growth=isinstance(stages.shape, Accelerations | ShotCurve | PrintedCurve)
+        and bool(_rates_of_masses(system, forms_of(system))),
     )
 
 
@@ -420,14 +422,11 @@ def _stage_curve(stages: StageSystem) -> StageCurve | None:
     )
 
 
-def _mass_growth(system: MechanicalSystem, stages: StageSystem) -> MassGrowth | None:
-    """Return the rates at which masses grow in steps whose unknowns are velocities; ``None`` if all are 0.
+def _rates_of_masses(system: MechanicalSystem, forms: Any) -> list[Any]:
+    """Return the rates at which masses grow, none if all are 0.
 
     Rates gamma + d log M_ii/dt of a Lagrangian, gamma - d log H_pp,ii/dt of a Hamiltonian; of an entry M_ii = 0 gamma.
     """
-    shape, forms = stages.shape, forms_of(system)
-    if not (isinstance(shape, Velocities) and _moves(stages, shape)) or forms.one_form:
-        return None
     masses = forms.legendre_jacobian or forms.mass
     diagonal = {i: entry for (i, j), entry in masses.items() if i == j} if system.depends_on_time else {}
     sign = -1 if system.auxiliaries else 1
@@ -435,7 +434,15 @@ def _mass_growth(system: MechanicalSystem, stages: StageSystem) -> MassGrowth | 
     for i, entry in diagonal.items():
         for derivative in gradient_tuple(entry, (system.time,)):
             rates[i] += sign * derivative / entry
-    if not any(rates):
+    return rates if any(rates) else []
+
+
+def _mass_growth(system: MechanicalSystem, stages: StageSystem) -> MassGrowth | None:
+    """Return the rates at which masses grow in steps whose unknowns are velocities; ``None`` if all are 0."""
+    shape, forms = stages.shape, forms_of(system)
+    if not (isinstance(shape, Velocities) and _moves(stages, shape)) or forms.one_form:
+        return None
+    if not (rates := _rates_of_masses(system, forms)):
         return None
     has_end_velocity = any((block.letter, block.index) == END_VELOCITY for block in stages.blocks)
     u, purpose = forms.legendre_arguments, "Rates of masses and damping, gamma + d log M_ii/dt."

@@ -389,6 +389,7 @@ class Interface:
         time_transformation: time-rescaling function g in dt = g dtau that determines its step sizes.
         conserves_energy: whether energy is a first integral.
         changes_energy: reason why it is not conserved; ``None`` if it is.
+        has_unseen_growth: whether the error estimate of a step does not see that masses grow.
         balances_energy: whether it changes by the work of forces or damping only.
         dissipates: whether it has contacts and cannot grow.
         arrays: declarations of arrays of known sizes, first those whose entries are the coordinates in order, then
@@ -439,6 +440,7 @@ class Interface:
     input_ranges: tuple[tuple[str, float, float], ...] = ()
     conserves_energy: bool = False
     changes_energy: str | None = None
+    has_unseen_growth: bool = False
     balances_energy: bool = False
     dissipates: bool = False
     solver: str = ""

@@ -14,6 +14,7 @@ the rounding errors of the states, u |x| with a random sign for each step of the
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -21,8 +22,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError
+from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError, StepFailedError
 from scvi_codegen.runs.accuracy.size import (
+    RESOLVED,
     first_of_groups,
     momenta_of_velocities,
     neighbouring,
@@ -34,7 +36,7 @@ from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runs.results.dense_output import parameters_set_until
 from scvi_codegen.runs.results.joining import concatenated
 from scvi_codegen.runs.results.output import ALL_STATES
-from scvi_codegen.runs.results.recomputation import steps_after
+from scvi_codegen.runs.results.recomputation import motion_by_reactions, steps_after
 from scvi_codegen.runs.results.saved_states import Array, SavedStates, parameters_on_sides, times_of_changes
 from scvi_codegen.runs.states.rotations import members_of
 from scvi_codegen.runs.states.words import low_words, with_low
@@ -55,6 +57,8 @@ ROUNDINGS = 1024.0
 """Errors of coordinates that constraints determine below so many roundings are those of rounding."""
 MOST_STEPS = 2048
 """Number of steps of one call of C."""
+COMPARED = 512
+"""One of so many steps of the finer method is compared with two steps of half its size."""
 AT_EVENT = 64.0
 """Distance of a time from that of an event, in roundings of the largest time, within which a state is that of it."""
 
@@ -73,6 +77,8 @@ class RunError:
         signed: false for errors by comparison with a run of a finer method.
         reason: why the errors are unknown from some time on, else empty.
         sizes: (2, m) sizes of positions and momenta that ``relative`` refers to.
+        proportional: number of rows up to which terms of the order of squares of errors are below a tenth of these;
+            later ones are lost, ``relative`` is 0.1 or more.
     """
 
     t: Array
@@ -84,6 +90,7 @@ class RunError:
     signed: bool = True
     reason: str = ""
     sizes: Array = field(default_factory=lambda: np.empty(0), repr=False)
+    proportional: int = sys.maxsize
     _run: Any = field(repr=False)
 
     @property
@@ -206,11 +213,16 @@ def error_of(run: Any) -> RunError:
     if _is_compared(stepper, finer):
         return _compared(run, finer)
     finer = finer.with_events(stepper.events if stepper.changes_states else ())
-    vectors, reason = _Replay(run, finer).of_run()
+    replay = _Replay(run, finer)
+    vectors, reason = replay.of_run()
     m = stepper.dimension
-    deviations = np.sqrt(np.mean(vectors[1:] ** 2, axis=0))
+    deviations = np.hypot.reduce(vectors[1:], axis=0) / math.sqrt(SAMPLES)  # squares may overflow
     errors, rounding = ([of[:m].T, of[m:].T] for of in (vectors[0], deviations))
-    return _described(run, errors, rounding, reason=reason)
+    result = _described(run, errors, rounding, reason=reason)
+    if result.relative[-1] <= math.sqrt(roundoff(1)) or not replay.is_smooth:
+        return result
+    result = replace(result, proportional=replay.rows_proportional(vectors[0]))
+    return replace(result, relative=relative_until(result, len(run))[1])
 
 
 def finer_of(stepper: Any) -> Any:
@@ -255,7 +267,7 @@ def _described(run: Any, errors: list[Array], rounding: list[Array], **others: A
 def relative_until(error: RunError, rows: int) -> tuple[Array, Array]:
     """Return (2, m) sizes of the motion in the first ``rows`` states and (rows,) running maxima of relative errors."""
     bounds = np.array([part[:rows].T for part in error.bounds])
-    is_known = np.isfinite(bounds.sum(axis=(0, 1)))
+    is_known = ~np.isnan(bounds).any(axis=(0, 1))
     if not is_known.all():
         bounds = np.where(is_known, bounds, 0.0)
     sizes = sizes_of(error._run, rows, bounds.max(axis=2))
@@ -264,6 +276,7 @@ def relative_until(error: RunError, rows: int) -> tuple[Array, Array]:
     parts = entries.max(axis=(0, 1))
     if error.reason:  # unknown from the last known state on
         parts[np.count_nonzero(np.cumsum(is_known[::-1])[::-1]) :] = np.inf
+    parts[error.proportional :] = np.maximum(parts[error.proportional :], LOST)
     return sizes, np.asarray(np.maximum.accumulate(parts))
 
 
@@ -291,9 +304,10 @@ def sizes_of(run: Any, rows: int, errors: Array) -> Array:
     if isinstance(plan, Adaptive) and plan.absolute_tolerance != ():
         absolute = absolute_tolerances(interface, m, plan.absolute_tolerance)
     t, q, p = (np.asarray(column)[:rows] for column in (run.t, run.q, run.p))
-    kinetic = momenta_of_velocities(run.stepper, t, q, p, run.parameters)
+    kinetic, firsts = momenta_of_velocities(run.stepper, t, q, p, run.parameters), first_of_groups(interface, m)
+    by_reactions = motion_by_reactions(run, t, q, p)
     q, p = (np.ascontiguousarray(column.T) for column in (q, p))
-    return sizes_of_motion(q, p, errors, kinetic, first_of_groups(interface, m), roundoff(interface.words), absolute)
+    return sizes_of_motion(q, p, errors, kinetic, by_reactions, firsts, roundoff(interface.words), absolute)
 
 
 class _Replay:
@@ -327,6 +341,45 @@ class _Replay:
             lost = known and not np.abs(self.now[0]).max() <= np.abs(self._state(self.run, slice(None))).max()
             return result, f"errors are lost: {failure}" if lost else str(failure)
         return result, ""
+
+    @property
+    def is_smooth(self) -> bool:
+        """Return whether states that are moved by their errors are states of the same equations."""
+        stepper = self.run.stepper
+        changes = stepper.changes_states or stepper.interface.kinks or stepper.interface.modes
+        return not (changes or stepper.constraints or stepper.interface.rotations or len(self.run._runs) > 1)
+
+    def rows_proportional(self, errors: Array) -> int:
+        """Return the number of first rows whose errors (2m, n) follow from those before also without linearisation.
+
+        delta' = x' - Phi(x - delta) for the flow Phi, a run at round-off: at the last row, and those of the largest
+        errors. The first row at which that differs by more than a tenth is found by bisection, as errors grow.
+        """
+        states = self._state(self.run, slice(None))
+        size = np.ptp(states, axis=0)
+        parts = relative(np.nan_to_num(np.abs(errors.T)), size)
+
+        def is_proportional(row: int) -> bool:
+            if not parts[row - 1].any() or not parts[row].any():
+                return True
+            t, end = map(float, self.run.t[row - 1 : row + 1])
+            q, p = np.split(states[row - 1] - errors[:, row - 1], 2)
+            try:
+                run = self.finer._run(q, p, plan=Adaptive(end), t=t, parameters=parameters_set_until(self.run, t))
+                moved = self._state(run._recorded(None, ALL_STATES), -1)
+            except ScviCodegenError:
+                return False
+            apart = np.abs(states[row] - moved - errors[:, row])
+            return bool(relative(apart, size).max() <= LOST * parts[row].max())
+
+        rows = len(states)
+        largest = parts.reshape(rows, 2, self.m).max(axis=2).argmax(axis=0).tolist()
+        doubtful = [row for row in (*largest, rows - 1) if row and not is_proportional(row)]
+        first, last = 0, min(doubtful, default=rows)
+        while doubtful and last - first > 1:
+            middle = (first + last) // 2
+            first, last = (middle, last) if is_proportional(middle) else (first, middle)
+        return last
 
     def _along(self, piece: Any) -> Iterator[tuple[Any, Array]]:
         """Yield indices of states, a slice or a number, and their vectors."""
@@ -369,7 +422,40 @@ class _Replay:
         """Transport the errors over single steps between two rows; return (end - begin, 1 + samples, 2m) vectors."""
         h = steps_after(piece, begin, end)
         parameters = parameters_on_sides(piece, float(piece.t[begin]))
+        if not self._resolves(piece, begin, h, parameters):
+            return np.array([self._over_one(piece, k) for k in range(begin, end)])
         return self._transport(piece.t[begin:end], h, piece.q, piece.p, slice(begin, end + 1), parameters)
+
+    def _over_one(self, piece: SavedStates, k: int) -> Array:
+        self._by_run(piece, float(piece.t[k]), piece.q[k], piece.p[k], k + 1, steps=1.0)
+        return self.now.copy()
+
+    def _resolves(self, piece: SavedStates, begin: int, h: Array, parameters: Array) -> bool:
+        """Return whether steps h of the finer method from row ``begin`` on have smaller errors than those of the run.
+
+        Of the steps in which positions and momenta change most, and one of ``COMPARED``, the errors of the finer method
+        are those beside two steps of h/2 (E. Hairer, S. P. Norsett, G. Wanner, Solving ODEs I, II.4).
+        """
+        states = self._state(piece, slice(begin, begin + len(h) + 1))
+        changes, size = np.abs(np.diff(states, axis=0)), np.ptp(states, axis=0)
+        largest = relative(changes, size).reshape(len(h), 2, self.m).max(axis=2).argmax(axis=0)
+        for k in {*largest.tolist(), *range(0, len(h), COMPARED)}:
+            t, length = float(piece.t[begin + k]), float(h[k])
+            try:
+                whole = self._stepped(states[k], t, length, parameters)
+                half = self._stepped(states[k], t, length / 2.0, parameters)
+                halves = self._stepped(half, t + length / 2.0, length / 2.0, parameters)
+            except StepFailedError:
+                return False
+            rounding = RESOLVED * self.u * (np.abs(states[k]) + np.abs(changes[k]))
+            apart, defect = np.abs(whole - halves) - rounding, np.abs(states[k + 1] - halves)
+            if relative(np.maximum(apart, 0.0), size).max() > LOST * relative(defect, size).max():
+                return False
+        return True
+
+    def _stepped(self, state: Array, t: float, h: float, parameters: Array) -> Array:
+        """Return a state after a step of the finer method."""
+        return np.concatenate(self.finer._states.pair(*self.finer.step(*np.split(state, 2), h, t, parameters)))
 
     def _transport(
         self, t: Array, h: Array, q: Array, p: Array, rows: slice, parameters: Array, steps: float = 1.0

@@ -18,7 +18,7 @@ from scvi_codegen.runs.states.validation import Array, coordinate_shapes
 RESOLVED = 64.0
 """Range in roundings of the largest value from which on a coordinate moves."""
 NOISE_OF_MOMENTA = 1e4
-"""The same of momenta, relative to the largest one: those that are conserved accumulate rounding errors."""
+"""The same of momenta, relative to the largest one, and of positions at rest by reactions: errors accumulate."""
 SAMPLES = 16
 """Number of states whose momenta without velocity are computed."""
 
@@ -44,17 +44,25 @@ def first_of_groups(interface: Interface, dimension: int) -> NDArray[np.intp]:
 
 
 def sizes_of_motion(
-    q: Array, p: Array, errors: Array, kinetic: Array, firsts: NDArray[np.intp], epsilon: float, absolute: Array | float
+    q: Array,
+    p: Array,
+    errors: Array,
+    kinetic: Array,
+    by_reactions: Array,
+    firsts: NDArray[np.intp],
+    epsilon: float,
+    absolute: Array | float,
 ) -> Array:
     """Return (2, m) sizes of positions and momenta of (m, n) states.
 
-    Positions: max(range, absolute); of a coordinate that is at rest, up to rounding, its largest value. Momenta: the
-    range, at least ``kinetic`` (m,), those of velocities, times the ratio of the size to the range of their coordinate,
-    or the least one. Of those that consist of rounding errors of others, by which ``errors`` (2, m) are as large, both
-    are the largest one.
+    Positions: max(range, absolute); of a coordinate that is at rest, up to rounding, its largest value, at least
+    ``by_reactions`` (2, m) (``motion_by_reactions``). Momenta: the range, at least ``kinetic`` (m,), those of
+    velocities, times the ratio of the size to the range of their coordinate, or the least one; at rest at least those
+    of reactions. Of those that consist of rounding errors of others, by which ``errors`` (2, m) are as large, both are
+    the largest one.
 
     Args:
-        q, p, errors, kinetic: as above.
+        q, p, errors, kinetic, by_reactions: as above.
         firsts: as of :func:`first_of_groups`.
         epsilon: largest relative rounding error.
         absolute: sizes below which errors do not matter, one number or (m,).
@@ -68,22 +76,24 @@ def sizes_of_motion(
     least_q, most_q = q.min(axis=1), q.max(axis=1)
     ranges, largest = of_groups(most_q - least_q), of_groups(np.maximum(most_q, -least_q))
     momenta = of_groups(np.maximum(np.ptp(p, axis=1), kinetic))
+    displacements, impulses = map(of_groups, by_reactions)
     resolution = RESOLVED * epsilon
-    rest = ranges <= resolution * largest
-    noise = _is_noise(ranges, errors[0], resolution)
+    rest = ranges <= resolution * np.maximum(largest, displacements)
+    rest |= _is_noise(ranges, errors[0], NOISE_OF_MOMENTA * resolution * displacements)
+    noise = _is_noise(ranges, errors[0], resolution * ranges.max(initial=0.0))
     sizes = np.where(noise, ranges.max(initial=0.0), np.where(rest, np.maximum(ranges, largest), ranges))
     sizes = np.maximum(sizes, absolute)
     with np.errstate(all="ignore"):
         ratio = np.maximum(1.0, sizes / ranges)
         least = np.fmin.reduce(ratio, initial=1.0 / epsilon)  # NaN: of 0 by 0
-        noise_of_p = _is_noise(momenta, errors[1], NOISE_OF_MOMENTA * resolution)
+        noise_of_p = _is_noise(momenta, errors[1], NOISE_OF_MOMENTA * resolution * momenta.max(initial=0.0))
         of_p = np.where(noise_of_p, momenta.max(initial=0.0), momenta) * np.where(rest | noise, least, ratio)
-    return np.array([sizes, of_p])
+    return np.where(rest, np.maximum([sizes, of_p], [displacements, impulses]), [sizes, of_p])
 
 
-def _is_noise(sizes: Array, errors: Array, resolution: float) -> NDArray[np.bool_]:
-    """Return which sizes are rounding errors of the largest one: errors are as large."""
-    return np.asarray((sizes < resolution * sizes.max(initial=0.0)) & (100.0 * errors >= sizes))
+def _is_noise(sizes: Array, errors: Array, rounding: Array | float) -> NDArray[np.bool_]:
+    """Return which sizes are rounding errors, of what the bounds ``rounding`` are those of: errors are as large."""
+    return np.asarray((sizes < rounding) & (100.0 * errors >= sizes))
 
 
 def momenta_of_velocities(stepper: Any, t: Array, q: Array, p: Array, parameters: Array) -> Array:

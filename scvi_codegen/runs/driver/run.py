@@ -123,7 +123,7 @@ class Run(Memory, AttitudeHistory, OfMethod):
         size = most if steps is None else steps
         status = short.integrate(size, save_every)
         if status == IN_DOUBT:
-            short.begin(t, *cast(Any, self.stepper)._consistent_state(initial))
+            short.begin(t, *cast(Any, self.stepper)._consistent_state(initial, self._plan))
             short.way = growth, 0
             short.call.begins_by = 0
             status = short.integrate(size, save_every)
@@ -137,7 +137,7 @@ class Run(Memory, AttitudeHistory, OfMethod):
 
     def _start_from(self, initial: InitialData, begins_by: int, growth: bool) -> None:
         """Start a run that is set up, as the initial state is given."""
-        q, p = cast(Any, self.stepper)._consistent_state(initial) if begins_by else initial[:2]
+        q, p = cast(Any, self.stepper)._consistent_state(initial, self._plan) if begins_by else initial[:2]
         self._begin(q, cast(States, p), initial.t, growth=growth)
 
     @property

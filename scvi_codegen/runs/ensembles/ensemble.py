@@ -85,9 +85,14 @@ def momenta_of_each(
 
 
 def start_of_ensemble(
-    stepper: Integrator, q: States, p: States, t: float, parameters: EnsembleParameters
+    stepper: Integrator, q: States, p: States, t: float, parameters: EnsembleParameters, durations: ArrayLike = 0.0
 ) -> tuple[Array, Array, Array]:
-    """Return (k, m) positions and momenta, projected onto constraints, and (k, number of parameters) parameters."""
+    """Return (k, m) positions and momenta, projected onto constraints, and (k, number of parameters) parameters.
+
+    Args:
+        stepper, q, p, t, parameters: of the start.
+        durations: one or (k,) as of :func:`~scvi_codegen.runs.events.contacts.in_first_modes`.
+    """
     check_inputs_given(stepper.interface, parameters)
     positions, momenta = checked_ensemble(stepper, q, p, "p")
     values = stepper._states.parameters_of_each(parameters, len(positions))
@@ -95,9 +100,9 @@ def start_of_ensemble(
         if stepper.interface.words == 1:
             positions, momenta = map(np.ascontiguousarray, (positions, momenta))
         if stepper.interface.contacts:
-            for k, value in enumerate(values):
+            for k, lasts in enumerate(np.broadcast_to(durations, len(values)).tolist()):
                 with of_trajectory(k):
-                    positions[k], momenta[k] = in_first_modes(stepper, positions[k], momenta[k], t, value)
+                    positions[k], momenta[k] = in_first_modes(stepper, positions[k], momenta[k], t, values[k], lasts)
         else:
             make_consistent(stepper, positions, momenta, t, values)
     return positions, momenta, values
@@ -269,7 +274,8 @@ class Ensemble:
         if settings.h is not None:
             t_end = None if ends is None else float(ends)
             fixed = common_steps(t0, settings.h, save_every, steps, t_end, inputs, layout.words)
-        positions, momenta, values = start_of_ensemble(stepper, q, momenta, t0, parameters)
+        durations = cast(Array, ends) - t0 if settings.h is None else settings.h
+        positions, momenta, values = start_of_ensemble(stepper, q, momenta, t0, parameters, durations)
         settings.check_range(values, positions, momenta)
         noise = Noise.checked(stepper, settings.seed, settings.metropolis, settings.trajectory, settings.inputs)
         for member in np.unique(values, axis=0) if stepper.interface.temperature is not None else ():

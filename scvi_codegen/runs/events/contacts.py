@@ -119,11 +119,14 @@ def warn_of_choices(stepper: Integrator, watch: Any) -> None:
         )
 
 
-def in_first_modes(stepper: Integrator, q: States, p: States, t: float, parameters: Parameters) -> tuple[Array, Array]:
+def in_first_modes(
+    stepper: Integrator, q: States, p: States, t: float, parameters: Parameters, duration: float
+) -> tuple[Array, Array]:
     """Return a state after the impacts of contacts that are closed, on the constraints of their first modes.
 
     Args:
         stepper, q, p, t, parameters: of the start.
+        duration: time of the run, relative to whose rounding contacts are at rest.
 
     Raises:
         ContactError: if a gap is negative, or no mode is consistent.
@@ -132,6 +135,7 @@ def in_first_modes(stepper: Integrator, q: States, p: States, t: float, paramete
     q1, p1 = (np.array(part, float) for part in stepper._states.pair(q, p))
     values = stepper._parameters(parameters)
     watch, numbers = binding.new("watch *"), [binding.pointer(part) for part in (q1, p1, values)]
+    watch.pace = abs(duration)
     status = binding.function("begin_contacts")(watch, t, *numbers, binding.workspace())
     if status:
         reason = f"the contacts are undefined at t = {t:.17g}, q = {q!r}: {REASONS[status]}"

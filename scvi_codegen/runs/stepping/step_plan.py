@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.codegen.rendering.source import Interface
-from scvi_codegen.common.errors import StateError, closest
+from scvi_codegen.common.errors import AccuracyWarning, StateError, closest, warn
 from scvi_codegen.common.validation import check_tolerance, checked_count
 from scvi_codegen.runs.states.times import steps_to
 from scvi_codegen.runs.states.validation import coordinate_shapes
@@ -22,6 +22,10 @@ ROUNDOFF_OF_TWO_WORDS = 1e-27
 """Error of a step in double-double arithmetic that a run without a tolerance may have."""
 LEAST_STEP = 4
 """Least value of ``max_step`` in roundings of the largest time."""
+UNSEEN_GROWTH = (
+    "masses depend on time, and the error estimate of adaptive steps of SCVI methods does not see how momenta grow: "
+    "errors may exceed the tolerance by any factor. Compile the system by an SVI, such as 'svi:8'"
+)
 AbsoluteTolerance: TypeAlias = float | tuple[tuple[str, float], ...]
 """Absolute tolerance of all coordinates, or those of some coordinates, arrays and rotations by name."""
 
@@ -83,6 +87,11 @@ StepPlan: TypeAlias = Fixed | Until | Adaptive | InTau
 """Step sizes of a run and the time at which it ends."""
 
 
+def duration_of(plan: StepPlan, t: float) -> float:
+    """Return the time of steps from t on: one fixed step, or all that are adaptive."""
+    return plan.h if isinstance(plan, FixedSteps) else plan.t_end - t
+
+
 def ending_at(plan: StepPlan, t_end: float) -> StepPlan:
     """Return a step plan with another target time."""
     return Until(plan.h, t_end) if isinstance(plan, FixedSteps) else replace(plan, t_end=t_end)
@@ -111,11 +120,13 @@ class KindOfSteps(NamedTuple):
         time_transformation: of the reversible controller, if there is one.
         in_tau: whether the system is one in transformed time, which has fixed steps only.
         words: number of words of the states.
+        has_unseen_growth: whether the error estimate of a step does not see that masses grow.
     """
 
     time_transformation: str | None = None
     in_tau: bool = False
     words: int = 1
+    has_unseen_growth: bool = False
 
 
 class ErrorControl(NamedTuple):
@@ -312,6 +323,8 @@ def checked_plan(kind: KindOfSteps, h: float | None, t_end: float | None, contro
     if h is None:
         if t_end is None:
             raise StateError("give either h (fixed step size) or t_end (adaptive step size); got neither")
+        if kind.has_unseen_growth:
+            warn(UNSEEN_GROWTH, AccuracyWarning)
         return control.to(t_end)
     if t_end is not None:
         raise StateError("give either h (fixed step size) or t_end (adaptive step size); got both")

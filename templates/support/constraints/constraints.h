@@ -115,10 +115,11 @@ static SELDOM void add_constraint_sizes(int forces, real t, const real *q, const
 
 /* Displacement of the heaviest body by the reactions lambda among unknowns z, h^2 |G^T lambda| / M, 0 without unknowns:
  * at rest they cancel the other forces, whose rounding remains, where positions and terms of constraints may vanish.
- * Reactions on light bodies cancel each other, too. */
-static SELDOM real displacement_by_reactions(const step_data *step, const real *z)
+ * Reactions on light bodies cancel each other, too. Their impulse, |h G^T lambda|, in *impulse. */
+static SELDOM real displacement_by_reactions(const step_data *step, const real *z, real *impulse)
 {
   real u[2 * M] = {0}, p[M], mass[MASS_ENTRIES], g[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES], force[M] = {0};
+  *impulse = 0;
   if (!z)
     return 0;
   memcpy(u, step->q0, sizeof(real) * M);
@@ -131,7 +132,8 @@ static SELDOM real displacement_by_reactions(const step_data *step, const real *
     force[CONSTRAINT_ENTRY[e][1]] += MATH(fabs)(derivative[e]) * strongest;
   }
   const real heaviest = largest_magnitude(mass, MASS_ENTRIES);
-  return heaviest > 0 ? step->h * step->h * largest_magnitude(force, M) / heaviest : 0;
+  *impulse = MATH(fabs)(step->h) * largest_magnitude(force, M);
+  return heaviest > 0 ? MATH(fabs)(step->h) * *impulse / heaviest : 0;
 }
 
 #ifndef BARE_STEPS
@@ -144,9 +146,9 @@ static inline const real *last_unknowns(const step_data *step)
 /* Largest size of positions that round as the constraints and reactions do, whatever the positions are. */
 static SELDOM real size_by_constraints(const step_data *step)
 {
-  real size[M] = {0};
+  real size[M] = {0}, impulse;
   add_constraint_sizes(ACTUAL_FORCES, step->t, step->q0, step->parameters, saddle_in(step->scratch), size);
-  return largest_magnitude(size, M) + displacement_by_reactions(step, last_unknowns(step));
+  return largest_magnitude(size, M) + displacement_by_reactions(step, last_unknowns(step), &impulse);
 }
 
 /* Displacements relative to which positions on constraints are rounded, whatever they are: those by reactions, the
@@ -157,7 +159,8 @@ static SELDOM void lengths_of_constraints(const step_data *step, real *lengths)
 {
   real g[CONSTRAINTS], rounding[CONSTRAINTS], steepest[CONSTRAINTS] = {0}, derivative[CONSTRAINT_ENTRIES], length = 0;
   real u[2 * M] = {0}, p[M], mass[MASS_ENTRIES], lightest[M] = {0}, yields[M] = {0};
-  const real by_reactions = displacement_by_reactions(step, last_unknowns(step));
+  real impulse;
+  const real by_reactions = displacement_by_reactions(step, last_unknowns(step), &impulse);
   memcpy(u, step->q0, sizeof(real) * M);
   legendre(u, step->t, step->parameters, p, mass);
   constraints(u, step->t, step->parameters, g, derivative);

@@ -122,6 +122,19 @@ static inline int is_nearby(const movement *moved, real first, real before, real
   return !(*rate > most) || moved->overall < MATH(sqrt)(REAL_EPSILON) || before <= REAL_EPSILON * first;
 }
 
+/* Displacement times impulse by the reactions among unknowns z: updates of this action times the rounding are rounding,
+ * also where all are, from rest at the origin. 0 without constraints. */
+static SELDOM real action_of_reactions(const step_data *step, const real *z)
+{
+#ifdef CONSTRAINED
+  real impulse;
+  const real displacement = displacement_by_reactions(step, z, &impulse);
+  return displacement * impulse;
+#else
+  return (void)step, (void)z, (real)0;
+#endif
+}
+
 /* Replaces the row of p1 - p0 by q0 + h sum_b beta_b z_b = q1, with p0 as a further unknown. */
 static void add_boundary(const step_data *step, newton_data *data, const real *q1, int with_jacobian, const band *shape)
 {
@@ -158,7 +171,8 @@ static int linearise(const step_data *step, newton_data *data, const band *shape
 static SELDOM void add_sizes_of_arguments(const step_data *step, const real *z, real *size)
 {
 #ifdef CONSTRAINED
-  const real by_reactions = displacement_by_reactions(step, z);
+  real impulse;
+  const real by_reactions = displacement_by_reactions(step, z, &impulse);
   add_constraint_sizes(ACTUAL_FORCES, step->t, step->q0, step->parameters, saddle_in(step->scratch), size);
   for (int i = 0; i < M; i++)
     size[i] += by_reactions;
@@ -227,7 +241,8 @@ static int newton(const step_data *step, newton_data *data, const real *q1, real
     moved = (movement){0};
     apply_update(data, &shape, step->h, p0, size_p, size_q, !*keep, &moved);
     first = k == 0 ? moved.action : first;
-    if (!q1 && !*keep && before > 0 && !is_nearby(&moved, first, before, &rate))
+    if (!q1 && !*keep && before > 0 && !is_nearby(&moved, first, before, &rate) &&
+        !(before <= REAL_EPSILON * action_of_reactions(step, data->z)))
       return STATUS(SPURIOUS_SOLUTION);
     *keep = has_converged(options, &moved, stagnations + has_stagnated(&moved, last), trials) ||
         (moved.overall < REUSE_CHANGE && moved.relative < REUSE_RATE * last);

@@ -187,7 +187,8 @@ static int terms_at(const event_step *step, const event_sample *at, contact_term
     }
     of->drift[r] = fabs(of->rate[r] - by_velocity);
     of->rounding[r] = DBL_EPSILON * (fmax(by_position, of->terms[r]) + fabs(at->t) * of->drift[r]);
-    of->size[r] = fmax(by_position, of->terms[r]) + fast * duration; /* low rebounds in long steps are above rounding */
+    /* low rebounds in long steps are above rounding; forces, which those of contacts cancel at rest, have that of b */
+    of->size[r] = fmax(by_position, of->terms[r]) + (fast + DBL_EPSILON * of->second_terms[r] * duration) * duration;
   }
   for (int k = 0; k < EVENT_CONTACTS && duration > 0.0; k++) /* rounding of bodies at rest without forces */
     for (int i = 0; i < CONTACTS[k].slips; i++)

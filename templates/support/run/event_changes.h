@@ -575,17 +575,19 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
 }
 
 #ifdef EVENT_CONTACTS
-/* First modes of contacts at a state. Gaps are measured by the least time T > 0 in which a row r changes by its size or
- * its rate, |r| = |r''| T^2 and |r'| = |r''| T, in any units; by a duration if all rows are 0. */
+/* First modes of contacts at a state. Gaps are measured by the least time T in which a row r changes by its size or
+ * its rate, |r| = |r''| T^2 and |r'| = |r''| T, in any units, above the rounding of the times of the run, as its own
+ * states at rest have rows of that size; by a duration if there is none. */
 static int begin_at(event_step *step, event_sample *at, real duration)
 {
+  const real rounding = CONTACT_LOWEST * DBL_EPSILON * (fabs(at->t) + fabs(duration));
   contact_terms of;
   real least = INFINITY;
   step->whole = 0.0;
   TRY(terms_at(step, at, &of));
   for (int r = 0; r < CONTACT_ROWS; r++) {
     const real second = fabs(of.second[r]), time = sqrt(of.size[r] / second) + of.speed[r] / second;
-    least = time > 0.0 ? fmin(least, time) : least;
+    least = time > rounding ? fmin(least, time) : least;
   }
   step->whole = step->h = isinf(least) ? duration : copysign(least, duration);
   return begin_contacts(step, at);
@@ -624,7 +626,7 @@ int NAME(begin_contacts)(event_watch *watch, real t, real *q, real *p, const rea
   memcpy(own, parameters, BYTES(PARAMETERS));
   for (int k = 0; k < EVENT_MODES; k++)
     watch->mode[k] = own[MODE_PLACE[k]];
-  return begin_at(&step, &at, 0.0);
+  return begin_at(&step, &at, watch->pace);
 }
 #endif
 
