@@ -30,6 +30,7 @@ from scvi_codegen.codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.codegen.variants import TangentVectors
 from scvi_codegen.common.errors import StateError, StepFailedError
+from scvi_codegen.common.thread_pool import StopCheck, run_jobs
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.accuracy.local_error import warn_of_large_steps
 from scvi_codegen.runs.driver.run_loop import record
@@ -37,7 +38,6 @@ from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings, mom
 from scvi_codegen.runs.ensembles.lanes import LaneRuns
 from scvi_codegen.runs.ensembles.result import OK
 from scvi_codegen.runs.ensembles.schedule import CommonSteps
-from scvi_codegen.runs.ensembles.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import Array, EnsembleParameters, States
 from scvi_codegen.runs.stepping.features import require
