@@ -11,6 +11,7 @@
     report       time at equal error, by interpolation; tables and JSON of results; plots: their pictures
     digits       double-double arithmetic, and heyoka in long double and quadruple precision
     families     families of periodic orbits, orbits a second
+    errors       run.error and error= beside the run
     tables       energy drift, time from text to the first step
     steps        time of a step: by size and threads, with derivatives, by compiler and processor
     machine      description of the machine
@@ -33,6 +34,7 @@ from benchmarks.cases.unforced import CASES
 from benchmarks.comparison import run_race
 from benchmarks.contenders.peers import PEERS
 from benchmarks.digits import run_digits
+from benchmarks.errors import run_errors
 from benchmarks.families import run_families
 from benchmarks.machine import machine
 from benchmarks.report import LEGEND, PRECISION, CaseResult, ResultTable, degree_table, header_lines
@@ -61,6 +63,7 @@ SECTIONS: Mapping[str, Callable[[Plan, ReportActivity], CaseResult | ResultTable
     "digits": run_digits,
     "drift": run_drift,
     "families": run_families,
+    "errors": run_errors,
     "first-step": run_first_steps,
     "scaling": run_scaling,
     "threads": run_threads,

@@ -174,6 +174,34 @@ int NAME(call_pieces)(NAME(call) *c, long long count, const double *t, const dou
   return status;
 }
 
+#ifdef HAS_DEFECTS
+/* Defects x[k + 1] - phi(x[k]) of `count` + 1 states x = (q, p) of another run at times t, by one step phi of size h
+ * from each, which begins at the curve of the last one. Increments of phi have low words, so that no rounding of
+ * states remains. */
+int NAME(call_defects)(NAME(call) *c, long long count, const double *t, const double *h, const double *q,
+    const double *p, double *defects)
+{
+  __typeof__(NAME(advance)) *volatile fixed = NAME(advance);
+  NAME(run) *run = c->run;
+  int status = 0;
+  for (long long k = 0; k < count && !status; k++, q += M, p += M, defects += 2 * M) {
+    if (k == 0)
+      NAME(start)(run, t[0], h[0], q, p);
+    run->t = t[k], run->t_low = 0.0, run->h = h[k];
+    memcpy(run->q, q, sizeof run->q);
+    memcpy(run->p, p, sizeof run->p);
+    memset(run->carry_q, 0, sizeof run->carry_q);
+    memset(run->carry_p, 0, sizeof run->carry_p);
+    status = fixed(run, 1, 0, c->parameters, c->options, c->t, c->q, c->p, c->iterations, c->report, c->workspace);
+    for (int i = 0; i < M; i++) {
+      defects[i] = (q[M + i] - run->q[i]) - run->carry_q[i];
+      defects[M + i] = (p[M + i] - run->p[i]) - run->carry_p[i];
+    }
+  }
+  return status;
+}
+#endif
+
 /* Advances the present trajectory by at most `steps` steps; returns 1 at its end. */
 static int NAME(call_one)(NAME(each) *c, const double *parameters, long long steps, long long *taken)
 {

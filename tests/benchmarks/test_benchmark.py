@@ -272,7 +272,7 @@ class TestCommand:
 class TestTables:
     @pytest.mark.rotated
     @pytest.mark.parametrize(
-        "section", ["scaling", "threads", "by-hand", "transforms", "newton", "derivatives", "builds", "bath"]
+        "section", ["scaling", "threads", "by-hand", "transforms", "newton", "derivatives", "builds", "bath", "errors"]
     )
     def test_times_of_steps_are_measured(self, section):
         table = bench.SECTIONS[section](bench.Plan(repeats=1, quick=True), lambda text: None)

@@ -62,7 +62,7 @@ def test_steppers_work_on_older_processors(tmp_path, level):
 def test_sanitizers_report_no_error(tmp_path):
     libraries = " ".join(map(sanitizer_library, ("libasan.so", "libubsan.so")))
     options = "detect_leaks=0:allocator_may_return_null=1"  # the interpreter keeps what it has; too much is refused
-    files = files_named("stepper", "fuzz_steppers", "constraints", "arrays_newton")
+    files = files_named("stepper", "fuzz_steppers", "constraints", "arrays_newton", "run_error")
     run_stepper_tests(tmp_path, SANITIZERS, *files, CC="gcc", LD_PRELOAD=libraries, ASAN_OPTIONS=options)
 
 

@@ -23,6 +23,8 @@ PROGRAM = "scvi-codegen "
 NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[-+]\d+)?(?!\w)")
 MAGNITUDE = re.compile(r"\de[-+]\d+")
 """One digit and a power of ten: the magnitude of an error, compared to a factor of 10."""
+UNCERTAIN = re.compile(r"(-?\d[\d.]*)\((\d+)\)(?:e([-+]\d+))?")
+"""Value with its uncertain digits, ``0.512345(12)``: values agree within both errors, which are magnitudes."""
 
 
 class Part(NamedTuple):
@@ -63,8 +65,19 @@ def run_command(command: str) -> None:
     assert result.returncode == 0, f"{command}\n{result.stdout}{result.stderr}"
 
 
+def uncertain_values(text: str) -> list[tuple[float, float]]:
+    """Return the values with uncertain digits, and their uncertainties."""
+    parts = [(value, digits, int(power or 0)) for value, digits, power in UNCERTAIN.findall(text)]
+    units = [10.0 ** (power - len(value.partition(".")[2])) for value, _, power in parts]
+    return [(float(f"{v}e{power}"), int(d) * unit) for (v, d, power), unit in zip(parts, units, strict=True)]
+
+
 def agree(message: str, printed: str) -> None:
     """Check equal words and equal numbers: to two units of the last printed digit, magnitudes to a factor of 10."""
+    for one, other in zip(*map(uncertain_values, (message, printed)), strict=True):
+        close = abs(one[0] - other[0]) <= one[1] + other[1] <= 11.0 * one[1]
+        assert close, f"{one[0]} +- {one[1]} is said, {other[0]} +- {other[1]} printed"
+    message, printed = (UNCERTAIN.sub("", text) for text in (message, printed))
     assert NUMBER.sub("#", message).split() == NUMBER.sub("#", printed).split(), f"said\n{message}\nprinted\n{printed}"
     for one, other in zip(NUMBER.findall(message), NUMBER.findall(printed), strict=True):
         if MAGNITUDE.fullmatch(one):

@@ -35,6 +35,11 @@ CONSISTENT = (
     "double *p1, double *workspace);\n"
 )
 """Declaration of the function of ``calls.h`` that only constraints of named coordinates have."""
+DEFECTS = (
+    "int NAME(call_defects)(NAME(call) *call, long long count, const double *t, const double *h, const double *q, "
+    "const double *p, double *defects);\n"
+)
+"""Declaration of that which only named coordinates in double have."""
 OPTIONAL_FUNCTIONS = frozenset(("advance_to", "set_fallback", "project"))
 """Functions that not all integrators have, HAS_.. in ``calls.h`` like the optional fields of a run."""
 
@@ -43,16 +48,17 @@ def with_calls(source: Source) -> Source:
     """Return a source of runs with the functions of calls; others unchanged."""
     if "advance" not in source.contents.functions:
         return source
-    sizes, constrained = source.contents.sizes, ""
-    if sizes and sizes.constraints and "h_low" not in source.contents.run_fields:
-        constrained = CONSISTENT
+    sizes, further, switches = source.contents.sizes, "", ""
+    if sizes and "h_low" not in source.contents.run_fields:
+        further, switches = DEFECTS, "#define HAS_DEFECTS\n"
+        if sizes.constraints:
+            further, switches = further + CONSISTENT, switches + LIMITS_ON_CONSTRAINTS
     declarations, functions = (
         re.sub(r"NAME\((\w+)\)", rf"{source.prefix}_\1", text)
-        for text in (_text("calls_declarations") + constrained, _text("calls"))
+        for text in (_text("calls_declarations") + further, _text("calls"))
     )
     present = [name for name in source.contents.functions if name in OPTIONAL_FUNCTIONS]
-    switches = "".join(f"#define HAS_{name.upper()}\n" for name in (*present, *source.contents.run_fields))
-    switches += LIMITS_ON_CONSTRAINTS if constrained else ""
+    switches += "".join(f"#define HAS_{name.upper()}\n" for name in (*present, *source.contents.run_fields))
     return replace(
         source,
         code=f"{source.code}\n{switches}{declarations}\n{functions}",

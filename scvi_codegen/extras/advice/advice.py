@@ -1,18 +1,16 @@
 """Choice of a fixed step size (and degree) for an error at the end of a run, by the errors of pilot runs.
 
 The error of a run (:mod:`scvi_codegen.runs.accuracy.run_error`) of order r is proportional to h^r, so that one run
-gives the step size h (target / error)^(1/r) of another one, whose error is computed as well: a recommended step was
-tried.
+gives the step size h (target / error)^(1/r) of another one, whose error is computed as well.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +18,7 @@ import numpy as np
 from scvi_codegen.api.checks import checks_arguments
 from scvi_codegen.api.methods import Discretisation, Method, method_from_specification
 from scvi_codegen.api.runs import without_accuracy_warnings
-from scvi_codegen.api.states import Array, States, checked_number
+from scvi_codegen.api.states import RESOLVED, States, checked_number, roundoff
 from scvi_codegen.api.systems import SYSTEM_OR_ARRAYS, MechanicalSystem
 from scvi_codegen.api.text import Html, card, grid, plain, summary
 from scvi_codegen.codegen.native.options import SolverOptions
@@ -32,9 +30,10 @@ from scvi_codegen.common.errors import (
     StepFailedError,
     UnresolvedError,
 )
-from scvi_codegen.extras.advice.size import distances_from_mean, relative_to_motion
+from scvi_codegen.extras.paths.size import largest_range
 from scvi_codegen.methods import ARGUMENTS, as_method
-from scvi_codegen.runs.accuracy.run_error import DEVIATIONS, LOST
+from scvi_codegen.runs.accuracy.run_error import DEVIATIONS, LOST, relative_until
+from scvi_codegen.runs.accuracy.size import relative
 from scvi_codegen.runs.compiler import compile_stepper
 from scvi_codegen.runs.ensembles.ensemble import momenta_of_each, start_of_ensemble
 from scvi_codegen.runs.states.validation import EnsembleParameters
@@ -46,17 +45,11 @@ DEGREES = {1: (2, 4, 6, 8, 10, 12), 2: (8, 12, 16, 20, 24, 32)}
 """Degrees, or numbers of stages, among which ``advise`` chooses, by the number of words of the states."""
 LANES, OVERHEAD = 8, {1: 3.0, 2: 25.0}
 """Numbers in a vector register, and the cost of a step beside its iterations, in iterations, by the number of words."""
-SHORT_MANTISSA = 2.0**20
-"""Steps of two words have so short a mantissa that their sums are exact; a shorter last one ends at the span."""
-SAFETY, CLOSE = 2.0, 1.1
-"""Ratio of the tolerance to the error aimed at, and of neighbouring step sizes at which the search ends."""
-FIRST, FACTOR, MOST_PARTS = 16, 4, 4**10
-"""Steps of the first pilot run, largest factor from one to the next, largest ratio of the span to a pilot run."""
-NUMBERS, FEWEST = 2**18, 2**12
-"""Numbers of positions of a pilot run, which is shorter than the span if it would have more, and its fewest steps."""
-EXPONENTIAL, FEWEST_ROWS = 4.0, 8
-"""Power of time from which on growth of errors and of rounding is exponential, as errors of regular motions are linear
-or quadratic in time, and the fewest states that show growth."""
+SAFETY, FACTOR = 2.0, 4
+"""Ratio of the tolerance to the error aimed at, and the largest factor from one number of steps to the next."""
+NUMBERS, EXPONENTIAL = 2**18, 4.0
+"""Numbers of positions of a pilot run, which is shorter than the span if it would have more; power of time from which
+on growth of errors is exponential, as errors of regular motions are linear or quadratic in time."""
 
 
 class Evidence(NamedTuple):
@@ -64,7 +57,7 @@ class Evidence(NamedTuple):
 
     Attributes:
         h: step size.
-        error: estimate of the error at the end of the span; infinite if a step failed.
+        error: error at the end of the span; infinite if a step failed.
         iterations: iterations of the solver per step.
         seconds: computing time per unit of time t.
     """
@@ -84,7 +77,7 @@ class Advice:
         steps: number of steps.
         degree: degree or number of stages of ``method``, ``None`` if it has none.
         method: recommended method: the one passed, or the one of the best degree.
-        expected_error: error of the positions at the end, relative to their distance from their mean.
+        expected_error: ``run.error.relative`` at the end: of positions and momenta, relative to their ranges.
         member: index of the trajectory that determines the step of an ensemble, ``None`` for a single state.
         evidence: pilot runs of ``method``, largest step size first.
         message: recommendation in a few sentences.
@@ -136,7 +129,7 @@ def advise(
     options: SolverOptions | None = None,
     precision: str = "double",
 ) -> Advice:
-    """Recommend the largest fixed step size with which positions at the end of a run meet a tolerance.
+    """Recommend the largest fixed step size with which a run meets a tolerance at its end.
 
     A smaller one is recommended if it needs less work in all, near the largest step at which the fixed-point iteration
     converges.
@@ -154,7 +147,7 @@ def advise(
         q, p, velocity: (m,) initial positions with one of momenta and velocities, or arrays by name; of an ensemble
             (k, m) each.
         span: duration of the run, negative to integrate backward; required.
-        tolerance: required: wanted error ``|q - q_exact| / |q - mean q|`` at the end; the step size aims at half of it.
+        tolerance: required: wanted error at the end, as ``run.error.relative``; the step size aims at half of it.
         parameters: values by name (others keep their defaults), or all in order; of an ensemble also (k,) values.
         t: initial time.
         degree: also choose the degree (or number of stages) among 2, 4, ..., 12: the one with the fewest evaluations in
@@ -188,9 +181,9 @@ def advise(
     result, failures = list[Advice](), list[StateError]()
     if precision not in ("double", "double-double"):
         raise MethodError(f"advise requires precision='double' or 'double-double', not {precision!r}")
-    compiled, words = partial(compile_stepper, precision=precision), 2 if precision == "double-double" else 1
+    words = 2 if precision == "double-double" else 1
     for candidate in _candidates(method, words) if degree else [method]:
-        for stepper in _steppers(compiled, system, candidate, solver):
+        for stepper in _steppers(system, candidate, solver, precision):
             try:
                 result.append(
                     _advised(stepper, candidate, Discretisation(system, candidate).symplectic, q, state, length, target)
@@ -220,14 +213,12 @@ def _checked_request(span: float | None, tolerance: float | None) -> tuple[float
     return length, target
 
 
-def _steppers(
-    compiled: Callable[..., Stepper], system: MechanicalSystem, method: Method, solver: str
-) -> Iterator[Stepper]:
+def _steppers(system: MechanicalSystem, method: Method, solver: str, precision: str) -> Iterator[Stepper]:
     """Yield steppers for a solver; for ``"auto"`` the fixed-point solver first, whose limit on h is best respected."""
     if solver == "auto":
         with suppress(MethodError):
-            yield compiled(system, method, solver="fixed-point")
-    yield compiled(system, method, solver=solver)
+            yield compile_stepper(system, method, solver="fixed-point", precision=precision)
+    yield compile_stepper(system, method, solver=solver, precision=precision)
 
 
 def _candidates(method: Method, words: int) -> list[Method]:
@@ -248,51 +239,6 @@ def _work(advice: Advice, words: int) -> float:
     return (row.iterations + OVERHEAD[words]) * math.ceil(points / LANES) * LANES / abs(advice.h)
 
 
-class FinalError(NamedTuple):
-    """Error |q - q_exact| / |q - mean q| of a run, from its states that have digits.
-
-    Attributes:
-        size: error at the end, at least the root mean square of the last quarter, as errors pass through zero.
-        rounding: the part of it that rounding causes.
-        duration: time of the run until digits are lost.
-        until: time of the last state before the error exceeds a tolerance.
-        growth: power of time by which the error grows.
-        tenfold: time in which rounding errors grow tenfold, infinite unless they grow exponentially.
-        at_rest: whether the motion has no size.
-    """
-
-    size: float = math.inf
-    rounding: float = 0.0
-    duration: float = 0.0
-    until: float = 0.0
-    growth: float = math.inf
-    tenfold: float = math.inf
-    at_rest: bool = False
-
-
-def final_error(run: Any, tolerance: float = 0.0, span: float = 0.0) -> FinalError:
-    """Return the error at the end of a run, or of a longer ``span`` that it is extrapolated to, by its ``error``."""
-    with np.errstate(over="ignore"):  # of chaotic motions
-        error, t = run.error, np.asarray(run.t)
-    lost = np.flatnonzero(~(error.relative < LOST))
-    rows = int(lost[0]) if len(lost) else len(t)
-    if rows < min(len(t), FEWEST_ROWS):
-        return FinalError()
-    known = np.flatnonzero(np.isfinite(error.q[:rows]).all(axis=1))
-    q, duration = np.asarray(run.q)[:rows], abs(float(t[known[-1]] - t[0]))
-    norms = [np.linalg.norm(part[known], axis=1) for part in (error.q, error.rounding_q)]
-    sizes, at_rest = [relative_to_motion(norm, q) for norm in norms], bool(distances_from_mean(q) == 0.0)
-    powers, ratio = [_power(size) for size in sizes], max(1.0, abs(span) / duration)
-    slower = min(powers)
-    tenfold = duration / 2.0 / (slower * math.log10(2.0)) if slower > EXPONENTIAL else math.inf
-    grown = [2.0 * power * (ratio - 1.0) if tenfold < math.inf else power * math.log2(ratio) for power in powers]
-    last = [max(size[-1], _rms(size[-max(1, len(size) // 4) :])) for size in sizes]
-    size, rounding = (float(x * 2.0 ** min(doublings, 1000.0)) for x, doublings in zip(last, grown, strict=True))
-    missed = np.flatnonzero(sizes[0] + DEVIATIONS * sizes[1] > tolerance)
-    until = float(t[known[max(0, int(missed[0]) - 1) if len(missed) else -1]])
-    return FinalError(size, rounding, duration, until, powers[0], tenfold, at_rest)
-
-
 def missed_tolerance(run: Any, tolerance: float) -> str:
     """Return why the error at the end of a run exceeds ``tolerance``, or is not known; ``""`` if it does not.
 
@@ -301,168 +247,147 @@ def missed_tolerance(run: Any, tolerance: float) -> str:
     if len(run) < 2:
         return ""
     try:
-        size = final_error(run).size
+        size = float(run.error.relative[-1])
     except ScviCodegenError as unknown:
         return f"the tolerance {tolerance:g} is not confirmed: {unknown}"
     remedy = "use adaptive step size (t_end, --tolerance)"
     return "" if size <= tolerance else f"the tolerance {tolerance:g} is missed: the error is {size:.1e}; {remedy}"
 
 
-def _power(errors: Array) -> float:
-    """Return the power of time by which errors grow: by their root mean squares in the second quarter and half."""
-    early, late = _rms(errors[len(errors) // 4 : len(errors) // 2]), _rms(errors[len(errors) // 2 :])
-    return math.log2(late / early) if 0.0 < early < late else 0.0
-
-
-def _rms(values: Array) -> float:
-    largest = float(values.max(initial=0.0)) or 1.0  # squares of chaotic errors overflow
-    return largest * float(np.sqrt(np.mean(np.square(values / largest)))) if len(values) else 0.0
-
-
 class _Trial(NamedTuple):
-    """Pilot run with n steps for the span, its duration, error at the end of the span, and price."""
+    """Pilot run with n steps for the span, or with the first of them.
+
+    Attributes:
+        h: step size.
+        error, rounding: relative errors at the end of the span, and the part that rounding causes; of runs that are
+            lost by the end those at the last time at which rounding alone meets the tolerance.
+        power: power of time by which the error grows.
+        duration, until: times until which digits are left, and until which the tolerance is met.
+        judged: time at which the error is judged.
+        covered: duration of the run.
+        lost: whether no digits are left at its end.
+    """
 
     n: int
-    duration: float
-    error: FinalError
+    h: float
+    error: float = math.inf
+    rounding: float = 0.0
+    power: float = 0.0
+    duration: float = 0.0
+    until: float = 0.0
+    judged: float = 0.0
+    covered: float = 0.0
+    lost: bool = True
     iterations: float = 0.0
     seconds: float = 0.0
     failure: str = ""
 
-
-class _Pilot:
-    """Pilot runs of one trajectory, from positions q and momenta p (m,), with step sizes of a method of some order."""
-
-    def __init__(self, stepper: Stepper, q: Array, p: Array, settings: dict[str, Any], aims: tuple[float, float, int]):
-        self.stepper, self.q, self.p, self.settings = stepper, q, p, settings
-        self.span, self.tolerance, self.order = aims
-        self.most, self.parts, self.trials = max(FEWEST, NUMBERS // stepper.dimension), 1, list[_Trial]()
-
-    def step(self, n: float) -> float:
-        """Return the step size of n steps."""
-        mantissa, exponent = math.frexp(self.span / n)
-        if self.stepper.interface.words > 1:
-            mantissa = math.trunc(mantissa * SHORT_MANTISSA) / SHORT_MANTISSA
-        return math.ldexp(mantissa, exponent)
-
-    def aim(self, error: FinalError) -> float:
-        """Return half of the tolerance, at least twice the error of rounding, which no step size reduces."""
-        return max(self.tolerance / SAFETY, SAFETY * error.rounding)
-
-    def is_good(self, trial: _Trial) -> bool:
-        """Return whether the error of a pilot run is at most the one aimed at."""
-        return trial.error.size <= self.aim(trial.error)
-
-    @property
-    def coarse(self) -> int:
-        """Largest number of steps whose error is larger than the one aimed at, 0 if there is none."""
-        return max((trial.n for trial in self.trials if not self.is_good(trial)), default=0)
-
-    @property
-    def good(self) -> list[_Trial]:
-        """Pilot runs with errors as aimed at, as those of all smaller steps, largest step first."""
-        return sorted(trial for trial in self.trials if trial.n > self.coarse)
-
-    def run(self, n: int) -> _Trial:
-        """Return a run with n steps for the span, or with those of its beginning."""
-        h, steps, began = self.step(n), -(-n // self.parts), time.perf_counter()
-        try:
-            run = self.stepper.integrate(self.q, self.p, h=h, steps=steps, **self.settings)
-            seconds, iterations = time.perf_counter() - began, float(run.iterations.sum()) / steps
-            error = final_error(run, self.tolerance, self.span)
-            result = _Trial(n, abs(h) * steps, error, iterations, seconds)
-        except StepFailedError as failure:
-            error = FinalError(duration=abs(failure.t - self.settings["t"]))
-            result = _Trial(n, abs(h) * steps, error, 0.0, time.perf_counter() - began, failure.status)
-        self.trials.append(result)
-        return result
-
-    def search(self, n: int) -> bool:
-        """Run with numbers of steps until the error is half of the tolerance; return False at rest."""
-        while True:
-            trial, coarser = self.run(n), [k for k in self.trials[-2:-1] if k.n < n]
-            error, aim = trial.error, self.aim(trial.error)
-            if error.at_rest:
-                return False
-            if self.parts > MOST_PARTS or (coarser and self.breaks_off(coarser[0], trial)):
-                raise self.unresolved
-            best, worst = [float(k.n) for k in self.good[:1]], self.coarse
-            if best and (best[0] <= CLOSE * worst or (n == best[0] and error.size >= aim / SAFETY)):
-                return True
-            change = (error.size / (0.9 * aim)) ** (1.0 / self.order)
-            n = math.ceil(n * min(max(change, 1.0 / FACTOR), FACTOR))
-            if not worst < n < (best or [math.inf])[0]:
-                n = max(1, math.ceil(math.sqrt(worst * best[0]))) if best else FACTOR * worst
-            if n in [k.n for k in self.trials]:
-                return True
-            if n > self.parts * self.most * (FACTOR if error.size < LOST or error.growth <= EXPONENTIAL else 1):
-                if error.size < LOST or error.rounding > self.tolerance:
-                    return True
-                self.parts *= FACTOR
-
-    def breaks_off(self, coarser: _Trial, trial: _Trial) -> bool:
-        """Return whether digits are lost at once: with a smaller step, or after a time that longer steps reach.
-
-        Such a motion has an encounter, or ends in a singularity; that of a chaotic one loses its digits by and by.
-        """
-        lost, error = coarser.error, trial.error
-        if lost.size < LOST <= error.size:
-            return True
-        late = coarser.duration > 2.0 * trial.duration and lost.duration >= trial.duration
-        return late and error.tenfold == math.inf and (bool(coarser.failure) or lost.growth > EXPONENTIAL)
-
-    @property
-    def unresolved(self) -> UnresolvedError:
-        """Error of a motion that no pilot run resolves."""
-        trial = self.trials[-1]
-        return UnresolvedError(
-            f"no pilot run over t = {trial.duration:.3g} is accurate, with step sizes down to "
-            f"{abs(self.step(trial.n)):.3g}: the solution may end in a singularity or have a close encounter; use "
-            "adaptive step size (t_end, --tolerance), or a shorter span"
+    def aim(self, tolerance: float) -> float:
+        """Return half of the tolerance, or what rounding leaves of it, at least twice the error of rounding."""
+        return max(
+            tolerance / SAFETY, min(SAFETY * self.rounding, tolerance if self.rounding < tolerance else math.inf)
         )
 
-
-class _Choice(NamedTuple):
-    """Number of steps for the span, expected error at its end, warnings, and whether the step was tried."""
-
-    n: int
-    error: float
-    warnings: tuple[str, ...] = ()
-    tried: bool = True
+    @property
+    def tenfold(self) -> float:
+        """Time in which errors grow tenfold, infinite unless they grow exponentially."""
+        return math.inf if self.power <= EXPONENTIAL else self.judged / 2.0 / (self.power * math.log10(2.0))
 
 
-def _choose(pilot: _Pilot) -> _Choice:
-    """Return the step with the least work of those that meet the tolerance, or whose error is that of rounding."""
-    trial, overhead = max(pilot.trials), OVERHEAD[pilot.stepper.interface.words]
-    if pilot.good:
-        trial = min(pilot.good, key=lambda k: k.n * (k.iterations + overhead))
-    warnings = tuple(_warnings(pilot, trial))
-    if pilot.good or trial.error.rounding > pilot.tolerance:
-        return _Choice(trial.n, min(1.0, trial.error.size), warnings)
-    if not trial.error.size < LOST:
-        raise pilot.unresolved
-    aim, coarser = pilot.aim(trial.error), [k for k in pilot.trials if k.n < trial.n]
-    if coarser and coarser[-1].error.size > trial.error.size * (trial.n / coarser[-1].n) ** (pilot.order / 2.0):
-        n = trial.n * (trial.error.size / aim) ** (1.0 / pilot.order)
-        return _Choice(math.ceil(n), aim, warnings, tried=False)
-    words = f"the tolerance may be missed: the errors of runs with steps down to {abs(pilot.step(trial.n)):.3g} do not "
-    return _Choice(trial.n, trial.error.size, (*warnings, f"{words}follow the order of the method yet"))
+class _Pilot(NamedTuple):
+    """Pilot runs of one trajectory, of at most so many steps."""
+
+    most: int
+    stepper: Stepper
+    q: Any
+    p: Any
+    settings: dict[str, Any]
+    span: float
+    tolerance: float
+    order: int
+
+    def tried(self, n: int) -> _Trial:
+        """Return the run with n steps for the span, or with the first of them; StateError for a motion at rest."""
+        h, steps, began = self.span / n, min(n, self.most), time.perf_counter()
+        if self.stepper.interface.words > 1:  # sums of short mantissas are exact
+            mantissa, exponent = math.frexp(h)
+            h = math.ldexp(float(np.float32(mantissa)), exponent)
+        try:
+            run = self.stepper.integrate(self.q, self.p, h=h, steps=steps, **self.settings)
+        except StepFailedError as failure:
+            lasted = abs(failure.t - self.settings["t"])
+            return _Trial(n, h, covered=abs(h) * steps, duration=lasted, failure=failure.status)
+        price = {"seconds": (time.perf_counter() - began) / abs(h * steps), "iterations": run.iterations.sum() / steps}
+        if largest_range(np.asarray(run.q)) <= RESOLVED * roundoff(1) * np.abs(np.asarray(run.q)).max():
+            raise StateError(
+                f"the motion is at rest over t = {abs(h) * steps:.3g}: errors relative to its size are undefined; give "
+                "an initial state that moves, or choose h below the shortest period"
+            )
+        with np.errstate(over="ignore"):  # of chaotic motions
+            return self.judged(run, _Trial(n, h, covered=abs(h) * steps, **price))
+
+    def judged(self, run: Any, trial: _Trial) -> _Trial:
+        """Return a pilot run with its errors."""
+        error, t = run.error, np.abs(np.asarray(run.t) - run.t[0])
+        lost = not error.relative[-1] < LOST
+        rows = int(np.flatnonzero(error.relative < LOST)[-1]) + 1
+        sizes, errors = relative_until(error, rows)
+        deviations = DEVIATIONS * np.stack([error.rounding_q, error.rounding_p], axis=1)
+        roundings = np.maximum.accumulate(np.nan_to_num(relative(deviations, sizes).max(axis=(1, 2)))[:rows])
+        row = int(np.flatnonzero(SAFETY * roundings <= self.tolerance)[-1]) if lost else rows - 1
+        half = int(np.searchsorted(t, t[row] / 2.0))
+        powers = [math.log2(max(1.0, x[row] / x[half])) if x[half] else 0.0 for x in (errors, roundings)]
+        ratio = 1.0 if lost else max(1.0, abs(self.span) / t[row])
+        power = powers[1] if lost else powers[0]  # neighbours leave each other as rounding errors grow
+        grown = [k * (2.0 * (ratio - 1.0) if power > EXPONENTIAL else math.log2(ratio)) for k in powers]
+        ends = [float(x[row]) * 2.0 ** min(k, 1000.0) for x, k in zip((errors, roundings), grown, strict=True)]
+        if not lost and ends[1] >= LOST:  # rounding alone exceeds it later: the run is judged as far as it goes
+            lost, power, ends = True, powers[1], [float(errors[row]), float(roundings[row])]
+        if lost and (row == 0 or row == rows - 1 < len(t) - 1):  # errors are those of the steps, not of rounding
+            ends[0] = math.inf
+        met = np.flatnonzero(errors <= self.tolerance)[-1]
+        times: Any = {name: float(t[k]) for name, k in (("duration", rows - 1), ("judged", row), ("until", met))}
+        return trial._replace(error=ends[0], rounding=ends[1], power=power, lost=lost, **times)
+
+    def trials(self, n: int) -> list[_Trial]:
+        """Return runs with numbers of steps, from n on, until the error is half of the tolerance."""
+        trials: list[_Trial] = []
+        while n not in [k.n for k in trials]:
+            trials.append(trial := self.tried(n))
+            worst = max((k.n for k in trials if k.error > k.aim(self.tolerance)), default=0)
+            best = min((k.n for k in trials if k.n > worst), default=0)
+            aim = trial.aim(self.tolerance) / math.sqrt(SAFETY)
+            if best and (best <= SAFETY ** (1.0 / self.order) * worst or (n == best and trial.error * SAFETY >= aim)):
+                break
+            n = math.ceil(n * min(max((trial.error / aim) ** (1.0 / self.order), 1.0 / FACTOR), FACTOR))
+            if not worst < n < (best or math.inf):
+                n = max(1, math.ceil(math.sqrt(worst * best))) if best else FACTOR * worst
+            if n > self.most and not best:
+                if any(k.error < LOST and not k.lost for k in trials):
+                    break
+                # Digits are lost at once at an encounter or a singularity, by and by where neighbours diverge.
+                at_once = trial.until > (1.0 - 1.0 / FACTOR**2) * trial.duration
+                before = trials[-2].duration if len(trials) > 1 and trials[-2].failure else math.inf
+                fails = trial.failure and 0.0 < before < math.inf and FACTOR * trial.duration <= (FACTOR + 1) * before
+                if (at_once and trial.lost and not trial.failure) or fails or n > self.most**2:
+                    raise UnresolvedError(
+                        f"no pilot run over t = {trial.covered:.3g} is accurate, with step sizes down to "
+                        f"{abs(trial.h):.3g}: the solution may end in a singularity or have a close encounter; use "
+                        "adaptive step size (t_end, --tolerance), or a shorter span"
+                    )
+        return trials
 
 
-def _warnings(pilot: _Pilot, trial: _Trial) -> Iterator[str]:
+def _warnings(trial: _Trial, tolerance: float, span: float) -> Iterator[str]:
     """Yield warnings about conditions that prevent, or may prevent, the tolerance from being met."""
-    error = trial.error
-    chaos = f"neighbouring trajectories diverge tenfold every {error.tenfold:.3g} units of time (chaos)"
-    if SAFETY * error.rounding <= pilot.tolerance:
-        if error.tenfold < math.inf and pilot.parts > 1:
-            yield f"{chaos}, at an uncertain rate later"
-        elif error.growth > EXPONENTIAL and pilot.parts > 1:
-            yield f"errors grew like t^{error.growth:.1f} in the pilot run, a rate that may not continue"
-    elif error.tenfold < math.inf:
+    chaos = f"neighbouring trajectories diverge tenfold every {trial.tenfold:.3g} units of time (chaos)"
+    if trial.lost:
         yield f"the tolerance cannot be met: {chaos}, so round-off alone exceeds it"
-        yield f"the recommended step meets it until t = {error.until:.4g}"
-    else:
-        yield f"round-off alone causes an error of about {error.rounding:.1g} at the end, for any step size"
+        yield f"the recommended step meets it until t = {trial.until:.4g}"
+    elif trial.error > tolerance and SAFETY * trial.rounding > trial.error:
+        yield f"round-off alone causes an error of about {trial.rounding:.1g} at the end, for any step size"
+    elif trial.tenfold < math.inf and trial.covered < 0.9 * abs(span):
+        yield f"{chaos}, at an uncertain rate later"
 
 
 def _advised(
@@ -473,34 +398,34 @@ def _advised(
     Of an ensemble the step is found for one trajectory, and the errors of all with that step are computed; if another
     one misses the tolerance, a smaller step is found for that.
     """
-    aims, settings = (span, tolerance, method.order or 1), {"t": state["t"], "options": state["options"]}
+    settings, n, done = {"t": state["t"], "options": state["options"]}, FACTOR**2, set[int]()
+    most = NUMBERS // stepper.dimension
     starts, together = _starts(stepper, q, state)
-    n, members, done = FIRST, list(range(len(starts))), set[int]()
+    members, at_rest = list(range(len(starts))), StateError(f"all {len(starts)} trajectories are at rest")
     while members:
         member = members.pop(0)
-        one, other, own = starts[member]
-        pilot = _Pilot(stepper, one, other, {**settings, "parameters": own}, aims)
-        if not pilot.search(n):
+        q, p, own = starts[member]
+        pilot = _Pilot(most, stepper, q, p, {**settings, "parameters": own}, span, tolerance, method.order or 1)
+        try:
+            trials = pilot.trials(n)
+        except StateError as failure:
+            at_rest = at_rest if together else failure
             continue
-        result = _described(pilot, method, symplectic, member if together else None)
+        result = _described(pilot, trials, method, symplectic, member if together else None)
         if not together:
             return result
         done.add(member)
-        steps = min(-(-result.steps // pilot.parts), max(FEWEST, round(pilot.most / math.sqrt(len(starts)))))
+        steps = min(result.steps, max(FACTOR, most // len(starts)))
         runs = stepper.integrate_ensemble(*together[:2], h=result.h, steps=steps, parameters=together[2], **settings)
-        errors = [final_error(runs[j], tolerance, span).size if runs.ok[j] else math.inf for j in range(len(starts))]
+        errors = [float(runs[j].error.relative[-1]) if runs.ok[j] else math.inf for j in range(len(starts))]
         worst = int(np.argmax(errors))
         if errors[worst] <= tolerance or worst in done:
             return result
         members, n = [worst], result.steps
-    which = f"all {len(starts)} trajectories are" if together else "the motion is"
-    raise StateError(
-        f"{which} at rest over t = {pilot.trials[-1].duration:.3g}: errors relative to its size are undefined; give an "
-        "initial state that moves, or choose h below the shortest period"
-    )
+    raise at_rest
 
 
-def _starts(stepper: Stepper, q: States, state: dict[str, Any]) -> tuple[list[tuple[Array, Array, Any]], Any]:
+def _starts(stepper: Stepper, q: States, state: dict[str, Any]) -> tuple[list[tuple[Any, Any, Any]], Any]:
     """Return (m,) positions and momenta with parameters of each trajectory; and (k, m) those of an ensemble."""
     t, parameters = state["t"], state["parameters"]
     q, p, velocity = stepper._states.start(q, state["p"], state["velocity"])
@@ -513,41 +438,40 @@ def _starts(stepper: Stepper, q: States, state: dict[str, Any]) -> tuple[list[tu
     return [(x, y, by_name(values)) for x, y, values in zip(*together, strict=True)], together
 
 
-def _described(pilot: _Pilot, method: Method, symplectic: bool, member: int | None) -> Advice:
-    """Return the recommendation in numbers and words."""
-    choice = _choose(pilot)
-    h, specification, trials = pilot.step(choice.n), method.specification(), sorted(pilot.trials)
-    steps = choice.n if pilot.stepper.interface.words == 1 else math.ceil(pilot.span / h)
-    degree = specification.get("degree", specification.get("stages"))
-    nearest = min(trials, key=lambda trial: abs(math.log(trial.n / choice.n)))
-    sentences = list(_sentences(pilot, choice, nearest, member))
+def _described(pilot: _Pilot, trials: list[_Trial], method: Method, symplectic: bool, member: int | None) -> Advice:
+    """Return the step with the least work of those that meet the tolerance, in numbers and words."""
+    tolerance, specification = pilot.tolerance, method.specification()
+    overhead, trials = OVERHEAD[pilot.stepper.interface.words], sorted(trials)
+    worst = max((k.n for k in trials if k.error > k.aim(tolerance)), default=0)
+    good = [k for k in trials if k.n > worst]
+    trial = min(good or trials[-1:], key=lambda k: k.n * (k.iterations + overhead))
+    n, h, error = trial.n, trial.h, min(1.0, trial.error) if not trial.lost else 1.0
+    sentences = [f"The pilot runs covered {trial.covered:.4g} of {abs(pilot.span):.4g}, where errors grew "]
+    sentences[0] += f"like t^{trial.power:.1f}." if trial.tenfold == math.inf else "exponentially."
+    if trial.covered >= (1.0 - 0.5**10) * abs(pilot.span):
+        sentences = ["The pilot runs covered the whole span."]
+    if member is not None:
+        sentences.append(f"Trajectory {member} (from 0) of the ensemble has the largest error.")
+    if not good:
+        error = trial.aim(tolerance)
+        n = math.ceil(n * (trial.error / error) ** (1.0 / pilot.order))
+        h = pilot.span / n
+        sentences.append(f"So small a step was not tried: the error is extrapolated by order {pilot.order}.")
+    if failing := [k for k in trials if k.failure]:
+        sentences.append(f"The solver fails at a step size of {abs(failing[-1].h):.3g}: {failing[-1].failure}.")
     if symplectic:
         sentences.append("The method is symplectic only at this fixed step size.")
+    steps = n if pilot.stepper.interface.words == 1 else math.ceil(pilot.span / h)
+    degree = specification.get("degree", specification.get("stages"))
+    message = f"{steps} steps of {h:.6g} by {method.name}, for an expected error of {error:.1g}. {' '.join(sentences)}"
     return Advice(
         h=h,
         steps=steps,
         degree=degree if isinstance(degree, int) else None,
         method=method,
-        expected_error=choice.error,
-        evidence=tuple(Evidence(pilot.step(k.n), k.error.size, k.iterations, k.seconds / k.duration) for k in trials),
-        message=f"{steps} steps of {h:.6g} by {method.name}, {' '.join(sentences)}",
-        warnings=choice.warnings,
+        expected_error=error,
+        evidence=tuple(Evidence(k.h, k.error, float(k.iterations), k.seconds) for k in trials),
+        message=message,
+        warnings=tuple(_warnings(trial, tolerance, pilot.span)),
         member=member,
     )
-
-
-def _sentences(pilot: _Pilot, choice: _Choice, nearest: _Trial, member: int | None) -> Iterator[str]:
-    yield f"for an expected error of {choice.error:.1g}."
-    if pilot.parts == 1:
-        yield "The pilot runs covered the whole span."
-    else:
-        growth = f"like t^{nearest.error.growth:.1f}" if nearest.error.tenfold == math.inf else "exponentially"
-        yield f"The pilot runs covered {nearest.duration:.4g} of {abs(pilot.span):.4g}, where errors grew {growth}."
-    if member is not None:
-        yield f"Trajectory {member} (from 0) of the ensemble has the largest error."
-    if not choice.tried:
-        yield f"So small a step was not tried: the error is extrapolated by order {pilot.order}."
-    failing = [trial for trial in pilot.trials if trial.failure]
-    if failing:
-        worst = max(failing)
-        yield f"The solver fails at a step size of {abs(pilot.step(worst.n)):.3g}: {worst.failure}."

@@ -24,6 +24,7 @@ from scvi_codegen.codegen.native.binding import Binding
 from scvi_codegen.codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.codegen.variants import TangentVectors
 from scvi_codegen.common.errors import StateError, StepFailedError
+from scvi_codegen.common.thread_pool import StopCheck, run_jobs
 from scvi_codegen.extras.chaos.indicators import MOST as LARGEST_CHUNK
 from scvi_codegen.extras.chaos.indicators import (
     SERIES,
@@ -38,7 +39,6 @@ from scvi_codegen.runs.ensembles.ensemble import Ensemble, momenta_of_each, star
 from scvi_codegen.runs.ensembles.lanes import LaneRuns
 from scvi_codegen.runs.ensembles.result import OK
 from scvi_codegen.runs.ensembles.schedule import CommonSteps
-from scvi_codegen.runs.ensembles.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import EnsembleParameters
 from scvi_codegen.runs.stepping.integrator import Integrator

@@ -179,7 +179,7 @@ class FamilyPoint:
     @cached_property
     def others(self) -> NDArray[np.complex128]:
         """Stability indices, or multipliers, but those at 1 of motions that are shifted in time or by a symmetry."""
-        orbit, autonomous = self.orbit, not math.isnan(self.orbit.trivial_error)
+        orbit, autonomous = self.orbit, self.orbit.autonomous
         values = orbit.stability_indices if self.symplectic else orbit.multipliers
         trivial = self.conserved if self.symplectic else max(self.conserved, int(autonomous))
         return values[np.argsort(np.abs(values - 1.0))][trivial:]
@@ -340,7 +340,7 @@ class Continuation:
         """Return the change from an orbit to the nearest start on another one, but along the former."""
         size, orbit = 2 * self.search.stepper.dimension, point.orbit
         t, state, duration = orbit.t, point.y[:size], orbit.period
-        if math.isnan(first.orbit.trivial_error):  # time is no matter of choice
+        if not first.orbit.autonomous:  # time is no matter of choice
             return self._away(first, point.y)
         for _ in range(2):  # among states along the orbit, and among those beside the nearest one
             times, states = _states_along(orbit, t, state, duration)
@@ -353,7 +353,7 @@ class Continuation:
     def shifted(self, before: FamilyPoint, after: FamilyPoint) -> FamilyPoint:
         """Return a point with its start in the middle between impacts, if one is near the start."""
         stepper, orbit, size = self.search.stepper, after.orbit, 2 * self.search.stepper.dimension
-        if not stepper.divides_steps or self.search.fixed_indices or math.isnan(orbit.trivial_error):
+        if not stepper.divides_steps or self.search.fixed_indices or not orbit.autonomous:
             return after
         runs = [point.orbit.run() for point in (before, after)]
         ends = np.concatenate([*(event.t for event in runs[1].events), *(kind.t for kind in runs[1].transitions)])

@@ -30,14 +30,23 @@ from scvi_codegen.extras.fits.measurements import state_names
 from scvi_codegen.extras.orbits.continuation import Continuation, FamilyPoint, Formula
 from scvi_codegen.extras.orbits.equilibrium import Equilibrium
 from scvi_codegen.extras.orbits.reversor import Reversor
-from scvi_codegen.extras.orbits.solver import OrbitSearch, PeriodicOrbit, bound_of, checked_part, gains_of, indices_of
+from scvi_codegen.extras.orbits.solver import (
+    ErrorsOfOrbit,
+    OrbitSearch,
+    PeriodicOrbit,
+    bound_of,
+    checked_part,
+    gains_of,
+    indices_of,
+)
 from scvi_codegen.extras.orbits.step_sequence import StepSequence
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runs.stepper import Stepper
 
 SAME_ORBIT = 1e-6
 """Relative distance, far above errors of orbits, from which an orbit of a file is another one than the recomputed."""
-OF_ORBITS = tuple(name for name in PeriodicOrbit.__dataclass_fields__ if name not in ("stepper", "sequence", "options"))
+OTHERS = ("stepper", "sequence", "options", "errors")
+OF_ORBITS = tuple(name for name in PeriodicOrbit.__dataclass_fields__ if name not in OTHERS)
 """Fields of orbits that are saved as they are."""
 OF_SEARCHES = ("fixed_indices", "energy", "gain", "drifts", "at_rest")
 OF_POINTS = ("step", "largest", "of_both", "accuracy")
@@ -195,6 +204,8 @@ class Family:
         """
         names, continuation = (*OF_ORBITS, "energy", "multipliers", "stable"), self._continuation
         arrays: dict[str, Any] = {name: np.array([getattr(orbit, name) for orbit in self.orbits]) for name in names}
+        for name in ("signed", "bounds", "reason"):
+            arrays[f"{name}_errors"] = np.array([getattr(orbit.errors, name) for orbit in self.orbits])
         arrays["ends"] = np.concatenate([orbit.sequence.ends for orbit in self.orbits])
         arrays["tolerance"] = np.array([orbit.sequence.tolerance for orbit in self.orbits], dtype=float)
         arrays["bifurcations"] = np.array([bifurcation.after for bifurcation in self.bifurcations], dtype=np.intp)
@@ -386,7 +397,10 @@ def _orbits_of(arrays: Mapping[str, Any], stepper: Stepper, options: SolverOptio
         sequence = StepSequence(ends, None if math.isnan(tolerance) else float(tolerance))
         values = {name: arrays[name][k] for name in OF_ORBITS}
         numbers = {name: value if value.ndim else value.item() for name, value in values.items()}
-        yield PeriodicOrbit(stepper=stepper, sequence=sequence, options=options, **numbers)
+        errors = ErrorsOfOrbit(
+            signed=arrays["signed_errors"][k], bounds=arrays["bounds_errors"][k], reason=str(arrays["reason_errors"][k])
+        )
+        yield PeriodicOrbit(stepper=stepper, sequence=sequence, options=options, errors=errors, **numbers)
 
 
 def _equal_steps_of(start: PeriodicOrbit | Equilibrium) -> StepSequence | None:

@@ -1,9 +1,9 @@
 """Periodic orbits: Newton's iteration on the state after one period, with the exact monodromy matrix.
 
 The steps of a period are equal, or chosen adaptively and then frozen relative to the period while Newton's method
-iterates. A run of more steps that end at other times confirms the closure: with its defect d, of the end minus the
-start, and the Jacobian A of the closing equations, -A^+ d is the distance to the orbit of the finer steps, the
-discretisation error of the orbit.
+iterates. The error of a run from the start of an orbit (:mod:`scvi_codegen.runs.accuracy.run_error`) gives the end x of
+the exact motion: with its defect d, x minus the start, and the Jacobian A of the closing equations, A^+ d is the error
+of the orbit, computed minus exact, up to its square.
 
 Where tangent vectors grow along the guess, the period is cut into segments first (multiple shooting).
 
@@ -61,6 +61,7 @@ from scvi_codegen.extras.orbits.constraint_manifold import reduction_of
 from scvi_codegen.extras.orbits.reversor import Reversor
 from scvi_codegen.extras.orbits.step_sequence import StepSequence
 from scvi_codegen.extras.paths.size import SizeOfMotion
+from scvi_codegen.runs.accuracy.run_error import finer_of, with_uncertainty
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runs.states.layout import InitialData
 from scvi_codegen.runs.states.times import steps_within
@@ -76,8 +77,6 @@ ERROR, ERROR_OF_EQUAL_STEPS = 1e-9, 1e-6
 """Default bounds of the discretisation error, of adaptive steps and of those that the user chose."""
 TOLERANCES = (1e-2, 1e-4, 0.0)
 """Local tolerances of adaptive steps, relative to the bound of the discretisation error, until one meets it."""
-TRIVIAL = 1e-3
-"""Deviation of the trivial stability index from 1 that is reported."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -95,12 +94,11 @@ class PeriodicOrbit:
             constraint manifold, with 2 rows fewer for each holonomic constraint.
         residual: largest entry of the end minus the start, of the computed map; of symmetric orbits (x - R x)/2 of the
             state x after half a period.
-        error: discretisation error of the orbit: the distance to the orbit of a run with 2.6 times as many steps, which
-            end at other times. It is the largest of three relative errors: of the positions and of the momenta at the
-            start, with their rounding errors, relative to the largest range of a position and the largest momentum of a
-            velocity over the orbit, and of the period.
-        trivial_error: deviation from 1 of the stability index (of steps that are not symplectic: the multiplier)
-            nearest to 1, where motions that are shifted in time make it 1; NaN if the system depends on time.
+        error: largest of three relative errors, with those of rounding: of the positions and of the momenta at the
+            start, relative to the largest range of a position and the largest momentum of a velocity over the orbit,
+            and of the period; infinite where they are unknown.
+        errors: errors of the start and of the period, by those of a run from it (``run.error``).
+        autonomous: whether motions that are shifted in time are motions, too, so that a multiplier is 1.
         iterations: number of Newton iterations.
         parameters: (k,) in the order of ``stepper.parameters``.
         stepper: the compiled integrator.
@@ -114,7 +112,8 @@ class PeriodicOrbit:
     monodromy: Array
     residual: float
     error: float
-    trivial_error: float
+    errors: ErrorsOfOrbit = field(repr=False)
+    autonomous: bool
     iterations: int
     parameters: Array
     stepper: Stepper = field(repr=False)
@@ -122,6 +121,13 @@ class PeriodicOrbit:
     options: SolverOptions | None = field(default=None, repr=False)
 
     __repr__ = summary("q", "p", "period", "steps", "error")
+
+    def __str__(self) -> str:
+        """Return start and period, with the uncertain digits in parentheses."""
+        names, values = [*state_names(self.stepper), "period"], [*self.q, *self.p, self.period]
+        rows = zip(names, values, self.errors.bounds, strict=True)
+        lines = [f"{name} = {with_uncertainty(value, bound)}" for name, value, bound in rows]
+        return "\n".join([*lines, f"relative error {self.error:.1e}", *filter(None, [self.errors.reason])])
 
     def run(self, *, save_every: int = 1) -> Trajectory:
         """Return the trajectory of one period, every ``save_every``-th state; of adaptive steps a new adaptive run."""
@@ -145,6 +151,37 @@ class PeriodicOrbit:
         """
         values = np.linalg.eigvals(self.monodromy).astype(complex)
         return values[np.argsort(-np.abs(values))]
+
+    @cached_property
+    def monodromy_error(self) -> Array:
+        """(2m, 2m) error of the monodromy matrix with its sign, by steps of a finer method along the exact orbit.
+
+        Raises:
+            MethodError: if the stepper has no finer method (it was loaded without its system).
+        """
+        finer = finer_of(self.stepper).with_events(self.stepper.events if self.stepper.changes_states else ())
+        rest: dict[str, Any] = {"sequence": self.sequence, "fixed_indices": (), "energy": None, "options": self.options}
+        exact = np.concatenate([self.q, self.p, [self.period]]) - np.nan_to_num(self.errors.signed)
+        z, none = exact[:-1], np.zeros(len(self.q))
+        search = OrbitSearch.at(
+            finer,
+            z[: len(none)],
+            period=self.period,
+            gain=none,
+            drifts=none > 0,
+            t=self.t,
+            parameters=self.parameters,
+            **rest,
+        )
+        segment = search._segment(z, self.sequence, 0, len(self.sequence), float(exact[-1]))
+        return self.monodromy - search.leaving(segment, z) @ segment.monodromy
+
+    @cached_property
+    def multiplier_errors(self) -> NDArray[np.complex128]:
+        """(2m,) errors of the multipliers, each minus the nearest one of the monodromy matrix without its error."""
+        exact = list(np.linalg.eigvals(self.monodromy - self.monodromy_error))
+        nearest = (exact.pop(int(np.argmin(np.abs(np.array(exact) - value)))) for value in self.multipliers)
+        return np.asarray(self.multipliers - np.fromiter(nearest, complex))
 
     @property
     def reciprocal_error(self) -> float:
@@ -185,6 +222,41 @@ class PeriodicOrbit:
             return bool(np.abs(self.multipliers).max() <= 1.0 + SAME)
         indices = self.stability_indices
         return bool((np.abs(indices.real) <= 1.0 + SAME).all() and (np.abs(indices.imag) <= SAME).all())
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ErrorsOfOrbit:
+    """Errors of the start and the period of an orbit, computed minus exact, of the nearest orbit of the system.
+
+    Attributes:
+        signed: (2m + 1,) errors of q, p and the period with their signs, NaN where they are unknown.
+        bounds: (2m + 1,) bounds of their absolute values: errors by comparison and those of rounding are added.
+        reason: why the errors are unknown, else empty.
+    """
+
+    signed: Array
+    bounds: Array
+    reason: str = ""
+
+    @classmethod
+    def unknown(cls, m: int, reason: str) -> ErrorsOfOrbit:
+        """Return errors that are unknown for a reason."""
+        return cls(signed=np.full(2 * m + 1, math.nan), bounds=np.full(2 * m + 1, math.inf), reason=reason)
+
+    @property
+    def q(self) -> Array:
+        """(m,) errors of the initial positions."""
+        return self.signed[: len(self.signed) // 2]
+
+    @property
+    def p(self) -> Array:
+        """(m,) errors of the initial momenta."""
+        return self.signed[len(self.signed) // 2 : -1]
+
+    @property
+    def period(self) -> float:
+        """Error of the period."""
+        return float(self.signed[-1])
 
 
 def _inverse(matrix: Array) -> Array:
@@ -264,8 +336,8 @@ def periodic_orbit(
 
     Where the orbit is unstable, multiple shooting improves the guess first. Give a state on the orbit and the period;
     without ``fixed`` or ``energy`` the orbit is one of a family near the guess. Steps are adaptive along the guess and
-    frozen, relative to the period, while Newton's method iterates, unless ``steps`` or ``h`` makes them equal. A run
-    with more steps then measures the discretisation error, ``orbit.error``; an
+    frozen, relative to the period, while Newton's method iterates, unless ``steps`` or ``h`` makes them equal. The
+    error of a run from its start then gives the error of the orbit, ``orbit.error``; an
     :class:`~scvi_codegen.AccuracyWarning` reports one above the bound ``error``. If the iteration
     fails or converges to an equilibrium, it is repeated from a closed curve near the guess, and with fixed positions.
     An :class:`~scvi_codegen.AccuracyWarning` reports an orbit that differs from the guess by more than a third of its
@@ -278,7 +350,7 @@ def periodic_orbit(
         period: initial guess of the period, positive.
         steps: number of equal steps per period, instead of adaptive ones.
         h: instead of ``steps``, the largest step size for the initial period; its sign is ignored.
-        error: bound of the discretisation error ``orbit.error``, by default 1e-9; adaptive steps become smaller until
+        error: bound of ``orbit.error``, by default 1e-9; adaptive steps become smaller until
             it is met. By default 1e-6 with ``steps`` or ``h``, which it does not change.
         max_step: largest size of adaptive steps, at most an eighth of the period.
         fixed_period: keep the period fixed; required if the system depends on time.
@@ -551,6 +623,7 @@ class OrbitSearch:
         self._check_motion(z, motion, guess)
         if motion.by_time.any():
             self._check_next_period(z, equations, allowed)
+        error, errors = self._errors(z, equations)
         return PeriodicOrbit(
             q=z[:m],
             p=z[m:-1],
@@ -560,8 +633,9 @@ class OrbitSearch:
             sequence=steps,
             monodromy=equations.monodromy,
             residual=equations.error,
-            error=self._discretisation_error(z, equations),
-            trivial_error=math.nan if motion.by_time.any() else _trivial_error(equations.monodromy),
+            error=error,
+            errors=errors,
+            autonomous=not motion.by_time.any(),
             iterations=iterations,
             parameters=self.parameters,
             stepper=self.stepper,
@@ -884,20 +958,37 @@ class OrbitSearch:
             by_parameter=partials[:, -1],
         )
 
-    def _discretisation_error(self, z: Array, equations: ClosingEquations) -> float:
-        """Return the distance of a closed orbit to that of a finer sequence of steps; see :class:`PeriodicOrbit`."""
-        start, period, steps = z[:-1], float(z[-1]), self.steps.finer
-        tangents = np.zeros((0, self.stepper._input_size))
-        at = self.t + period * steps.ends[:-1], period * steps.widths, tangents, self.parameters, self.options
+    def _errors(self, z: Array, equations: ClosingEquations) -> tuple[float, ErrorsOfOrbit]:
+        """Return the error of a closed orbit and its entries, by the error of a run from its start."""
+        start, period, steps, m = z[:-1], float(z[-1]), self.steps, self.stepper.dimension
+        span = period * float(steps.ends[-1])
+        plan: dict[str, Any] = {"h": span / len(steps), "steps": len(steps)}
+        if steps.tolerance is not None:
+            plan = {"t_end": self.t + span, "tolerance": steps.tolerance or None, "check_growth": False}
         try:
-            states = tangents_along(self.stepper, start, *at)[0]
-        except (EventError, StepFailedError):
-            return math.inf
-        finer = replace(equations.segments[-1], states=states[1:])
-        defects = equations.returning @ self._defect(finer, start, closes=True)
-        change = self._inverse(equations) @ np.append(defects, np.zeros(len(equations.defects) - len(defects)))
-        q, p = (float(np.abs(part).max()) for part in np.split((equations.into @ change)[:-1], 2))
-        return max(float(abs(change[-1])) / period, self._size_of(self._whole(states)).error(q, p))
+            with without_accuracy_warnings():
+                plan |= {"t": self.t, "parameters": self.parameters, "options": self.options}
+                run = self.stepper.integrate(*np.split(start, 2), **plan)
+                error = run.error
+        except (EventError, MethodError, StateError, StepFailedError) as failure:
+            return math.inf, ErrorsOfOrbit.unknown(m, str(failure))
+        end, own = (np.concatenate([part.q[-1], part.p[-1]]) for part in (run, error))
+        if not np.isfinite(own).all():
+            return math.inf, ErrorsOfOrbit.unknown(m, error.reason or "the errors at the end of the period are unknown")
+        widths = np.concatenate([bounds[-1] for bounds in error.bounds]) - (np.abs(own) if error.signed else 0.0)
+        exact = end - own if error.signed else end
+        inverse = self._inverse(equations)[:, : len(equations.returning)] @ equations.returning
+        changes = []
+        for x in (exact, *(exact + np.diag(widths))[widths > 0.0]):
+            defect = self._defect(replace(equations.segments[-1], states=x[np.newaxis]), start, closes=True)
+            changes.append(equations.into @ inverse @ defect)
+        errors = changes[0]
+        bounds = np.abs(errors) + np.linalg.norm(np.array(changes) - errors, axis=0)
+        bounds += np.where(bounds > 0.0, roundoff(1) * np.abs(z), 0.0)  # fixed entries are exact
+        q, p = (float(part.max()) for part in np.split(bounds[:-1], 2))
+        states = self._whole(np.hstack([run.q, run.p]))
+        relative = max(float(bounds[-1]) / period, self._size_of(states).error(q, p))
+        return relative, ErrorsOfOrbit(signed=errors, bounds=bounds)
 
     def independent_equations(self, starts: Array, segments: Sequence[_Segment], sizes: Array, error: float) -> Array:
         """Return the (size, size) projection onto the equations of return not implied by conserved quantities.
@@ -957,27 +1048,17 @@ def _listed(values: Array) -> str:
     return f"[{', '.join(f'{x:.6g}' for x in values[:6])}{', ..' if len(values) > 6 else ''}]"
 
 
-def _trivial_error(monodromy: Array) -> float:
-    """Return the deviation from 1 of the stability index nearest to 1, of other matrices of the multiplier."""
-    if _symplectic_error(monodromy) > SYMPLECTIC:
-        return float(np.abs(np.linalg.eigvals(monodromy) - 1.0).min())
-    return float(np.abs(np.linalg.eigvals(monodromy + _inverse(monodromy)) / 2.0 - 1.0).min())
-
-
 def _warn_of_discretisation(orbit: PeriodicOrbit, bound: float) -> None:
-    """Warn if the discretisation error of an orbit exceeds a bound, or its trivial stability index differs from 1."""
-    if not warnings_wanted() or (orbit.error <= bound and not orbit.trivial_error > TRIVIAL):
+    """Warn if the error of an orbit exceeds a bound."""
+    if not warnings_wanted() or orbit.error <= bound:
         return
-    deviation = ""
-    if orbit.trivial_error > TRIVIAL:
-        deviation = f", and the stability index that must be 1 differs from it by {orbit.trivial_error:.1e}"
     remedy = "Omit steps and h, for adaptive steps, or take more steps"
     if orbit.sequence.tolerance is not None:
         remedy = "Use a method of higher degree, or fixed_period= or fixed= if the orbit is one of a family"
+    reason = f" ({orbit.errors.reason})" if orbit.errors.reason else ""
     warn(
-        f"the periodic orbit is one of its {orbit.steps} steps rather than of the system: a run with "
-        f"{len(orbit.sequence.finer)} steps is closed by an orbit at the relative distance {orbit.error:.1e} (the "
-        f"bound is {bound:.1e}){deviation}. {remedy}",
+        f"the periodic orbit is one of its {orbit.steps} steps rather than of the system, from whose orbit it has the "
+        f"relative distance {orbit.error:.1e}{reason} (the bound is {bound:.1e}). {remedy}",
         AccuracyWarning,
     )
 

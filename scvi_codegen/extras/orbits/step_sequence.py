@@ -18,9 +18,6 @@ from scvi_codegen.runs.stepper import Stepper
 
 LEAST_STEPS = 8
 """Least number of steps of a search in a period: two may end at turning points only."""
-FINER = 2.6
-"""Factor between the numbers of steps of a sequence and of the finer one that confirms it; no whole number, so that
-both have no inner end in common."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,12 +115,3 @@ class StepSequence:
     def mirrored(self) -> StepSequence:
         """Sequence of half a period, followed by its mirror image."""
         return StepSequence(np.append(self.ends, 1.0 - self.ends[-2::-1]), self.tolerance)
-
-    @property
-    def finer(self) -> StepSequence:
-        """Sequence of ``FINER`` times as many steps with the same relative density, and with other ends."""
-        count = int(np.ceil(FINER * len(self))) | 1
-        if self.tolerance is None:
-            return StepSequence.equal(count, float(self.ends[-1]))
-        numbers = np.linspace(0.0, len(self), count + 1)
-        return StepSequence(np.interp(numbers, np.arange(len(self) + 1), self.ends), self.tolerance)

@@ -1,9 +1,10 @@
-"""Discretisation error of a path: its intervals in finer steps, and the response of all nodes to their defects.
+"""Error of a path: the steps of a finer method along its intervals, and the response of all nodes to their defects.
 
-An interval from (q0, p0), in ``FINER`` steps, ends at (q1 + dq, p1 + dp). Between the same positions the finer steps
-have the momenta p0 - b dq and p1 + dp - e dq with b = dp0/dq1 and e = dp1/dq1, so that the residual of the discrete
-Euler-Lagrange equations at a node is d = (dp - e dq) of the interval before it plus b dq of the one after it. The path
-of the finer steps is at the distance -H^-1 d, with the Hessian H whose factors are those of the last Newton step.
+It is the error of a run (:mod:`scvi_codegen.runs.accuracy.run_error`) with conditions at both ends instead of one. The
+step of the finer method from (q0, p0) ends at (q1 + dq, p1 + dp). Between the same positions it has the momenta
+p0 - b dq and p1 + dp - e dq with b = dp0/dq1 and e = dp1/dq1, so that the residual of the discrete Euler-Lagrange
+equations at a node is d = (dp - e dq) of the interval before it plus b dq of the one after it. The path of the system
+is at the distance -H^-1 d, with the Hessian H whose factors are those of the last Newton step.
 """
 
 from __future__ import annotations
@@ -14,16 +15,13 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.api.states import RESOLVED, Array, roundoff
-from scvi_codegen.common.errors import StepFailedError
+from scvi_codegen.common.errors import MethodError, StepFailedError
 from scvi_codegen.extras.paths.intervals import Intervals
 from scvi_codegen.extras.paths.solver import Solution
+from scvi_codegen.runs.accuracy.run_error import LOST
 
-FINER = 3
-"""Number of steps by which each interval is solved again."""
-OF_FINER = FINER**2 / (FINER**2 - 1.0)
-"""Largest ratio of the error to the distance from the path of the finer steps, of a method of order 2 at least."""
-NO_MOTION, ENERGY_OF_NO_MOTION = 0.1, 0.5
-"""Discretisation error, and relative change of a conserved energy from node to node, from which a stationary point of
+ENERGY_OF_NO_MOTION = 0.5
+"""Relative change of a conserved energy from node to node, from which a stationary point of
 the discrete action is no path of the system, as one that passes through an attractive singularity."""
 
 
@@ -33,30 +31,34 @@ class Discretisation:
 
     Attributes:
         error: of positions relative to their largest range, or of momenta relative to the largest one of a velocity,
-            whichever is larger, and the rounding error of both; infinite if a finer step fails.
+            whichever is larger, and the rounding error of both; infinite if a finer step fails, NaN if it is unknown.
+        q, p: (N + 1, m) errors of positions and momenta with their signs, computed minus exact.
+        reason: why the error is unknown, else empty.
         energy_change: range of the energy of the nodes relative to the largest p . v; 0 if it is not conserved.
     """
 
-    error: float
     energy_change: float
+    error: float
+    q: Array
+    p: Array
+    reason: str = ""
 
     @property
     def is_motion(self) -> bool:
         """True if the path approximates a motion of the system."""
-        return self.error < NO_MOTION and self.energy_change < ENERGY_OF_NO_MOTION
+        return not self.error >= LOST and self.energy_change < ENERGY_OF_NO_MOTION
 
 
 def discretisation_of(solution: Solution) -> Discretisation:
-    """Return the discretisation error of a path and the change of its energy."""
-    return Discretisation(_error(solution), _energy_change(solution))
-
-
-def _error(solution: Solution) -> float:
-    intervals, at, q = solution.intervals, solution.at, solution.q
+    """Return the errors of a path and the change of its energy."""
+    intervals, at, q, change = solution.intervals, solution.at, solution.q, _energy_change(solution)
+    lost = np.full_like(q, np.nan)
     try:
-        end, end_momenta = intervals.refined(q, at.p0, FINER)
-    except StepFailedError:
-        return np.inf
+        end, end_momenta = intervals.finer_ends(q, at.p0)
+    except StepFailedError as failure:
+        return Discretisation(change, np.inf, lost, lost, str(failure))
+    except MethodError as unknown:
+        return Discretisation(change, np.nan, lost, lost, str(unknown))
     moved, kicked = (
         np.array([intervals.tangent(k, row) for k, row in enumerate(rows, 1)])
         for rows in (end - q[1:], end_momenta - at.p1)
@@ -77,8 +79,10 @@ def _error(solution: Solution) -> float:
         intervals.products(own, nodes[:-1]) + intervals.products(before, ends),
         intervals.products(other, nodes[:-1]) + intervals.products(after, ends) + kicked,
     ]
-    position, momentum = (float(np.abs(changes).max(initial=0.0)) for changes in (nodes, impulses))
-    return solution.size.error(OF_FINER * position, OF_FINER * momentum)
+    error = solution.size.error(*(float(np.abs(changes).max(initial=0.0)) for changes in (nodes, impulses)))
+    momenta = [*impulses[0], impulses[1][-1]]
+    errors = [np.array([-intervals.outward(k, row) for k, row in enumerate(rows)]) for rows in (nodes, momenta)]
+    return Discretisation(change, error, errors[0], errors[1])
 
 
 def _energy_change(solution: Solution) -> float:

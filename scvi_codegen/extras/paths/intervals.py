@@ -18,6 +18,7 @@ from scvi_codegen.api.states import Array
 from scvi_codegen.codegen.native.options import SolverOptions, step_failure
 from scvi_codegen.common.errors import PathError, StateError
 from scvi_codegen.extras.paths.size import size_for_updates
+from scvi_codegen.runs.accuracy.run_error import finer_of
 from scvi_codegen.runs.states.rotations import members_of
 
 CONVERGED, MOST_ITERATIONS = 1e-13, 20
@@ -84,6 +85,10 @@ class Intervals:
         """Return the components of a covector at node k in its tangent space."""
         return vector
 
+    def outward(self, k: int, y: Array) -> Array:
+        """Return the change of the positions at node k by one in its tangent space."""
+        return y
+
     def on_manifold_all(self, q: Array) -> Array:
         """Return the nearest admissible positions of nodes, with rotations of the lengths of the first."""
         return q
@@ -127,16 +132,17 @@ class Intervals:
         if status:
             raise step_failure(status, report, step=int(report.steps), h=float(h[report.steps]))
 
-    def refined(self, q: Array, p0: Array, count: int) -> tuple[Array, Array]:
-        """Return the (N, m) positions and momenta at the ends of all intervals from their starts, in ``count`` steps.
+    def finer_ends(self, q: Array, p0: Array) -> tuple[Array, Array]:
+        """Return the (N, m) positions and momenta at the ends of all intervals by the finer method of ``run.error``.
 
         Raises:
             StepFailedError: if one of these steps fails.
+            MethodError: if the stepper has no finer method (it was loaded without its system).
         """
-        h, state = self.h / count, (np.ascontiguousarray(q[:-1]), np.ascontiguousarray(p0))
-        for k in range(count):
-            state = self._stepped(self.t + k * h, h, *state)
-        return state
+        finer = copy(self)
+        finer.stepper = finer_of(self.stepper)
+        finer.binding = finer.stepper.tangent
+        return finer._stepped(self.t, self.h, np.ascontiguousarray(q[:-1]), np.ascontiguousarray(p0))
 
     def _stepped(self, t: Array, h: Array, q: Array, p: Array) -> tuple[Array, Array]:
         """Return the ends of one step of each interval."""
@@ -292,6 +298,10 @@ class ReducedIntervals(Intervals):
     def tangent(self, k: int, vector: Array) -> Array:
         """See :meth:`Intervals.tangent`."""
         return np.asarray(self._bases[k].T @ vector)
+
+    def outward(self, k: int, y: Array) -> Array:
+        """See :meth:`Intervals.outward`."""
+        return np.asarray(self._bases[k] @ y)
 
     def evaluated(self, q: Array) -> Linearised:
         """See :meth:`Intervals.evaluated`."""

@@ -49,9 +49,10 @@ class Path:
         action: sum of the discrete Lagrangians; with forces and constraints that of L alone.
         residual: largest jump of the momentum between two steps, relative to the largest momentum of a velocity; at
             rest, relative to the momentum of a step of the size of the start of the search.
-        error: discretisation error: the distance to the path of which all steps are divided by three, to first order,
-            and the rounding error. Of positions it is relative to their largest range, of momenta to the largest one of
-            a velocity; the larger of both.
+        error: distance to the path of the system, to first order, and the rounding error. Of positions it is relative
+            to their largest range, of momenta to the largest one of a velocity; the larger of both.
+        q_error, p_error: (N + 1, m) errors with their signs, computed minus exact, by the finer method of a run's
+            ``error``; on manifolds their tangential parts. NaN where they are unknown.
         energy_change: range of a conserved energy over the nodes, relative to the largest p . v; else 0.
         dropped: number of stationary points of the discrete action that were found first and are no paths of the
             system, as those that pass through an attractive singularity.
@@ -73,6 +74,8 @@ class Path:
     energy_change: float
     iterations: int
     stepper: Any = field(repr=False)
+    q_error: Array = field(repr=False)
+    p_error: Array = field(repr=False)
     dropped: int = 0
     repetitions: int = 1
     zero_modes: int = 0
@@ -432,12 +435,10 @@ def _described(
     if M is not None:
         repetitions = _order(M)
         zero_modes = 0 if forced else int((~solution.factors.kept).sum())
-    if comparison.error > TOLERABLE_ERROR and warnings_wanted():
-        warn(
-            f"the discretisation error of the path is about {comparison.error:.1e} (relative): take more steps than "
-            f"{count}, or a method of higher degree",
-            AccuracyWarning,
-        )
+    if not comparison.error <= TOLERABLE_ERROR and warnings_wanted():
+        remedy = f"take more steps than {count}, or a method of higher degree"
+        known = f"about {comparison.error:.1e} (relative): {remedy}"
+        warn(f"the discretisation error of the path is {comparison.reason or known}", AccuracyWarning)
     jumps = at.residual if M is None else at.p1[:-1] - at.p0[1:]
     return Path(
         t=t,
@@ -445,6 +446,8 @@ def _described(
         p=stepper.named(solution.momenta),
         action=float(np.sum(at.actions)),
         error=comparison.error,
+        q_error=stepper.named(comparison.q),
+        p_error=stepper.named(comparison.p),
         energy_change=comparison.energy_change,
         dropped=dropped,
         residual=float(np.abs(jumps).max(initial=0.0)) / (solution.size.momentum or 1.0),

@@ -17,12 +17,17 @@ from scvi_codegen.codegen.rendering.events import EventFormulas
 from scvi_codegen.common.errors import EventWarning, StateError
 from scvi_codegen.extras.exact.solution import ExactMotion, Numbers, exact_motion, numbers, solved
 from scvi_codegen.extras.verification.certificate import Check, Finding, checked
-from scvi_codegen.extras.verification.convergence import MAX_HALVINGS
+from scvi_codegen.extras.verification.convergence import MAX_HALVINGS, SLACK
+from scvi_codegen.extras.verification.structure import SPREAD
 from scvi_codegen.extras.verification.system_under_test import (
+    BOUND,
+    CONSECUTIVE_STEPS,
     EPSILON,
+    LARGEST_RATIO,
+    LONG_RUN,
     ROUND_OFF,
     ROUNDINGS,
-    SAMPLED_STATES,
+    SHORT_RUN,
     STEP_DIVISOR,
     WIDTH,
     State,
@@ -36,15 +41,6 @@ from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.trajectory import Trajectory
 from scvi_codegen.systems.contact import coefficients
 from scvi_codegen.systems.event import Crossings, Kink
-
-STEPS = 2000
-"""Number of steps of the run."""
-LEAST_REDUCTION = 4.0
-"""Least ratio of the defects of the symplectic form at two step sizes, which are those of the method."""
-REVERSED = 5
-"""Number of impacts that are undone."""
-SPREAD, NOISE = 100.0, 1e-9
-"""Bound on deviations from finite differences, in units of their uncertainty, and besides."""
 
 
 class Change(NamedTuple):
@@ -85,7 +81,7 @@ def impact_checks(tested: SystemUnderTest, stepper: Stepper, parameters: Any = N
 
 def _surfaces(tested: SystemUnderTest, stepper: Stepper, parameters: Any, crossings: list[Any]) -> Finding:
     """Return the largest value of an event function; add the run and its changes to ``crossings``."""
-    run = run_of(stepper, tested.initial, tested.initial.h, steps=STEPS, parameters=parameters)
+    run = run_of(stepper, tested.initial, tested.initial.h, steps=2 * LONG_RUN, parameters=parameters)
     crossings.extend((run, _changes(run)))
     return Finding(max(change.residual for change in crossings[1]), ROUNDED, f"{len(crossings[1])} changes")
 
@@ -101,7 +97,9 @@ def _changes(run: Trajectory) -> list[Change]:
             if np.count_nonzero(np.abs(times - t) < 1.5 * abs(run.h)) == 1:
                 changes.append(_change_at(run, function, t, q, p))
     if not changes:
-        raise StateError(f"no event alone changes the state within {STEPS} steps: give another state or step size")
+        raise StateError(
+            f"no event alone changes the state within {2 * LONG_RUN} steps: give another state or step size"
+        )
     return changes
 
 
@@ -205,13 +203,13 @@ def _saltation(scales: Array, run: Trajectory, changes: list[Change]) -> Finding
     if around is None:
         raise StateError("steps from neighbouring states fail")
     exact = step(start).tangent()[-1] / scales[:, np.newaxis] * scales
-    return Finding(float(np.abs(exact - around.matrix).max()), SPREAD * around.uncertainty + NOISE, "relative")
+    return Finding(float(np.abs(exact - around.matrix).max()), SPREAD * around.uncertainty + BOUND, "relative")
 
 
 def _reversal(run: Trajectory, changes: list[Change]) -> Finding | None:
     """Return the defect of steps with elastic impacts and back, in units of one rounding of state, time and step."""
     worst = list[float]()
-    for change in _elastic(changes)[:REVERSED]:
+    for change in _elastic(changes)[:SAMPLED_CHANGES]:
         start, step = _across(run, change, run.h)
         there, stepper = step(start), cast(Stepper, run.stepper)
         end, t = np.hstack([there.q[-1], there.p[-1]]), there.t[-1]
@@ -233,13 +231,14 @@ def _symplecticity(run: Trajectory, changes: list[Change]) -> Finding | None:
         start, step = _across(run, elastic[0], h)
         matrix = step(start).tangent()[-1]
         defects.append(float(np.abs(matrix.T @ form @ matrix - form).max() / np.abs(matrix).max() ** 2))
-    return Finding(defects[1], max(defects[0] / LEAST_REDUCTION, NOISE), "step / 8")
+    return Finding(defects[1], max(defects[0] * LARGEST_RATIO, BOUND), "step / 8")
 
 
-SAMPLED_CHANGES, ROUNDED, DIFFERENCE = 12, 256.0 * EPSILON, mp.mpf(10) ** -30
-LEAST_STEPS, TRANSITIONS, SLACK, OUTSIDE = 16, 2, 0.5, 1e-9
-"""Bound on zeros relative to their terms; of runs that measure an order: slack of the order; part of
-their size by which impulses may leave their cone, ten times that by which runs choose them (CONTACT_ROUNDING)."""
+SAMPLED_CHANGES, ROUNDED, DIFFERENCE = 12, ROUNDINGS * EPSILON, mp.mpf(10) ** -30
+"""Number of changes that are checked, bound on zeros relative to their terms, and width of differences."""
+OUTSIDE = 1e-9
+"""Part of their size by which impulses may leave their cone, ten times that by which runs choose them
+(CONTACT_ROUNDING)."""
 
 
 @dataclass(frozen=True)
@@ -331,7 +330,7 @@ class RunInModes:
 
     def states(self) -> Iterator[tuple[Numbers, Array]]:
         """Yield states x with parameters: some of those of the run, and those before transitions."""
-        for t in self.run.t[:: -(-len(self.run) // SAMPLED_STATES)].tolist():
+        for t in self.run.t[:: -(-len(self.run) // SHORT_RUN)].tolist():
             yield numbers([*np.concatenate(self.run.at(t)), t]), parameters_on_sides(self.run, t)
         yield from ((before, sides[0]) for _, _, before, _, sides in self.changes)
 
@@ -406,10 +405,10 @@ def _order(of: RunInModes) -> Finding:
     if any(getattr(event, "power_sides", ()) for event in of.run.stepper.searched):
         raise StateError("motions are not smooth at kinks with powers that are not whole: the order is lower there")
     start, best, stepper = of.tested.initial, Finding(-math.inf, math.nan), of.tested.stepper
-    times = [*(change[0] for change in of.changes), of.run.t.item(-1)][: TRANSITIONS + 1]
+    times = [*(change[0] for change in of.changes), of.run.t.item(-1)][:CONSECUTIVE_STEPS]
     end, scales = sum(times[-2:]) / len(times[-2:]), of.tested.scales(start)
     for halving in range(MAX_HALVINGS):
-        steps = max(LEAST_STEPS, math.ceil((end - start.t) / abs(of.run.h))) << halving
+        steps = max(SHORT_RUN, math.ceil((end - start.t) / abs(of.run.h))) << halving
         runs = [run_of(stepper, start, (end - start.t) / (part * steps), t_end=end) for part in (1, 2, 8)]
         apart = [np.abs((np.hstack([run.q[-1] - runs[2].q[-1], run.p[-1] - runs[2].p[-1]])) / scales) for run in runs]
         errors = [(float(z.max()), run.energy_error()) for z, run in zip(apart[:2], runs, strict=False)]

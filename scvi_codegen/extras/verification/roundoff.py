@@ -27,7 +27,10 @@ from scvi_codegen.extras.verification.certificate import Check, Finding, Violati
 from scvi_codegen.extras.verification.system_under_test import (
     CONSECUTIVE_STEPS,
     EPSILON,
+    PERTURBATION,
+    ROUND_OFF,
     ROUNDINGS,
+    STEP_DIVISOR,
     State,
     SystemUnderTest,
 )
@@ -40,18 +43,14 @@ from scvi_codegen.systems.splittings.kinetic import kinetic_splitting
 
 SHORT = 2.0**-40
 SHORT_STEPS = 64
-LOST = 1e-6
-"""Bound on the relative error of 64 steps of h 2^-40; without compensation it is 1e-3, with it 1e-15."""
 LARGE_COMPENSATION = 1e-6
 """Compensation relative to the state in tests, instead of about 1e-17."""
 LARGE_IN_LANES = 1e-13
 """The same where lanes are compared with single runs, which take it into their stages in other iterations."""
 MAX_LOSS = 1e-3
 """Part of the effect of the compensation that may be lost; the term of second order in h is a tenth of it."""
-SHORTER = 1 / 64
-"""Factor of h: until the last iteration the stages may lack the compensation, a term of second order in h."""
 LANES = 3
-RUNS, SPREAD = 64, 0.02
+RUNS = 64
 Invariant: TypeAlias = Callable[[Array, Array, float], tuple[Array, Array]]
 """Conserved quantity as a function of (n, m) states and time: (n,) values and their sizes."""
 WORK, MIN_STEPS, MAX_STEPS = 2**14, 2**9, 2**13
@@ -62,7 +61,7 @@ TO_CONVERGENCE = SolverOptions(tolerance=2.0**-68)
 """Solver options that iterate until nothing changes."""
 MAX_RESIDUAL = 0.25
 """Residual of the fixed-point iteration, in units of rounding; see ``templates/support/iteration/convergence.h``."""
-NO_TRUNCATION = 2.0**-56
+NO_TRUNCATION = EPSILON / ROUNDINGS
 """Relative energy change of one exact step below which round-off dominates."""
 
 
@@ -117,7 +116,7 @@ def _sums(tested: SystemUnderTest) -> Finding:
             size = np.abs(expected[part]).max(initial=0.0)
             if size > 0.0:
                 worst = max(worst, float(np.abs(moved - expected)[part].max() / size))
-    return Finding(worst, LOST, "relative")
+    return Finding(worst, ROUND_OFF, "relative")
 
 
 def _large_compensation(state: State, scales: Array) -> Array:
@@ -132,8 +131,9 @@ def _low_words(tested: SystemUnderTest) -> Finding | None:
     carry = _large_compensation(state, tested.scales(state))
     whole = state.z + carry
     rest = (state.z - whole) + carry
-    state, joined = (State(z[:m], z[m:], state.t, SHORTER * state.h) for z in (state.z, whole))
+    state, joined = (State(z[:m], z[m:], state.t, state.h / STEP_DIVISOR**2) for z in (state.z, whole))
     ways = ((state, CONSECUTIVE_STEPS, carry), (joined, CONSECUTIVE_STEPS, rest))
+    # Shorter steps: until the last iteration the stages may lack the compensation, a term of second order in h.
     (end, low), (other, other_low) = (_advanced(tested, tested.stepper, *way) for way in ways)
     scales = tested.scales(state)
     difference = np.abs((end - other) + (low - other_low)) / scales
@@ -155,7 +155,7 @@ def _ensemble(tested: SystemUnderTest) -> Finding | None:
     rounding = ROUNDINGS * (tested.rounding(first) + LARGE_IN_LANES**2 * scales)
     for h, steps, carry, unit in (
         (first.h, CONSECUTIVE_STEPS, large, rounding),
-        (first.h * SHORT, SHORT_STEPS, np.zeros_like(large), LOST * SHORT_STEPS * SHORT * scales),
+        (first.h * SHORT, SHORT_STEPS, np.zeros_like(large), ROUND_OFF * SHORT_STEPS * SHORT * scales),
     ):
         state = State(first.q, first.p, first.t, h)
         starts = [_perturbed(state, scales, lane) for lane in range(LANES)]
@@ -254,7 +254,9 @@ def _walks(tested: SystemUnderTest, run: Callable[[Array, Array, int], tuple[Arr
     if not invariants:
         return
     initial, m = tested.initial, len(tested.initial.q)
-    starts = initial.z + SPREAD * tested.scales(initial) * np.random.default_rng(0).uniform(-1.0, 1.0, (RUNS, 2 * m))
+    starts = initial.z + PERTURBATION * tested.scales(initial) * np.random.default_rng(0).uniform(
+        -1.0, 1.0, (RUNS, 2 * m)
+    )
     steps = min(MAX_STEPS, max(MIN_STEPS, WORK // m))
     end = run(starts[:, :m], starts[:, m:], steps)
     for name, invariant in invariants.items():

@@ -24,8 +24,13 @@ from scvi_codegen.extras.verification.system_under_test import (
     LARGEST_RATIO,
     MAX_UNKNOWNS,
     NOISE_OF_DIFFERENCES,
+    ROUND_OFF,
     ROUNDINGS,
+    SHORT_RUN,
+    STEP_DIVISOR,
+    TRIALS,
     WEIGHTS,
+    WIDTHS,
     State,
     SystemUnderTest,
 )
@@ -35,17 +40,13 @@ ANY_UPDATE = SolverOptions(tolerance=1e300)
 """Solver options that accept any update, so that a step makes one iteration."""
 LEAST_UPDATE = 1e6
 """Least size of the first update in units of rounding, for it to distinguish a wrong matrix."""
-MUCH_SHORTER, MAX_ITERATIONS = 256, 10
-"""Divisor of h, and bound on iterations at h/256.
+MUCH_SHORTER, MAX_ITERATIONS = STEP_DIVISOR**3, 10
+"""Divisor of h, and bound on iterations at h/512.
 
-There an error factor proportional to h is at most 2^-8 per iteration: 53 bits take 7, plus a few."""
-MAX_LIMIT = 30
-"""Largest limit on iterations that is tried to reach the fallback solver."""
-RUN_STEPS, SAMPLED_STEPS = 12, (0, 1, 2, 5, 11)
-"""Length of the run, and the steps of it that are checked; the first ones have no full predictor history."""
+There an error factor proportional to h is at most 2^-9 per iteration: 53 bits take 6, plus a few."""
+SAMPLED_STEPS = (0, 1, 2, 5, SHORT_RUN - 1)
+"""Steps of the run that are checked; the first ones have no full predictor history."""
 STATIONARY = 1e-25
-TRANSFORM = 1e-11
-DERIVATIVE_WIDTHS = (3e-2, 1e-2, 3e-3, 1e-3)
 
 
 def step_checks(tested: SystemUnderTest) -> Iterator[Check]:
@@ -129,7 +130,7 @@ def _fallback(tested: SystemUnderTest) -> Finding | None:
         return None
     for factor, start in itertools.product((1, 2, 4, 8, 16), tested.states):
         state = State(start.q, start.p, start.t, factor * start.h)
-        for most in range(3, MAX_LIMIT):
+        for most in range(3, SHORT_RUN):
             try:
                 iterations, end = _counted(tested, state, SolverOptions(max_iterations=most))
             except StepFailedError:
@@ -162,12 +163,12 @@ def _run(tested: SystemUnderTest) -> Finding | None:
     if tested.stepper.interface.mode_names:
         return None  # steps may end at transitions
     worst = max(_run_of(tested, stepper) for stepper in tested.steppers)
-    return Finding(worst, ROUNDINGS, f"in units of rounding, {RUN_STEPS} steps, also with Newton's method alone")
+    return Finding(worst, ROUNDINGS, f"in units of rounding, {SHORT_RUN} steps, also with Newton's method alone")
 
 
 def _run_of(tested: SystemUnderTest, stepper: Stepper) -> float:
     first, worst = tested.states[0], 0.0
-    run = stepper.integrate(first.q, first.p, h=first.h, steps=RUN_STEPS, t=first.t, parameters=tested.parameters)
+    run = stepper.integrate(first.q, first.p, h=first.h, steps=SHORT_RUN, t=first.t, parameters=tested.parameters)
     for k in SAMPLED_STEPS:
         start = State(run.q[k], run.p[k], float(run.t[k]), first.h)
         end = np.concatenate([run.q[k + 1], run.p[k + 1]])
@@ -202,7 +203,7 @@ def _transform(tested: SystemUnderTest) -> Finding:
         wrong.append(_relative(stepper.momentum(state.q, v.astype(float), state.t, tested.parameters), p))
     value = stepper.energy(state.q, state.p, state.t, tested.parameters)
     wrong.append(float(abs(value - energy) / (abs(p) @ abs(v) + abs(energy) or 1)))
-    return Finding(max(wrong), TRANSFORM, "relative")
+    return Finding(max(wrong), ROUND_OFF, "relative")
 
 
 def _relative(result: Array, expected: Numbers) -> float:
@@ -233,7 +234,7 @@ def _action_derivatives(tested: SystemUnderTest, state: State, q1: Array) -> Arr
         return tested.stepper.discrete_lagrangian(ends[:m], ends[m:], state.h, state.t, tested.parameters)
 
     result: list[Array] = []
-    for width in DERIVATIVE_WIDTHS:
+    for width in WIDTHS:
         moved = width * (np.abs(q1 - state.q).max() or 1.0)
         units = np.eye(2 * m) * moved
         changes = [sum(w * (action(both + k * e) - action(both - k * e)) for k, w in WEIGHTS.items()) for e in units]
@@ -242,7 +243,6 @@ def _action_derivatives(tested: SystemUnderTest, state: State, q1: Array) -> Arr
     return result[best]
 
 
-HALVINGS = 12
 LEAST_ERROR = 1e4 * EPSILON
 """Least error that one iteration from the straight line must leave, relative to the state, for a comparison."""
 STEPS = (1, 3, 4)
@@ -278,7 +278,7 @@ def _predictor(tested: SystemUnderTest) -> Finding | None:
 
 def _worst(tested: SystemUnderTest, stepper: Stepper) -> tuple[float, float] | None:
     """Return the largest ratio of the errors left by predictor and line, and the smallest h at which it shows."""
-    for k in reversed(range(HALVINGS)):
+    for k in reversed(range(TRIALS)):
         h = tested.states[0].h / 2**k
         with suppress(StepFailedError):
             left = [_errors_left(tested, stepper, h, steps) for steps in STEPS]

@@ -16,9 +16,11 @@ from scvi_codegen.extras.verification.system_under_test import (
     BOUND,
     CONSECUTIVE_STEPS,
     EPSILON,
+    LONG_RUN,
     NOISE_OF_DIFFERENCES,
     ROUNDINGS,
-    SAMPLED_STATES,
+    SHORT_RUN,
+    TRIALS,
     Jacobian,
     State,
     SystemUnderTest,
@@ -28,8 +30,6 @@ from scvi_codegen.runs.trajectory import Trajectory
 
 SPREAD = 10.0
 """Safety factor of the error of the finite-difference Jacobian over the disagreement of two widths."""
-STEPS = 1000
-DOUBLINGS, BISECTIONS = 24, 10
 SPACES = {"rotation": "T*SO(3)", "direction": "T*S^2", "spin": "S^2"}
 LENGTH, PHASE = 1.7, complex(np.exp(0.7j))
 """Factors of quaternions and directions, and of spins, to which steps must be invariant."""
@@ -51,7 +51,7 @@ def structure_checks(tested: SystemUnderTest) -> Iterator[Check]:
             statement = f"A^T Omega A = Omega of the derivative A of the step on the reduced space ({kinds})"
             yield from checked("reduced symplecticity", statement, partial(_reduced_symplecticity, tested))
     if tested.system.constraints:
-        statement = f"they and their rates are 0 up to round-off at {SAMPLED_STATES} states of {STEPS} steps"
+        statement = f"they and their rates are 0 up to round-off at {SHORT_RUN} states of {LONG_RUN} steps"
         yield from checked("constraints", statement, partial(_constraints, tested))
         statement = "the compiled multipliers are those of the exact motion (60 digits)"
         yield from checked("multipliers", statement, partial(_multipliers, tested))
@@ -133,9 +133,9 @@ def _constraints(tested: SystemUnderTest) -> Finding | None:
         return None
     first, stepper, parameters = tested.states[0], tested.stepper, tested.constant_inputs
     q, p = stepper.project(first.q, first.p, t=first.t, parameters=parameters)
-    run = stepper.integrate(q, p, h=first.h, steps=STEPS, t=first.t, parameters=parameters)
+    run = stepper.integrate(q, p, h=first.h, steps=LONG_RUN, t=first.t, parameters=parameters)
     worst = 0.0
-    for k in range(0, len(run), STEPS // SAMPLED_STATES):
+    for k in range(0, len(run), LONG_RUN // SHORT_RUN):
         state = State(run.q[k], run.p[k], float(run.t[k]), first.h)
         units = EPSILON * np.maximum(np.abs(state.z), tested.scales(state))
         partials = np.abs(tested.constraint_derivatives(state, units / EPSILON)).sum(axis=1) + _by_time(tested, state)
@@ -182,7 +182,7 @@ def _momentum(tested: SystemUnderTest, k: int) -> Finding:
     initial, stepper = tested.initial, tested.stepper
     try:
         run = stepper.integrate(
-            initial.q, initial.p, h=initial.h, steps=STEPS, t=initial.t, parameters=stepper.defaults
+            initial.q, initial.p, h=initial.h, steps=LONG_RUN, t=initial.t, parameters=stepper.defaults
         )
     except StepFailedError as failure:
         run = Trajectory.before(failure)
@@ -216,14 +216,14 @@ def largest_step(tested: SystemUnderTest) -> Check:
     good, bad = 0.0, state.h
     if usable(state.h):
         good = state.h
-        for _ in range(DOUBLINGS):
+        for _ in range(TRIALS):
             bad = 2 * good
             if not usable(bad):
                 break
             good = bad
         else:
             return information(name, statement, good, "no failing step size was found")
-    for _ in range(BISECTIONS):
+    for _ in range(TRIALS):
         middle = (good + bad) / 2
         good, bad = (middle, bad) if usable(middle) else (good, middle)
     return information(name, statement, good)

@@ -74,21 +74,20 @@ def canonical_form(m: int) -> Array:
     return np.asarray(np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(m)), dtype=float)
 
 
-EPSILON, ROUNDINGS = 2.0**-52, 16.0
+EPSILON, ROUNDINGS = float(np.finfo(float).eps), 16.0
 """Rounding error of doubles, and the bound on errors in units of the rounding of a state."""
 ROUND_OFF, BOUND, NOISE_OF_DIFFERENCES = 1e-12, 1e-10, 1e-6
 """Sizes relative to their terms below which values are round-off, and bounds on relative errors of derivatives and
 products, and of finite differences."""
 STEP_DIVISOR, LARGEST_RATIO = 8, 0.25
 """Ratio of two step sizes whose errors are compared, and largest ratio of the errors of a better and a worse one."""
-CONSECUTIVE_STEPS, SAMPLED_STATES = 3, 20
-"""Number of steps in a row, and of the states of a run, that are checked."""
+CONSECUTIVE_STEPS, SHORT_RUN, LONG_RUN, TRIALS = 3, 40, 1000, 12
+"""Number of steps in a row that are checked, of steps of short runs and of states sampled in others, of steps of long
+runs, and of step sizes that a search tries."""
 WIDTH = 1e-5
 """Width of differences of constraints, relative to the state."""
-PERTURBATION, PERTURBATIONS = 0.05, 6
-"""Perturbation of the initial state relative to its size; divided by 4 up to six times until a step succeeds."""
-STEPS_BETWEEN = 5
-"""Number of steps from the first state to the second."""
+PERTURBATION = 0.05
+"""Perturbation of states relative to their size; divided by 4 until a step succeeds."""
 MAX_COORDINATES = 18
 """Largest number of coordinates whose exact motion is computed; these take half a minute."""
 REFERENCE_STEPS, ANNOUNCED_SECONDS = 12, 10.0
@@ -193,7 +192,7 @@ class SystemUnderTest:
         """Two generic states: a step forward is taken from the first, a step backward from the second."""
         first = self._perturbed()
         now = first
-        for _ in range(STEPS_BETWEEN):
+        for _ in range(CONSECUTIVE_STEPS):
             try:
                 q, p = self.step(now)
             except StepFailedError:
@@ -205,7 +204,7 @@ class SystemUnderTest:
         initial, m = self.initial, len(self.initial.q)
         sizes = self.scales(initial)
         directions = np.concatenate([np.cos(1.0 + np.arange(m)), np.sin(2.0 + 1.3 * np.arange(m))])
-        for k in range(PERTURBATIONS):
+        for k in range(TRIALS):
             z = initial.z + PERTURBATION / 4**k * sizes * directions
             t = initial.t + 0.37 * initial.h
             try:

@@ -13,15 +13,20 @@ from scvi_codegen.api.systems import MechanicalSystem
 from scvi_codegen.extras.exact.solution import ExactMotion, exact_motion, numbers
 from scvi_codegen.extras.verification.certificate import Check, Finding, checked
 from scvi_codegen.extras.verification.structure import momentum_error
-from scvi_codegen.extras.verification.system_under_test import EPSILON, ROUNDINGS, STEP_DIVISOR, State, SystemUnderTest
+from scvi_codegen.extras.verification.system_under_test import (
+    EPSILON,
+    ROUNDINGS,
+    SHORT_RUN,
+    STEP_DIVISOR,
+    State,
+    SystemUnderTest,
+)
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.trajectory import Trajectory
 from scvi_codegen.systems.time_transformation import time_rescaling_function
 
 ERROR_RATIO = 100.0
 """Largest ratio of the error in t to that in tau: the quadrature of dt = g dtau has an error of the same order."""
-THERE_AND_BACK, SPAN = 20, 40
-"""Steps of tau there and back; length of adaptive runs in steps of the fixed size."""
 CUT = (2, 0.6)
 """Target time in steps: two whole steps and part of a third."""
 SAMPLED_STEPS = 7
@@ -113,7 +118,7 @@ def _time_transformation_checks(runs: VariableSteps) -> Iterator[tuple[str, str,
     yield "time", "the error in t is of the size of the error in tau (60 digits)", _in_time
     yield "final time", "a run to t_end ends at t_end with an error of that size (60 digits)", _at_final_time
     if runs.tested.method.symmetric:
-        yield "reversal in tau", f"{THERE_AND_BACK} steps of h and of -h return to time and state", _there_and_back
+        yield "reversal in tau", f"{SHORT_RUN} steps of h and of -h return to time and state", _there_and_back
 
 
 def _adaptive_checks(runs: VariableSteps) -> Iterator[tuple[str, str, Any]]:
@@ -176,17 +181,17 @@ def _compared_with_exact(runs: VariableSteps, start: State, steps: int, q: Array
 
 def _there_and_back(runs: VariableSteps) -> Finding:
     first = runs.tested.states[0]
-    how: dict[str, Any] = {"steps": THERE_AND_BACK, "save_every": THERE_AND_BACK, "parameters": runs.at_energy(first)}
+    how: dict[str, Any] = {"steps": SHORT_RUN, "save_every": SHORT_RUN, "parameters": runs.at_energy(first)}
     there = runs.stepper.integrate(first.q, first.p, h=first.h, t=first.t, **how)
     back = runs.stepper.integrate(there.q[-1], there.p[-1], h=-first.h, t=float(there.t[-1]), **how)
     change = runs.tested.in_roundings(np.concatenate([back.q[-1], back.p[-1]]) - first.z, first)
     late = abs(float(back.t[-1]) - first.t) / (EPSILON * (abs(float(there.t[-1])) + abs(first.t)))
-    return Finding(max(change, late) / THERE_AND_BACK, ROUNDINGS, "in units of rounding per step")
+    return Finding(max(change, late) / SHORT_RUN, ROUNDINGS, "in units of rounding per step")
 
 
 def _adaptive_run(runs: VariableSteps, part: float = 1.0) -> Trajectory:
     first = runs.tested.states[0]
-    end = first.t + SPAN * first.h
+    end = first.t + SHORT_RUN * first.h
     if runs.stepper.interface.time_transformation is not None:
         return runs.run(h=part * runs.tau, t_end=end)
     return runs.run(t_end=end, tolerance=runs.tolerance or None)

@@ -325,11 +325,11 @@ class Runs:
         start, end = float(run.t[0]), float(run.t[-1])
         size = longest_piece(run, self.motion.end - start) * FINER_PIECES**self.examinations
         self.examinations += 1
-        apart = differences_in_pieces(run, size)
-        if not apart.any():
-            return False
         rounding = roundoff(1) * max(1.0, max(abs(start), abs(end)) / abs(end - start))  # also of times
         bound = max(PART_OF_ERROR * self.requested, ROUNDINGS * rounding)
+        apart = differences_in_pieces(run, size, bound)
+        if not apart.any():
+            return False
         entries = relative(apart, run.error.sizes)[..., None]
         leave_out_rounding(run, apart[..., None], entries)
         if entries.max() <= bound:

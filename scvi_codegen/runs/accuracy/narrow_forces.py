@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.runs.results.saved_states import parameters_on_sides, times_of_changes
 
 Array = NDArray[np.float64]
 
 MOST_PIECES, LEAST_PIECES, NUMBERS = 1024, 64, 2**20
 """Pieces of a run: of few coordinates, of arrays, and times the number of coordinates: narrower forces are not seen."""
+ITERATED = 0.1
+"""Tolerance of the iterations in pieces, of the differences that count: their motions add up to that of the step."""
 LONG = 2.0
 """Pieces from which on a step is long: the stages of others are as close together."""
 
@@ -25,38 +28,41 @@ def longest_piece(run: Any, span: float) -> float:
     return abs(span) / float(min(MOST_PIECES, max(LEAST_PIECES, NUMBERS // run.stepper.dimension)))
 
 
-def differences_in_pieces(run: Any, size: float) -> Array:
+def differences_in_pieces(run: Any, size: float, part: float) -> Array:
     """Return (2, m) largest differences of positions and momenta at the ends of long steps from the steps in pieces.
 
     Args:
         run: trajectory with all states of adaptive steps.
         size: of the pieces; steps from ``LONG`` times it on are taken in pieces, all but the last before an impact. If
             one fails, the differences are infinite.
+        part: of the motion of a step, differences that count.
     """
-    largest = np.zeros((2, run.q.shape[1]))
-    for part in run.pieces or (run,):
-        spans, changes = np.diff(part.t), times_of_changes(part)
+    largest, options = np.zeros((2, run.q.shape[1])), SolverOptions(tolerance=ITERATED * part)
+    for piece in run.pieces or (run,):
+        spans, changes = np.diff(piece.t), times_of_changes(piece)
         rows = np.flatnonzero(np.abs(spans) > LONG * size)
-        modes = np.searchsorted(part.forward * changes, part.forward * part.t[rows], side="right")
+        modes = np.searchsorted(piece.forward * changes, piece.forward * piece.t[rows], side="right")
         for mode in {*modes.tolist()}:
-            apart = _apart(part, rows[modes == mode], spans, size, changes)
+            apart = _apart(piece, rows[modes == mode], spans, size, changes, options)
             np.fmax(largest, apart, out=largest)
     return largest
 
 
-def _apart(part: Any, rows: NDArray[np.intp], spans: Array, size: float, changes: Array) -> Array:
+def _apart(
+    part: Any, rows: NDArray[np.intp], spans: Array, size: float, changes: Array, options: SolverOptions
+) -> Array:
     """Return (2, m) largest differences of the steps at some rows in one mode, by one call of C."""
-    taken = part._restarted(0, size)
-    taken._parameters[:] = parameters_on_sides(part, float(part.t[rows[0]]))
-    counts = np.ceil(np.abs(spans[rows]) / size)
+    counts, stepper = np.ceil(np.abs(spans[rows]) / size), part.stepper
     h, before = spans[rows] / counts, np.zeros(len(rows), bool)
     if len(changes):
         before = np.isin(part.t[rows + 1], changes)
-    (q, p), binding = (np.ascontiguousarray(np.asarray(x)[rows]) for x in (part.q, part.p)), part.stepper.binding
+    (q, p), binding = (np.ascontiguousarray(np.asarray(x)[rows]) for x in (part.q, part.p)), stepper.binding
     pieces, ends = (counts - before).astype(np.int64), np.empty((2, *q.shape))
-    numbers = binding.whole_numbers(pieces)
-    arguments = *map(binding.pointer, (np.ascontiguousarray(part.t[rows]), h)), numbers
-    if binding.call("pieces", taken._call)(len(rows), *arguments, *map(binding.pointer, (q, p, *ends))):
+    arguments = *map(binding.pointer, (np.ascontiguousarray(part.t[rows]), h)), binding.whole_numbers(pieces)
+    parameters = parameters_on_sides(part, float(part.t[rows[0]]))
+    pointers = map(binding.pointer, (q, p, *ends))
+    status, _ = stepper._call_steps("pieces", parameters, options, len(rows), *arguments, *pointers)
+    if status:
         return np.full((2, q.shape[1]), np.inf)  # the step was solved over what its pieces meet
     states = np.array([np.asarray(x)[rows + 1] for x in (part.q, part.p)])
     if before.any():

@@ -7,8 +7,9 @@ For the saved states x_k of a run, the steps phi of a finer method from each of 
 is the error of x_{k+1}, up to terms of the order of delta^2 and the error of phi (E. Hairer, S. P. Norsett, G. Wanner,
 Solving Ordinary Differential Equations I, II.4; R. D. Skeel, Thirteen ways to estimate global error, Numer. Math. 48
 (1986) 1-20). It holds for any sequence of states: phi is one step where all states are saved, else a run at round-off
-from one state to the next, over events, so that no interval ends at one. Further vectors rho transport samples of
-the rounding errors of the states, u |x| with a random sign for each step of the run.
+from one state to the next, over events, so that no interval ends at one. The differences need no derivatives and are
+those of intervals shared by threads; the derivatives are those of the run's own steps. Further vectors rho transport
+samples of the rounding errors of the states, u |x| with a random sign for each step of the run.
 """
 
 from __future__ import annotations
@@ -17,12 +18,15 @@ import math
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.codegen.variants import Derivatives
 from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError, StepFailedError
+from scvi_codegen.common.thread_pool import run_jobs
 from scvi_codegen.runs.accuracy.size import (
     RESOLVED,
     first_of_groups,
@@ -56,7 +60,12 @@ mean square of k is Student's t with k degrees of freedom, above 6 in 0.9 % for 
 ROUNDINGS = 1024.0
 """Errors of coordinates that constraints determine below so many roundings are those of rounding."""
 MOST_STEPS = 2048
-"""Number of steps of one call of C."""
+"""Number of steps of one call of C; threads share such intervals, whatever their number is."""
+LEFT = 1e-6
+"""Relative change of transported errors that the iterations of all steps together leave, as it compounds.
+
+A pericentre enlarges it: with 1e-3 errors of an orbit of eccentricity 0.99 are 5 to 13 times too large, with 1e-6 .2 %.
+"""
 COMPARED = 512
 """One of so many steps of the finer method is compared with two steps of half its size."""
 AT_EVENT = 64.0
@@ -174,9 +183,9 @@ class WithErrors:
     def error(self: Any) -> RunError:
         """Global errors of all states since the first one, with their signs (:class:`RunError`), made at first access.
 
-        One step of a finer method and a product with its Jacobian for each step, about five to nine times the cost of
-        the run; a finer method is compiled once. docs/digits.md lists which runs have signs, which are compared with a
-        finer run, and which are refused.
+        One step of a finer method and products with the Jacobian of the step for each step, about four to seven times
+        the cost of the run and 0.2 ms, more where Newton's method solves it; a finer method is compiled once.
+        docs/steps.md lists which runs have signs, which are compared with a finer run, and which are refused.
 
         Raises:
             MethodError, StateError: for runs whose error is not defined or not known, with the reason.
@@ -313,6 +322,9 @@ def sizes_of(run: Any, rows: int, errors: Array) -> Array:
 class _Replay:
     """Replay of a run from its saved states.
 
+    The derivatives of single steps are those of the run's own method, where it has them: they differ from those of the
+    finer method by derivatives of the local error, which times delta is below terms of the order of delta^2.
+
     Args:
         run: trajectory.
         finer: stepper of the finer method, with the events of the run that change the state.
@@ -320,17 +332,20 @@ class _Replay:
 
     def __init__(self, run: Any, finer: Any) -> None:
         self.run, self.finer, self.m = run, finer, run.stepper.dimension
-        self.u, self.calls = roundoff(1), 0
+        own = run.stepper.interface.time_transformation is None and not run.stepper._lacks(Derivatives())
+        self.linear = run.stepper if own else finer
+        self.u, self.calls, self.left = roundoff(1), 0, LEFT / max(1, run.steps)
+        self.steps = max(1.0, run.steps / max(1, len(run) - 1))  # mean number between two states
         self.now = np.zeros((1 + SAMPLES, 2 * self.m))
 
     def of_run(self) -> tuple[Array, str]:
         """Return (1 + samples, 2m, n) errors and rounding errors, NaN where unknown, and the reason for that."""
         first, result = 0, np.full((*self.now.shape, len(self.run)), np.nan)
-        initial = getattr(self.run, "_initial", None)
+        initial, reason = getattr(self.run, "_initial", None), ""
         try:
             if initial is not None:  # t_eval without the initial time
                 t, q, p = initial
-                self._by_run(self.run, t, q, p, 0, steps=self._steps_between(self.run))
+                self._by_run(self.run, t, q, p, 0, steps=self.steps)
             result[..., 0] = self.now
             for piece in self.run._runs:
                 for row, vectors in self._along(piece):
@@ -339,8 +354,8 @@ class _Replay:
         except (ScviCodegenError, FloatingPointError) as failure:
             known = int(np.count_nonzero(np.isfinite(result[0, 0])))
             lost = known and not np.abs(self.now[0]).max() <= np.abs(self._state(self.run, slice(None))).max()
-            return result, f"errors are lost: {failure}" if lost else str(failure)
-        return result, ""
+            reason = f"errors are lost: {failure}" if lost else str(failure)
+        return result, reason
 
     @property
     def is_smooth(self) -> bool:
@@ -386,49 +401,59 @@ class _Replay:
         special = times_of_changes(piece)
         rows = _rows_between(piece, special)
         single = self._single_steps(piece, rows, special)
-        first, steps = 0, self._steps_between(piece)
-        while first < len(rows) - 1:
-            last = first + 1
+        changes = (np.flatnonzero(single[1:] != single[:-1]) + 1).tolist()  # from single steps to others, and back
+        for first, last in pairwise([0, *changes, len(single)] if len(single) else ()):
             if single[first]:
-                ahead = np.flatnonzero(~single[first : first + MOST_STEPS])
-                last = first + int(ahead[0]) if len(ahead) else min(first + MOST_STEPS, len(rows) - 1)
-                begin, end = int(rows[first]), int(rows[last])
-                yield slice(begin + 1, end + 1), self._by_steps(piece, begin, end).transpose(1, 2, 0)
-            else:
-                begin, end = int(rows[first]), int(rows[last])
+                yield from self._by_steps(piece, int(rows[first]), int(rows[last]))
+                continue
+            for begin, end in pairwise(rows[first : last + 1].tolist()):
                 start = float(piece.t[begin]), piece.q[begin], piece.p[begin]
-                self._by_run(piece, *start, end, steps=steps * (end - begin))
+                self._by_run(piece, *start, end, steps=self.steps * (end - begin))
                 yield end, self.now
-            first = last
 
     def _single_steps(self, piece: Any, rows: NDArray[np.intp], special: Array) -> NDArray[np.bool_]:
-        """Return (rows,) whether the interval after a row is one step of the run in one mode; the last is false."""
-        single = np.zeros(len(rows), bool)
+        """Return (rows - 1,) whether the interval after a row is one step of the run in one mode."""
         begin, end = rows[:-1], rows[1:]
-        lengths = piece.step_sizes[begin]
         with np.errstate(invalid="ignore"):
-            one = (end == begin + 1) & (np.abs(piece.stepped[end] - piece.stepped[begin]) < 1.5 * np.abs(lengths))
+            whole = np.abs(piece.stepped[end] - piece.stepped[begin]) < 1.5 * np.abs(piece.step_sizes[begin])
+        single = np.asarray(whole & (end == begin + 1))
         if len(special):
             passed = [np.searchsorted(piece.forward * special, piece.forward * piece.t[of]) for of in (begin, end)]
-            one &= passed[0] == passed[1]
-        single[:-1] = one
+            single &= passed[0] == passed[1]
         return single
 
-    def _steps_between(self, piece: Any) -> float:
-        """Return the mean number of steps of the run between two of its states."""
-        return float(max(1.0, self.run.steps / max(1, len(self.run) - 1)))
+    def _by_steps(self, piece: SavedStates, begin: int, end: int) -> Iterator[tuple[Any, Array]]:
+        """Transport the errors over single steps between two rows; yield slices of rows and their vectors."""
+        t, h = np.ascontiguousarray(piece.t[begin:end]), np.ascontiguousarray(steps_after(piece, begin, end))
+        q, p = (np.ascontiguousarray(np.asarray(column)[begin : end + 1]) for column in (piece.q, piece.p))
+        starts, parameters = Starts(t, h, q, p), parameters_on_sides(piece, float(piece.t[begin]))
+        parts = [starts.part(k, k + MOST_STEPS) for k in range(0, len(h), MOST_STEPS)]
+        defects = self._defects(parts, parameters)
+        for k, part in enumerate(parts):
+            first = begin + k * MOST_STEPS
+            last = first + len(part.h)
+            if not isinstance(defects[k], ScviCodegenError) and self._resolves(piece, first, part.h, parameters):
+                yield slice(first + 1, last + 1), self._transport(self.linear, part, defects[k], parameters)
+                continue
+            for row in range(first, last):
+                self._by_run(piece, float(piece.t[row]), piece.q[row], piece.p[row], row + 1, steps=1.0)
+                yield row + 1, self.now
 
-    def _by_steps(self, piece: SavedStates, begin: int, end: int) -> Array:
-        """Transport the errors over single steps between two rows; return (end - begin, 1 + samples, 2m) vectors."""
-        h = steps_after(piece, begin, end)
-        parameters = parameters_on_sides(piece, float(piece.t[begin]))
-        if not self._resolves(piece, begin, h, parameters):
-            return np.array([self._over_one(piece, k) for k in range(begin, end)])
-        return self._transport(piece.t[begin:end], h, piece.q, piece.p, slice(begin, end + 1), parameters)
+    def _defects(self, parts: list[Starts], parameters: Array) -> list[Any]:
+        """Return (n, 2m) states minus the ends of finer steps from those before, or the error of a step that fails."""
+        defects = list[Any]([None] * len(parts))
 
-    def _over_one(self, piece: SavedStates, k: int) -> Array:
-        self._by_run(piece, float(piece.t[k]), piece.q[k], piece.p[k], k + 1, steps=1.0)
-        return self.now.copy()
+        def find(k: int, _: object = None) -> None:
+            try:
+                defects[k] = self.finer._defects(parts[k], parameters)
+            except ScviCodegenError as failure:
+                defects[k] = failure
+
+        if len(parts) == 1:
+            find(0)
+        else:
+            run_jobs(len(parts), find, progress=None, threads=None)
+        return defects
 
     def _resolves(self, piece: SavedStates, begin: int, h: Array, parameters: Array) -> bool:
         """Return whether steps h of the finer method from row ``begin`` on have smaller errors than those of the run.
@@ -458,18 +483,16 @@ class _Replay:
         return np.concatenate(self.finer._states.pair(*self.finer.step(*np.split(state, 2), h, t, parameters)))
 
     def _transport(
-        self, t: Array, h: Array, q: Array, p: Array, rows: slice, parameters: Array, steps: float = 1.0
+        self, linear: Any, starts: Starts, defects: Array | None, parameters: Array, steps: float = 1.0
     ) -> Array:
-        """Transport the errors over steps h of the finer method from times t, each of so many steps of the run."""
-        m, n = self.m, len(h)
-        states = [np.ascontiguousarray(np.asarray(column)[rows]) for column in (q, p)]
-        vectors = np.zeros((n + 1, 1 + SAMPLES, self.finer._input_size))
-        vectors[0, :, : 2 * m] = self.now
+        """Transport the errors over steps of a method, each of so many steps of the run; return their vectors."""
+        vectors = np.zeros((len(starts.h) + 1, 1 + SAMPLES, linear._input_size))
+        vectors[0, :, : 2 * self.m] = self.now
         self.calls += 1
-        starts = Starts(np.ascontiguousarray(t), np.ascontiguousarray(h), states[0], states[1])
-        self.finer._transport_errors(starts, vectors, parameters, math.sqrt(steps) * self.u, self.calls)
-        self.now = vectors[-1, :, : 2 * m].copy()
-        return vectors[1:, :, : 2 * m]
+        rounding = math.sqrt(steps) * self.u
+        linear._transport_errors(starts, defects, vectors, parameters, self.left / steps, rounding, self.calls)
+        self.now = vectors[-1, :, : 2 * self.m].copy()
+        return vectors[1:, :, : 2 * self.m].transpose(1, 2, 0)
 
     def _by_run(self, piece: Any, t: float, q: Array, p: Array, end: int, *, steps: float) -> None:
         """Transport the errors to a row by a run of the finer method at round-off, over the events in between."""
@@ -485,11 +508,10 @@ class _Replay:
             normal = np.random.default_rng(self.calls).standard_normal((SAMPLES, 2 * self.m))
             self.now[1:] += math.sqrt(steps) * self.u * normal * np.abs(self._state(piece, end))
         else:
-            h, sides = np.diff(fine.t), parameters_on_sides(fine, t)
+            times, h, x, y = (np.ascontiguousarray(of) for of in (fine.t, np.diff(fine.t), fine.q, fine.p))
+            starts, sides = Starts(times, h, x, y), parameters_on_sides(fine, t)
             for k in range(0, len(h), MOST_STEPS):
-                rows = slice(k, min(k + MOST_STEPS, len(h)) + 1)
-                own = h[rows.start : rows.stop - 1]
-                self._transport(fine.t[rows][:-1], own, fine.q, fine.p, rows, sides, steps / len(h))
+                self._transport(self.finer, starts.part(k, k + MOST_STEPS), None, sides, steps / len(h))
         self.now[0] += self._state(piece, end) - self._state(fine, -1)
 
     @staticmethod

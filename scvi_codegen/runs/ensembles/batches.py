@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from scvi_codegen.codegen.native.binding import Binding
 from scvi_codegen.codegen.native.capacity import TOO_MANY_STATES
 from scvi_codegen.codegen.native.options import OUTCOMES
+from scvi_codegen.common.thread_pool import StopCheck, run_jobs
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.ensembles.ensemble import Ensemble
 from scvi_codegen.runs.ensembles.result import INTERRUPTED, OK
-from scvi_codegen.runs.ensembles.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.states.words import Word, block_of, from_block
 from scvi_codegen.runs.stepping.chunks import drive

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scvi_codegen.codegen.native.capacity import TOO_MANY_STATES, room_for_states, too_many_states
 from scvi_codegen.codegen.native.options import FAILURES
 from scvi_codegen.common.errors import AccuracyWarning, EventError, StateError, StepFailedError, of_trajectory, warn
+from scvi_codegen.common.thread_pool import StopCheck, run_jobs
 from scvi_codegen.common.validation import LARGEST_COUNT
 from scvi_codegen.runs.accuracy.global_error import GlobalError
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
@@ -29,7 +30,6 @@ from scvi_codegen.runs.ensembles.lanes import CommonRuns
 from scvi_codegen.runs.ensembles.observation import EnsembleObservation
 from scvi_codegen.runs.ensembles.result import EVENT_FAILED, INTERRUPTED, OK, EnsembleTrajectory, Span
 from scvi_codegen.runs.ensembles.schedule import CommonSteps
-from scvi_codegen.runs.ensembles.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runs.results.saved_states import ModeHistory
 from scvi_codegen.runs.states.times import WHOLE
 from scvi_codegen.runs.states.validation import Array, columns_of_inputs

@@ -16,13 +16,13 @@ import numpy as np
 from scvi_codegen.codegen.native.arguments import empty_array
 from scvi_codegen.codegen.native.binding import Binding
 from scvi_codegen.common.errors import StateError, StepFailedError
+from scvi_codegen.common.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runs.driver.run_loop import record
 from scvi_codegen.runs.ensembles.batches import CHUNK_SECONDS, FIRST_CHUNK_STEPS, GROWTH, Batch, Rows, SuccessiveRuns
 from scvi_codegen.runs.ensembles.ensemble import Ensemble
 from scvi_codegen.runs.ensembles.observation import EnsembleObservation
 from scvi_codegen.runs.ensembles.result import INTERRUPTED, OK, EnsembleTrajectory
 from scvi_codegen.runs.ensembles.schedule import CommonSteps
-from scvi_codegen.runs.ensembles.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.states.words import from_block
 from scvi_codegen.runs.stepping.chunks import drive

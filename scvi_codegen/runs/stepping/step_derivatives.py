@@ -8,6 +8,7 @@ are composed of these. In transformed time the energy is one of the parameters, 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -291,27 +292,60 @@ class LinearisedMethod(StateFunctions):
             raise step_failure(status, report, step=failed, h=float(starts.h[failed]))
         return q1, p1
 
-    def _transport_errors(self, starts: Starts, vectors: Array, parameters: Array, rounding: float, seed: int) -> None:
-        """Transport global errors, and further tangent vectors, along the saved states of another run, in place.
+    def _defects(self, starts: Starts, parameters: Array) -> Array:
+        """Return (n, 2m) states minus the ends of the steps from those before them, along a run of another method."""
+        defects = np.empty((len(starts.h), 2 * self.dimension))
+        arrays = map(self.binding.pointer, (starts.t, starts.h, starts.q, starts.p, defects))
+        status, report = self._call_steps("defects", parameters, None, len(starts.h), *arrays)
+        if status:
+            raise step_failure(status, report, step=0, h=float(starts.h[0]))
+        return defects
+
+    def _call_steps(self, name: str, parameters: Array, options: SolverOptions | None, *arguments: Any) -> Any:
+        """Call a function of C that takes steps from states of its own; return its status and report."""
+        binding = self.binding
+        run, call, report = map(binding.new, ("run *", "call *", "report *"))
+        t, iterations, workspace = binding.numbers("double *"), binding.numbers("int *"), binding.workspace(run)
+        settings = binding.options(options)
+        call.run, call.parameters, call.options = run, binding.pointer(parameters), settings
+        call.t, call.iterations, call.report, call.workspace = t, iterations, report, workspace
+        call.coordinates = self.dimension
+        return binding.call(name, call)(*arguments), report
+
+    def _transport_errors(
+        self,
+        starts: Starts,
+        defects: Array | None,
+        vectors: Array,
+        parameters: Array,
+        left: float,
+        rounding: float,
+        seed: int,
+    ) -> None:
+        """Transport global errors, and further tangent vectors, along saved states, in place.
 
         Args:
-            starts: n steps; their (n + 1, m) states are those of the run.
+            starts: n steps and their (n + 1, m) states.
+            defects: (n, 2m) states minus the ends of the steps of a finer method from those before.
             vectors: (n + 1, count, 2m + k + 2) as of :meth:`_propagate`; the first one of each row is the error, to
-                which the difference of the state from the end of this step is added.
+                which the defect of the state is added.
             parameters: as of :meth:`_propagate`.
+            left: relative change of the step and of vectors that the iterations of a step leave.
             rounding: rounding errors relative to the states, which further vectors receive with random signs.
             seed: of the signs.
         """
         binding = self.tangent
-        report, work = binding.new("report *"), np.empty((2, len(starts.h), self.dimension))
+        report = binding.new("report *")
         status = binding.function("transport_errors")(
             len(starts.h),
             *map(binding.pointer, (starts.t, starts.h, starts.q, starts.p, parameters)),
-            binding.options(None),
+            binding.options(SolverOptions(tolerance=left)),
             vectors.shape[1],
+            left,
             rounding,
             seed,
-            *map(binding.pointer, (vectors, *work)),
+            binding.null if defects is None else binding.pointer(defects),
+            binding.pointer(vectors),
             report,
             binding.workspace(),
         )

@@ -41,7 +41,7 @@ int NAME(actions)(long long steps, const real *t, const real *h, const real *q, 
   newton_data *data = newton_in(workspace + SCRATCH);
   memset(report, 0, sizeof *report);
 #ifdef UNKNOWNS_OF_POINTS
-  propagation over = {PROPAGATION_OF_ARGUMENTS};
+  propagation over = {PROPAGATION_OF_ARGUMENTS, .q1 = q1, .p1 = p1};
 #endif
   for (long long k = 0; k < steps; k++) {
 #ifdef UNKNOWNS_OF_POINTS

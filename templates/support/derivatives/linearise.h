@@ -2,24 +2,28 @@
 
 /* Tangent and adjoint vectors over steps solved by Newton's method. */
 
+#define LEFT_TO_COME (DBL_EPSILON * DBL_EPSILON / 16.0) /* squared: relative change still to come that is accepted */
+
 /* Steps and the vectors propagated over them, of shape (steps + 1, count, STEP_INPUTS). */
 typedef struct {
   const real *t, *h, *q, *p, *parameters;
   const solver_options *options;
   int back, count;
-  int defects; /* whether the first vectors receive the defects of the saved states: q1, p1 are increments then */
+  const real *defects; /* of the saved states, (steps, 2M), which the first vectors receive; NULL: none */
+  int together; /* whether VECTORS_AT_ONCE vectors are iterated together */
   real *vectors, *q1, *p1, *workspace;
   solver_report *report;
-  real rounding; /* relative error of the saved states that the other vectors receive */
+  real accepted; /* squared: relative change of vectors still to come that is accepted */
+  real rounding; /* relative error of the saved states that the vectors after the first receive; 0: none */
   unsigned long long random;
   long long guess; /* number of previous steps that the predictor uses (fixed-point iteration only) */
-  int look, look_at_rounding; /* first iteration of the linearised equations whose convergence is tested */
+  int look; /* first iteration of the linearised equations whose convergence is tested */
 } propagation;
 
 /* Propagation by the arguments of a function. */
 #define PROPAGATION_OF_ARGUMENTS                                                                              \
   .t = t, .h = h, .q = q, .p = p, .parameters = parameters, .options = options ? options : &STANDARD_OPTIONS, \
-  .q1 = q1, .p1 = p1, .workspace = workspace, .report = report
+  .workspace = workspace, .report = report
 
 static step_data step_of(const propagation *over, long long k, const real *nothing)
 {
@@ -33,16 +37,12 @@ static real *vectors_at(const propagation *over, long long k)
   return over->vectors + k * over->count * STEP_INPUTS;
 }
 
-/* Adds x[k + 1] - phi(x[k]) to the first vector at the end of step k, with phi from the increments, or else the ends,
- * in q1 and p1. Errors of rounded states cancel in the sum, those of increments do not. */
-static void add_defect(propagation *over, long long k, int increments)
+/* Adds the defect of state k + 1 to the first vector at the end of step k. */
+static void add_defect(propagation *over, long long k)
 {
-  const real *x[2] = {over->q + k * M, over->p + k * M}, *step[2] = {over->q1 + k * M, over->p1 + k * M};
   real *to = vectors_at(over, k + 1);
-  for (int j = 0; j < 2 * M; j++) {
-    const int i = j % M, of = j / M;
-    to[j] += (x[of][M + i] - (increments ? x[of][i] : 0)) - step[of][i];
-  }
+  for (int j = 0; over->defects && j < 2 * M; j++)
+    to[j] += over->defects[k * 2 * M + j];
 }
 
 /* The next number of a linear congruential generator (D. E. Knuth, The Art of Computer Programming 2, 3.3.4). */
@@ -55,7 +55,7 @@ static inline unsigned long long next_random(unsigned long long *x)
 static void add_rounding(propagation *over, long long k)
 {
   const real *x[2] = {over->q + (k + 1) * M, over->p + (k + 1) * M};
-  for (int j = 1; j < over->count; j++) {
+  for (int j = 1; over->rounding > 0 && j < over->count; j++) {
     real *to = vectors_at(over, k + 1) + j * STEP_INPUTS;
     for (int i = 0; i < 2 * M; i++)
       to[i] += (next_random(&over->random) >> 63 ? over->rounding : -over->rounding) * x[i / M][i % M];
@@ -112,8 +112,8 @@ static int solve_steps(propagation *over, long long first, long long end)
     if (!solve_by_iteration(over, &step, &data, dq, dp))
       return 0;
     for (int i = 0; over->q1 && i < M; i++) {
-      over->q1[k * M + i] = (over->defects ? 0.0 : step.q0[i]) + (dq[i] + dq[M + i]);
-      over->p1[k * M + i] = (over->defects ? 0.0 : step.p0[i]) + (dp[i] + dp[M + i]);
+      over->q1[k * M + i] = step.q0[i] + (dq[i] + dq[M + i]);
+      over->p1[k * M + i] = step.p0[i] + (dp[i] + dp[M + i]);
     }
     store_step(&step, &data, over->workspace + SCRATCH, dq, dp, stored_of(over, k - first));
   }
@@ -141,14 +141,13 @@ static int propagate_by_iteration(propagation *over, long long k, const double *
   iterated_step at;
   prepare_iteration(&step, &data);
   linearise_points(&step, &data, kept, &at);
+  at.accepted = over->accepted;
   for (int j = 0, own; j < over->count; j += own) {
     double v[VECTORS_AT_ONCE * STEP_INPUTS];
-    int *look = over->defects && j ? &over->look_at_rounding : &over->look;
-    own = over->defects && j && over->count - j >= VECTORS_AT_ONCE ? VECTORS_AT_ONCE : 1;
-    at.accepted = over->defects ? LEFT_IN_ERRORS : LEFT_TO_COME;
+    own = over->together && over->count - j >= VECTORS_AT_ONCE ? VECTORS_AT_ONCE : 1;
     memcpy(v, from + j * STEP_INPUTS, sizeof(double) * (size_t)(own * STEP_INPUTS));
     if ((over->back ? vjp_by_iteration : own > 1 ? jvps_by_iteration
-                                                 : jvp_by_iteration)(&at, v, look) != OK)
+                                                 : jvp_by_iteration)(&at, v, &over->look) != OK)
       return j;
     for (int i = 0; i < own * STEP_INPUTS; i++)
       to[j * STEP_INPUTS + i] += v[i];
@@ -172,13 +171,12 @@ static int propagate_steps(propagation *over, long long first, long long end)
   for (long long done = 0; status == OK && done < end - first; done++) {
     const long long k = over->back ? end - 1 - done : first + done;
     const int carried = iterated ? propagate_by_iteration(over, k, stored_of(over, k - first)) : 0;
-    const int by_newton = !iterated || carried < over->count;
-    if (by_newton)
+    if (!iterated || carried < over->count)
       status = vectors_by_newton(over, k, carried);
     else if (!all_finite(vectors_at(over, k + !over->back), over->count * STEP_INPUTS))
       status = NOT_FINITE;
-    if (over->defects && status == OK) {
-      add_defect(over, k, !by_newton);
+    if (status == OK) {
+      add_defect(over, k);
       add_rounding(over, k);
     }
     over->report->steps += status == OK;
@@ -205,18 +203,19 @@ int NAME(linearise)(long long steps, const real *t, const real *h, const real *q
     const real *parameters, const solver_options *options, int back, int count, real *vectors, real *q1, real *p1,
     solver_report *report, real *workspace)
 {
-  propagation over = {PROPAGATION_OF_ARGUMENTS, .back = back, .count = count, .vectors = vectors};
+  propagation over = {PROPAGATION_OF_ARGUMENTS, .q1 = q1, .p1 = p1, .back = back, .count = count, .vectors = vectors,
+      .accepted = LEFT_TO_COME};
   return propagate_blocks(&over, steps);
 }
 
-/* Global errors delta[k + 1] = Dphi(x[k]) delta[k] + x[k + 1] - phi(x[k]) of a run by another method from its saved
- * states, transported by the tangent map of that step phi (Hairer, Norsett & Wanner, Solving ODEs I, II.3 and II.4);
- * further vectors receive rounding errors. */
+/* Global errors delta[k + 1] = D psi(x[k]) delta[k] + defect[k] of a run by the step psi from its saved states, with
+ * their defects, x[k + 1] - phi(x[k]) by a finer method (Hairer, Norsett & Wanner, Solving ODEs I, II.3 and II.4);
+ * further vectors receive rounding errors. What is `left` of the change of a vector compounds over the steps. */
 int NAME(transport_errors)(long long steps, const real *t, const real *h, const real *q, const real *p,
-    const real *parameters, const solver_options *options, int count, double rounding, unsigned long long seed,
-    real *vectors, real *q1, real *p1, solver_report *report, real *workspace)
+    const real *parameters, const solver_options *options, int count, double left, double rounding,
+    unsigned long long seed, const real *defects, real *vectors, solver_report *report, real *workspace)
 {
-  propagation over = {PROPAGATION_OF_ARGUMENTS, .defects = 1, .count = count, .rounding = rounding, .random = seed,
-      .vectors = vectors};
+  propagation over = {PROPAGATION_OF_ARGUMENTS, .together = 1, .accepted = left * left, .count = count,
+      .rounding = rounding, .random = seed, .defects = defects, .vectors = vectors};
   return propagate_blocks(&over, steps);
 }

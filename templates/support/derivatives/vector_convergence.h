@@ -4,12 +4,9 @@
  * parameters and time. Requires: POINT_INPUTS. */
 
 enum { INPUT_T = STEP_INPUTS - 2,
-  VECTORS_AT_ONCE = 3 }; /* which are iterated together, so that no product waits for the last one */
+  VECTORS_AT_ONCE = 4 }; /* which are iterated together, so that no product waits for the last one */
 
 #define MOVED_BY_ROUNDING (4.0 * DBL_EPSILON * DBL_EPSILON) /* squared: relative change that rounding alone may cause */
-#define LEFT_TO_COME (DBL_EPSILON * DBL_EPSILON / 16.0) /* squared: relative change still to come that is accepted */
-
-#define LEFT_IN_ERRORS 1e-14 /* the same of transported errors: 1e-7 a step, since what is left compounds over steps */
 
 #define LEAST_SIZE 1e-250 /* squared size below which vectors underflow */
 

@@ -15,7 +15,7 @@
 
 /* Fallback to Newton's method when the fixed-point iteration fails. */
 
-static SELDOM int fall_back(int status, const step_data *step, double *dq, double *dp, const solver_options *options,
+static int fall_back(int status, const step_data *step, double *dq, double *dp, const solver_options *options,
     solver_report *report, double *workspace, const error_measure *measure)
 {
   newton_data *newtons = newton_in(workspace);

@@ -35,7 +35,7 @@ static SELDOM int fall_back(int status, const step_data *step, double *dq, doubl
 /* Newton solver for a library without it. Requires: fallback.h, FALLBACK_WORKSPACE. */
 #include <stdlib.h>
 
-static SELDOM int provided_step(const step_data *step, double *dq, double *dp, const solver_options *options,
+static int provided_step(const step_data *step, double *dq, double *dp, const solver_options *options,
     solver_report *report, double *error, const error_measure *measure)
 {
   double *workspace = malloc(sizeof(double) * STATUS(FALLBACK_WORKSPACE));

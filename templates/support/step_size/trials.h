@@ -29,7 +29,8 @@
 #define AT_START (-NEVER_FAILED) /* trial->inside of the shortest one, whose increments are the rates at its start */
 #define FAILURES_BEFORE_NEWTON 3 /* trials of a step in which the iteration of the multipliers fails */
 #define TRIED_AGAIN (-1) /* run->avoiding of the step after those by Newton's method */
-#define GAIN_OF_NEWTON (3 * LEVELS_PER_BINADE) /* levels by which its steps are larger, so that they take less time */
+#define COST_OF_NEWTON (10LL * M * KEPT) /* of an update, in iterations: measured 1 to 10 times M KEPT */
+#define UPDATES 4 /* of a step by Newton's method from a straight line */
 #define UNBENT REAL(1e-11) /* leading coefficients of the velocities of a free flight relative to their change */
 #define LEAP 2 /* levels by which a step is larger than the one before, whose end is then examined */
 #define MOST_EXAMINED 8 /* trials, each up to four times shorter, until no force sets in at the end of a step */
@@ -559,30 +560,38 @@ static SELDOM int may_grow(const run_memory *run, const trial *now, int levels)
 }
 #endif
 
-/* Tries the step by Newton's method where the iteration, not the error, limits the steps: where it fails again at about
- * the size at which it failed before. Newton's method takes several times as long, so that its step has to be so many
- * times as large, with an admissible error; it then solves the next steps. Returns 0 where the step has an inadmissible
- * error. The iteration is tried again after those steps; where it has no admissible step of the same size, Newton's
- * method solves the next ones, too. */
+#ifdef NEWTON_ADMITTED
+/* Returns 1 if so many updates of a step by Newton's method take longer per unit of time than the iteration took. */
+static inline int is_dear(const run_memory *run, long long updates)
+{
+  const real gain = size_of_level(run->grid_level) / size_of_level(run->failed);
+  return (real)(updates * COST_OF_NEWTON) > MANY_ITERATIONS * gain;
+}
+
+/* Returns to the iteration and its size. */
+static inline void leave_newton(run_memory *run)
+{
+  run->avoiding = 0;
+  run->error_before = error_at(run->error_before, (int)(run->failed - run->grid_level));
+  run->grid_level = run->failed;
+}
+#endif
+
+/* Lets Newton's method solve the next steps, too, where the iteration, tried again, has no admissible one of the same
+ * size, and leaves it where shorter ones take longer. Returns 1 after a trial. */
 static inline int try_by_newton(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
 #ifdef NEWTON_ADMITTED
-  const long long level = run->grid_level, above = run->failed + GAIN_OF_NEWTON - level;
-  const int again = run->avoiding == TRIED_AGAIN;
-  const int first = now->change + level == run->change; /* trial of the step */
-  const int near = run->failed - level <= LEVELS_PER_BINADE && level - run->failed <= LEVELS_PER_BINADE;
-  const int repeated = first && run->avoiding == 0 && near;
-  const int unlimited = repeated && levels_within(run, now, INT_MAX) >= above;
-  if (!again && !(unlimited && may_grow(run, now, (int)(run->change + above))))
-    return 0;
-  run->avoiding = -AVOIDED;
-  run->grid_level += again || above < 0 ? 0 : above;
-  try_step(run, now, now->limits.least, options, report);
-  if (again || now->status != OK || now->error <= now->limits.most)
+  if (run->avoiding == TRIED_AGAIN) {
+    run->avoiding = -AVOIDED;
+    try_step(run, now, now->limits.least, options, report);
     return 1;
-  run->avoiding = 0;
-  run->grid_level = level;
-  now->error = INFINITY;
+  }
+  if (run->avoiding < TRIED_AGAIN && is_dear(run, UPDATES)) {
+    leave_newton(run);
+    try_step(run, now, now->limits.least, options, report);
+    return 1;
+  }
 #endif
   return 0;
 }
@@ -622,7 +631,7 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
 #endif
   while (now->status == OK && !(now->error <= now->limits.most * GROWTH)) {
     const int failed = run->error_before > 0 && !(now->error < INFINITY);
-    if ((failed || run->avoiding == TRIED_AGAIN) && try_by_newton(run, now, options, report))
+    if (try_by_newton(run, now, options, report))
       continue;
     if (failed)
       avoid_size(run, now);
@@ -905,20 +914,26 @@ static inline int even_out(const run_memory *run, const trial *now, int change)
 }
 #endif
 
-/* Lets Newton's method solve the next steps where the number of iterations limits their size but never so much that one
- * fails, as with friction that becomes stiff: if the error admits steps so much larger that they take less time. Asked
- * in one of AVOIDED steps, when the next one was chosen. */
+/* Lets Newton's method solve the next steps where the iteration, not the error, limits their size, if the error admits
+ * steps so much larger that they take less time, and no longer than that. Asked after numbers of steps that are powers
+ * of 2, the first of which took the iteration as long as ten updates: so Newton's method takes little longer than the
+ * iteration did before, even if it is always in vain. */
 static inline void change_to_newton(run_memory *run, const trial *now, int is_limited, real error)
 {
 #ifdef NEWTON_ADMITTED
-  const int change = (int)run->change + GAIN_OF_NEWTON;
-  if (!is_limited || by_newton(now) || run->avoiding != 0 || run->step % AVOIDED != 0)
+  const int gain = (int)level_below(UPDATES * COST_OF_NEWTON / MANY_ITERATIONS) + 1;
+  const int change = (int)run->change + gain;
+  const long long steps = run->step + 1;
+  if (by_newton(now) && is_dear(run, UPDATES / 2))
+    leave_newton(run);
+  if (!is_limited || run->change != 0 || by_newton(now) || run->avoiding < 0 || steps < COST_OF_NEWTON || (steps & (steps - 1)) != 0)
     return;
-  if (levels_within(run, now, GAIN_OF_NEWTON) < GAIN_OF_NEWTON || !may_grow(run, now, change))
+  if (levels_within(run, now, gain) < gain || !may_grow(run, now, change))
     return;
   run->avoiding = -AVOIDED;
+  run->failed = run->grid_level;
   run->change = change;
-  run->grid_level += GAIN_OF_NEWTON;
+  run->grid_level += gain;
   run->error_before = error_at(error, change);
 #endif
 }
@@ -930,13 +945,15 @@ static inline void choose_size(run_memory *run, const trial *now)
   const real error = larger(now->error, TRUSTED_DECREASE * run->error_before);
   int change = next_change(run, error, run->error_before, &now->limits);
   const int most = limit_by_iterations(run, now);
-  const int is_limited = change > most;
+  int is_limited = change > most;
   change = is_limited ? most : change;
 #ifdef NEWTON_IN_PLACE
   run->avoiding += run->avoiding < 0;
 #endif
-  if (run->avoiding > 0 && run->avoiding-- && run->grid_level + change >= run->failed)
+  if (run->avoiding > 0 && run->avoiding-- && run->grid_level + change >= run->failed) {
     change = (int)(run->failed - 1 - run->grid_level);
+    is_limited = 1;
+  }
   change = levels_within(run, now, change);
 #ifdef COSTLY_POINTS
   change = even_out(run, now, change);

@@ -24,7 +24,7 @@ from scvi_codegen.extras.verification.convergence import convergence_checks
 from scvi_codegen.extras.verification.impacts import impact_checks
 from scvi_codegen.extras.verification.stepping import step_checks
 from scvi_codegen.extras.verification.structure import structure_checks
-from scvi_codegen.extras.verification.system_under_test import State, SystemUnderTest
+from scvi_codegen.extras.verification.system_under_test import ROUNDINGS, SHORT_RUN, State, SystemUnderTest
 from scvi_codegen.methods import SVI, StoermerVerlet
 from scvi_codegen.runs.compiler import compile_stepper
 from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
@@ -33,9 +33,7 @@ from scvi_codegen.systems.rolling import unroll_sums
 
 __all__ = ["state_of_fields", "verify_arrays"]
 
-SMALL_STEPS, MOST_COORDINATES = 40, 64
-ROUNDINGS = 16.0 * SMALL_STEPS
-"""Bound on the deviation after ``SMALL_STEPS`` steps, in units of rounding."""
+MOST_COORDINATES = 64
 
 
 def state_of_fields(mesh: Any, method: Method | str, h: float | None) -> tuple[Any, Any, float]:
@@ -138,7 +136,7 @@ def _bound(stepper: Stepper, arrays: RunArrays) -> Stepper:
 
 
 def _unrolled_checks(tested: SystemUnderTest) -> Iterator[Check]:
-    statement = f"{SMALL_STEPS} steps equal those of the unrolled system"
+    statement = f"{SHORT_RUN} steps equal those of the unrolled system"
     return checked("unrolled system", statement, partial(_compared_with_unrolled, tested))
 
 
@@ -148,13 +146,13 @@ def _compared_with_unrolled(tested: SystemUnderTest) -> Finding:
     other = compile_stepper(tested.system, tested.method, flags=tested.stepper.flags)
     states = [(first.q, first.p)] * 2
     worst = 0.0
-    for n in range(SMALL_STEPS):  # single steps, which take kinks as formulas
+    for n in range(SHORT_RUN):  # single steps, which take kinks as formulas
         t = first.t + n * first.h
         pairs = zip((tested.stepper, other), states, strict=True)
         states = [stepper.step(*state, first.h, t, tested.parameters) for stepper, state in pairs]
         difference = np.subtract(*map(np.concatenate, states))
         worst = max(worst, float((np.abs(difference) / tested.rounding(first)).max()))
-    return Finding(worst, ROUNDINGS, "in units of rounding of a step")
+    return Finding(worst, ROUNDINGS * SHORT_RUN, "in units of rounding of a step")
 
 
 Numbers = NDArray[np.float64]

@@ -14,6 +14,7 @@ from scvi_codegen.api.methods import Method
 from scvi_codegen.api.systems import ArraySystem
 from scvi_codegen.common.errors import StepFailedError
 from scvi_codegen.extras.verification.certificate import Check, Finding, Outcome, checked, information
+from scvi_codegen.extras.verification.system_under_test import EPSILON, LONG_RUN, ROUNDINGS, SHORT_RUN
 from scvi_codegen.runs.driver.run import Run
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.array_interface import RunArrays
@@ -22,14 +23,12 @@ from scvi_codegen.systems.formulas.numpy_values import Elements, convolved
 
 Numbers = NDArray[np.float64]
 
-EPSILON = 2.0**-52
-ROUNDINGS = 64.0
 SHORT = 2.0**-60
 """Factor of h for steps whose increment is h times the rate at the start, wholly in the compensation terms."""
 PERTURBATION = 2.0**-30
 """Relative change of the state by which the effect of rounding is estimated."""
-WORK, MOST_STEPS = 4_000_000, 1000
-"""Number of coordinates times steps of the run, and its largest number of steps."""
+WORK = 4_000_000
+"""Number of coordinates times steps of the run."""
 RESOLVED = EPSILON
 """Local error below which round-off dominates the change of the energy."""
 
@@ -192,7 +191,7 @@ def _reversal(start: WholeStart) -> Finding:
 def _long_run(start: WholeStart, sizes: str) -> Iterator[Check]:
     run = start.run()
     count = sum(values.size for values in start.p.values())
-    steps = int(max(20, min(MOST_STEPS, WORK // count)))
+    steps = max(SHORT_RUN // 2, min(LONG_RUN, WORK // count))
     before, maps = np.array(run.energies), run.momentum_maps
     terms = _map_sizes(start)
     try:
