@@ -110,7 +110,7 @@ def test_estimates_are_right_and_no_motion_is_falsely_confirmed(family: Any) -> 
     assert confirmed >= 18
 
 
-@pytest.mark.rotated
+@pytest.mark.second
 def test_a_run_with_several_consistent_modes_is_not_confirmed() -> None:
     """Painleve's rod, which may slide or lift: all runs choose the same one of two motions."""
     lagrangian, a = "(x_dot**2 + y_dot**2)/2 + a_dot**2/6 - y", np.arctan(0.5)
