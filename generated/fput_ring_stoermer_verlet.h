@@ -27,7 +27,8 @@ enum {
   FPUT_RING_STOERMER_VERLET_SINGULAR = 2, /* a mass is not positive */
   FPUT_RING_STOERMER_VERLET_NOT_FINITE = 3, /* a value is infinite or NaN */
   FPUT_RING_STOERMER_VERLET_STEP_SIZE_UNDERFLOW = 4, /* step size underflow: the solution ends there */
-  FPUT_RING_STOERMER_VERLET_SPURIOUS_SOLUTION = 5 /* converged to a spurious solution of the stage equations */
+  FPUT_RING_STOERMER_VERLET_SPURIOUS_SOLUTION = 5, /* converged to a spurious solution of the stage equations */
+  FPUT_RING_STOERMER_VERLET_EVERY_BELOW_1 = 7 /* there are arrays for states, but `every` is below 1: no step is taken */
 };
 
 /* Convergence criterion of the iteration: the root mean square of the changes of coordinates, each relative to its
@@ -122,9 +123,9 @@ int fput_ring_stoermer_verlet_step(double t, double h, const double *q0, const d
     const fput_ring_stoermer_verlet_options *options, double *q1, double *p1, fput_ring_stoermer_verlet_report *report,
     double *workspace);
 
-/* Runs with compensated sums and predictors: start a run, then advance it any number of times. Every `every` steps,
+/* Runs with compensated sums and predictors: start one, then advance it any number of times. Every `every` >= 1 steps,
  * counted from its start, the state is stored: t (k), q (k, n), p (k, n), iterations since the last stored one (k);
- * every = 0: none, with NULLs; options NULL: the defaults; no workspace is needed: NULL. */
+ * with NULLs for these none is, and `every` is not read; options NULL: the defaults; no workspace is needed: NULL. */
 void fput_ring_stoermer_verlet_start(fput_ring_stoermer_verlet_run *run, double t, double h, const double *q,
     const double *p);
 int fput_ring_stoermer_verlet_advance(fput_ring_stoermer_verlet_run *run, long long steps, long long every,

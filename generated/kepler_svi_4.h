@@ -27,7 +27,8 @@ enum {
   KEPLER_SVI_4_SINGULAR = 2, /* the Newton matrix is singular */
   KEPLER_SVI_4_NOT_FINITE = 3, /* a value is infinite or NaN */
   KEPLER_SVI_4_STEP_SIZE_UNDERFLOW = 4, /* step size underflow: the solution ends there */
-  KEPLER_SVI_4_SPURIOUS_SOLUTION = 5 /* converged to a spurious solution of the stage equations */
+  KEPLER_SVI_4_SPURIOUS_SOLUTION = 5, /* converged to a spurious solution of the stage equations */
+  KEPLER_SVI_4_EVERY_BELOW_1 = 7 /* there are arrays for states, but `every` is below 1: no step is taken */
 };
 
 /* Convergence criterion of the stage equations. With absolute = 0 the update of the stages, relative to |q| + h|v|, and
@@ -96,9 +97,9 @@ int kepler_svi_4_momentum_maps(long long count, const double *t, const double *q
 int kepler_svi_4_step(double t, double h, const double *q0, const double *p0, const double *parameters,
     const kepler_svi_4_options *options, double *q1, double *p1, kepler_svi_4_report *report, double *workspace);
 
-/* Runs with compensated sums and predictors: start a run, then advance it any number of times. Every `every` steps,
+/* Runs with compensated sums and predictors: start one, then advance it any number of times. Every `every` >= 1 steps,
  * counted from its start, the state is stored: t (k), q (k, m), p (k, m), iterations since the last stored one (k);
- * every = 0: none, with NULLs; options NULL: the defaults. */
+ * with NULLs for these none is, and `every` is not read; options NULL: the defaults. */
 void kepler_svi_4_start(kepler_svi_4_run *run, double t, double h, const double *q, const double *p);
 int kepler_svi_4_advance(kepler_svi_4_run *run, long long steps, long long every, const double *parameters,
     const kepler_svi_4_options *options, double *t, double *q, double *p, int *iterations, kepler_svi_4_report *report,

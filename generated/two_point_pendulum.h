@@ -28,7 +28,8 @@ enum {
   TWO_POINT_PENDULUM_SINGULAR = 2, /* the Newton matrix is singular */
   TWO_POINT_PENDULUM_NOT_FINITE = 3, /* a value is infinite or NaN */
   TWO_POINT_PENDULUM_STEP_SIZE_UNDERFLOW = 4, /* step size underflow: the solution ends there */
-  TWO_POINT_PENDULUM_SPURIOUS_SOLUTION = 5 /* converged to a spurious solution of the stage equations */
+  TWO_POINT_PENDULUM_SPURIOUS_SOLUTION = 5, /* converged to a spurious solution of the stage equations */
+  TWO_POINT_PENDULUM_EVERY_BELOW_1 = 7 /* there are arrays for states, but `every` is below 1: no step is taken */
 };
 
 /* Convergence criterion of the stage equations. With absolute = 0 the update of the stages, relative to |q| + h|v|, and
@@ -91,9 +92,9 @@ int two_point_pendulum_step(double t, double h, const double *q0, const double *
     const two_point_pendulum_options *options, double *q1, double *p1, two_point_pendulum_report *report,
     double *workspace);
 
-/* Runs with compensated sums and predictors: start a run, then advance it any number of times. Every `every` steps,
+/* Runs with compensated sums and predictors: start one, then advance it any number of times. Every `every` >= 1 steps,
  * counted from its start, the state is stored: t (k), q (k, m), p (k, m), iterations since the last stored one (k);
- * every = 0: none, with NULLs; options NULL: the defaults. */
+ * with NULLs for these none is, and `every` is not read; options NULL: the defaults. */
 void two_point_pendulum_start(two_point_pendulum_run *run, double t, double h, const double *q, const double *p);
 int two_point_pendulum_advance(two_point_pendulum_run *run, long long steps, long long every, const double *parameters,
     const two_point_pendulum_options *options, double *t, double *q, double *p, int *iterations,

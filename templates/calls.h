@@ -164,11 +164,12 @@ int NAME(call_pieces)(NAME(call) *c, long long count, const double *t, const dou
     const double *q, const double *p, double *q1, double *p1)
 {
   __typeof__(NAME(advance)) *volatile fixed = NAME(advance);
-  int status = 0;
+  double end[2];
+  int status = 0, iterations;
   for (long long k = 0; k < count && !status; k++) {
     const long long row = k * c->coordinates;
     NAME(start)(c->run, t[k], h[k], q + row, p + row);
-    status = fixed(c->run, pieces[k], pieces[k], c->parameters, c->options, c->t, q1 + row, p1 + row, c->iterations,
+    status = fixed(c->run, pieces[k], pieces[k], c->parameters, c->options, end, q1 + row, p1 + row, &iterations,
         c->report, c->workspace);
   }
   return status;
@@ -192,7 +193,7 @@ int NAME(call_defects)(NAME(call) *c, long long count, const double *t, const do
     memcpy(run->p, p, sizeof run->p);
     memset(run->carry_q, 0, sizeof run->carry_q);
     memset(run->carry_p, 0, sizeof run->carry_p);
-    status = fixed(run, 1, 0, c->parameters, c->options, c->t, c->q, c->p, c->iterations, c->report, c->workspace);
+    status = fixed(run, 1, 1, c->parameters, c->options, NULL, NULL, NULL, NULL, c->report, c->workspace);
     for (int i = 0; i < M; i++) {
       defects[i] = (q[M + i] - run->q[i]) - run->carry_q[i];
       defects[M + i] = (p[M + i] - run->p[i]) - run->carry_p[i];

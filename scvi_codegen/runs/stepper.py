@@ -291,11 +291,6 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
         run._noise = noise
         if segments is None:
             trajectory = run._integrated(initial, begins_by, growth, steps, output)
-            if (
-                output.times is not None and (trajectory.t[:1] != initial.t).any()
-            ):  # errors are those since the initial state
-                start: Any = self._consistent_state(initial, plan) if begins_by else initial[:2]
-                trajectory._initial = float(initial.t), *self._states.pair(*start)
         else:
             run._start_from(initial, begins_by, growth)
             trajectory = segments.record(run, output.save_every, output.progress)

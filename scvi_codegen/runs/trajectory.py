@@ -30,7 +30,7 @@ from scvi_codegen.runs.events.refinement import crossings_of
 from scvi_codegen.runs.forwarding import OfRuns
 from scvi_codegen.runs.results.dense_output import states_at, times_of_words, within
 from scvi_codegen.runs.results.energy import energy_account
-from scvi_codegen.runs.results.export import States, to_dataframe, write_states
+from scvi_codegen.runs.results.export import COLUMNS, States, to_dataframe, write_states
 from scvi_codegen.runs.results.joining import (
     Number,
     accumulated,
@@ -41,7 +41,7 @@ from scvi_codegen.runs.results.joining import (
 )
 from scvi_codegen.runs.results.quantities import describe_states, describe_step_size, quantities_in_modes, quantities_of
 from scvi_codegen.runs.results.recomputation import work_and_impulses_until, work_until
-from scvi_codegen.runs.results.recorded import OfMethod, WithUnsetAttributes, changed
+from scvi_codegen.runs.results.recorded import OfMethod, WithUnsetAttributes, changed, without
 from scvi_codegen.runs.results.saved_states import Array, ModeHistory, checked_row, in_modes
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.rotation_quantities import named_quantities
@@ -98,6 +98,8 @@ class Trajectory(
         pieces: with inputs, the trajectories between their breakpoints, each with its parameters; the first state of
             each is the last of the previous one. ``parameters`` are then those of the first.
         bath: seed of the noise, heat and acceptance up to the end in a heat bath, else ``None``.
+        began: (t, q, p) of the state from which the run began where it may not be saved, else ``None``: see
+            :attr:`initial`.
 
     Trajectories of ensembles have no ``iterations``, ``bath``, ``step_error``, ``worst_step_time``, ``transitions`` and
     numbers of rejected steps, and raise :class:`StateError`, unless there is nothing to record.
@@ -117,8 +119,8 @@ class Trajectory(
     actions: Array | None = field(default=None, repr=False)
     pieces: tuple[Self, ...] = field(default=(), repr=False)
     bath: BathReport | None = None
+    began: tuple[float, Array, Array] | None = field(default=None, repr=False)
     _error: RunError | None = field(default=None, init=False, repr=False)
-    _initial: tuple[float, Array, Array] | None = field(default=None, init=False, repr=False)
     _has_dense_output: ClassVar[bool] = True
 
     def __repr__(self) -> str:
@@ -127,6 +129,11 @@ class Trajectory(
         bath = getattr(self, "bath", None)
         seed = "" if bath is None else f", seed {bath.seed}"
         return describe_states(self, describe_step_size(self.h, self.plan, tau=self.tau is not None) + seed)
+
+    @property
+    def initial(self) -> tuple[float, Array, Array]:
+        """State (t, q, p) from which the run began, since which its errors count: of a slice its first state."""
+        return (scalar(self.t[0]), self.q[0], self.p[0]) if self.began is None else self.began
 
     @overload
     def __getitem__(self, rows: slice) -> Self: ...
@@ -165,6 +172,7 @@ class Trajectory(
         low, high = sorted((self.t[first], self.t[range(first, last, stride)[-1]]))
         return changed(
             self,
+            began=None,
             **{name: getattr(self, name)[rows] for name in ("t", "q", "p", "iterations") if hasattr(self, name)},
             tau=None if self.tau is None else self.tau[rows],
             actions=None if self.actions is None else self.actions[rows],
@@ -177,6 +185,12 @@ class Trajectory(
                 else {}
             ),
         )
+
+    def _between_states(self, t: Array, q: Array, p: Array) -> Self:
+        """Return states at other times of this run, as of dense output, whose iterations and steps are not recorded."""
+        states: dict[str, Any] = {"t": t, "q": q, "p": p, "step_sizes": np.full(len(t), np.nan), "iterations": None}
+        unknown: dict[str, Any] = {"tau": None, "pieces": (), "observed": None, "conserved": None}
+        return without(changed(self, **states, **unknown), "iterations")
 
     def _slice_of_pieces(self, first: int, last: int, stride: int, rows: slice) -> Self:
         if stride > 1:
@@ -390,7 +404,8 @@ class Trajectory(
     def states(self, units: Mapping[str, str] | None = None, *, error: bool = False) -> States:
         """Return the states for :mod:`scvi_codegen.runs.results.export`, with their errors if requested."""
         errors = self.error.arrays if error else {}
-        interface, columns = self.stepper.interface, (self.t, self.q, self.p, self._known_iterations)
+        interface, recorded = self.stepper.interface, tuple(name for name in COLUMNS if hasattr(self, name))
+        columns = tuple(getattr(self, name) for name in recorded)
         by_name = dict(zip(interface.own_parameters, map(float, self.parameters), strict=False))
         derived: Callable[..., Any] = partial(quantities_of, self)
         if self.pieces:
@@ -416,6 +431,7 @@ class Trajectory(
             if isinstance(self.q, Words)
             else {},
             errors=errors,
+            recorded=recorded,
         )
 
     def unresolved(self) -> Array:
@@ -504,21 +520,16 @@ class Trajectory(
         with suppress(StateError):  # outside the domain of L
             energies = self.energy()[::save_every]
             rows.append((plain("energy"), sparkline(energies.tolist(), "energy"), _range(energies)))
-        names, iterations = zip(self.stepper.parameters, self.parameters, strict=False), self._known_iterations
+        names = zip(self.stepper.parameters, self.parameters, strict=False)
         facts = (
             ("time", plain(f"{self.t[0]:g} to {self.t[-1]:g}, {self._steps()}")),
             ("states", plain(f"{len(self)}; q and p of shape {self.q.shape}")),
             ("coordinates", listed(self.stepper.coordinates)),
             ("parameters", listed([f"{name} = {value:g}" for name, value in names])),
-            ("iterations", plain(f"{iterations.sum()}" if hasattr(self, "iterations") else "not recorded")),
+            ("iterations", plain(f"{self.iterations.sum()}" if hasattr(self, "iterations") else "not recorded")),
             ("step error", plain(self._worst())),
         )
         return card(self.stepper.title, facts, grid(rows))
-
-    @property
-    def _known_iterations(self) -> NDArray[np.int32]:
-        """Iterations of the states, -1 in files and tables where they were not recorded."""
-        return getattr(self, "iterations", np.full(len(self), -1, np.int32))
 
     def _steps(self) -> str:
         if not isinstance(self.plan, FixedSteps):
@@ -543,7 +554,8 @@ class Trajectory(
         An ``.npz`` file has arrays t, q, p, iterations, h, parameters, coordinates, parameter_names, and strings title,
         system, method, version; in double-double arithmetic also t_low, q_low, p_low and parameters_low. A CSV file has
         columns t, coordinates x, momenta p_x, iterations, velocities x_dot and energy, NaN where undefined. HDF5 and
-        Zarr files (``.h5``, ``.nc``, ``.zarr``) contain the variables of :meth:`to_xarray`.
+        Zarr files (``.h5``, ``.nc``, ``.zarr``) contain the variables of :meth:`to_xarray`. Trajectories of ensembles,
+        whose iterations are not counted, have none in files and tables.
 
         Args:
             path: file.

@@ -25,6 +25,7 @@ def run_of(n: int, interval: float) -> SimpleNamespace:
 def ensemble_of(n: int, k: int, interval: float) -> EnsembleTrajectory:
     t, none = interval * np.arange(n), np.zeros(k)
     states, about = np.zeros((n, k, 1)), {"h": interval, "parameters": none, "stepper": None}
+    about |= {"initial": (0.0, *np.zeros((2, k, 1)))}
     return EnsembleTrajectory(t=t, q=states, p=states, status=np.full(k, "ok"), steps=none.astype(int), **about)
 
 

@@ -243,7 +243,9 @@ def test_certificates_have_all_groups_of_checks_in_order(
         monkeypatch.setattr(verification, group, lambda *_, group=group: [information(group, "", None)])
     monkeypatch.setattr(verification, "largest_step", lambda _: information("largest_step", "", None))
     monkeypatch.setattr(verification, "compile_stepper", lambda *_, **__: Midpoint())
-    found = verification._certificate(system, MIDPOINT, Midpoint(), START, 0.0, solver="auto", tolerance=tolerance)
+    found = verification._certificate(
+        system, system, MIDPOINT, Midpoint(), START, 0.0, solver="auto", tolerance=tolerance
+    )
     assert [check.name for check in found.checks] == [g for k, g in enumerate(GROUPS) if k not in missing]
     assert (found.q, found.p, found.t, found.h, found.method) == ((0.7,), (0.4,), 0.0, 0.1, MIDPOINT.name)
     assert found.checksum == "6b51d431df5d7f141cbececcf79edf3dd861c3b4069f0b11661a3eefacbba918"  # of "12"

@@ -51,7 +51,7 @@ int main(void)
   for (int i = 0; i < N; i++)
     start[i] = 0.125 * i, start[N + i] = 0.5 - 0.0625 * i;
   ring_start(run, 0.0, {h}, start, start + N);
-  status |= ring_advance(run, {steps}, 0, beta, NULL, NULL, NULL, NULL, NULL, &of_all, NULL);
+  status |= ring_advance(run, {steps}, 1, beta, NULL, NULL, NULL, NULL, NULL, &of_all, NULL);
   show(one.q, M), show(one.p, M), show(run->q, N), show(run->p, N);
   return status;
 }}

@@ -36,7 +36,7 @@ def states_printed(folder, flags=STRICT):
     return np.loadtxt(printed.splitlines(), comments="#"), printed
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("h", [0.03, None])
 @pytest.mark.parametrize("restitution", [0.8, None])
 def test_events_of_a_system_with_inputs(model, h, restitution, tmp_path):

@@ -79,8 +79,7 @@ def main_of(program: str, model: sc.Model, stepper: sc.Stepper, p: np.ndarray) -
 def test_programs_of_the_readme_agree_with_python(kind: str, embedded: str | None, tmp_path: Path) -> None:
     model = KINDS[kind]()
     folder = sc.generate_package(model, tmp_path / "own_svi", embedded=embedded)
-    kinks = "as formulas" if embedded else "located"
-    stepper = sc.compile_stepper(model.system, model.method, events=model.events, prefix="own_svi", kinks=kinks)
+    stepper = sc.compile_stepper(model.system, model.method, events=model.events, prefix="own_svi")
     p = stepper.momentum(model.q, model.velocity)
     plan = {"inputs": INPUT} if model.inputs else {}
     plan |= {"seed": 1} if kind == "bath" else {}

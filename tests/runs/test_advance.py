@@ -52,3 +52,48 @@ def test_the_end_is_saved_if_whole_steps_reach_it(save_every):
     assert few.t[-1] == 1000.0
     assert np.array_equal(few.q[-1], every.q[-1])
     assert few.steps == every.steps
+
+
+SPRINGS = {
+    "fixed steps": (["x"], "svi:3", {"h": 0.1}),
+    "adaptive steps": (["x"], "svi:3", {"t_end": 9.0}),
+    "explicit steps": (["x"], "stoermer-verlet", {"h": 0.1}),
+    "heat bath": (["x"], "svi:2", {"h": 0.1}),
+    "arrays": (["x[N]"], "svi:3", {"h": 0.1}),
+    "arrays by adaptive steps": (["x[N]"], "svi:3", {"t_end": 9.0}),
+}
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("kind", SPRINGS)
+def test_c_stores_states_where_there_are_arrays_for_them(kind):
+    """Then every 1 or more steps, else the call is refused and changes nothing; with NULLs `every` is not read."""
+    coordinates, method, plan = SPRINGS[kind]
+    bath = {"temperature": "0.5", "damping": "0.1"} if kind == "heat bath" else {}
+    energy = "x_dot[i]**2/2 - x[i]**4/4" if "arrays" in kind else "x_dot**2/2 - x**4/4"
+    lagrangian = f"sum(i in N, {energy})" if "arrays" in kind else energy
+    spring = sc.LagrangianSystem.from_text("spring", coordinates, lagrangian, **bath)
+    stepper = sc.compile_stepper(spring, method)
+    binding, ends = stepper.start([1.0], [0.2], **plan).stepper.binding, {}
+    null = binding.null
+
+    def advanced(every, arrays):
+        run = stepper.start([1.0], [0.2], **plan)
+        memory, report = run._memory, binding.new("report *")
+        control = (plan["t_end"], run._call.control) if "t_end" in plan else ()
+        function = binding.function("advance_to" if control else "advance")
+        before = (run.t, run.q.tobytes(), run.p.tobytes(), run.steps)
+        stored = [np.zeros(9), np.zeros(9), np.zeros(9), np.zeros(9, np.int32)]
+        pointers = [*map(binding.pointer, stored)] if arrays else [null] * 4
+        workspace = null if "arrays" in kind else run._workspace
+        given = (run._arguments[0], null, *pointers, report, workspace)
+        status = function(memory, *control, 6, every, *given)
+        after = (run.t, run.q.tobytes(), run.p.tobytes(), run.steps)
+        assert (after == before) == (status != 0)
+        return status, after, int(np.count_nonzero(stored[0]))
+
+    for every in (-1, 0, 1, 3):
+        ends[every] = advanced(every, arrays=True), advanced(every, arrays=False)
+    assert [ends[every][0][0] for every in ends] == [7, 7, 0, 0]
+    assert [ends[every][0][2] for every in ends] == [0, 0, 6, 2]
+    assert {(status, after) for _, (status, after, _) in ends.values()} == {ends[1][0][:2]}

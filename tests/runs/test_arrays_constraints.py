@@ -71,7 +71,7 @@ def test_chains_ordered_from_an_end_need_no_iteration_for_their_linear_systems(s
     run = stepper.start(q, h=1e-4, **data | {"tables": data["tables"] | {"bonds": bonds}})
     memory, binding = run._memory, run.stepper.binding
     report, null = binding.new("report *"), binding.null
-    binding.function("advance")(memory, 10, 0, run._arguments[0], *[null] * 5, report, null)
+    binding.function("advance")(memory, 10, 1, run._arguments[0], *[null] * 5, report, null)
     assert report.iterations > 0
     assert (report.products == 0) == (stride == 1)
     assert np.abs(run.q["r"] - ordered.q["r"]).max() < 1e-14

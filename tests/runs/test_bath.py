@@ -195,7 +195,7 @@ def test_zero_temperature_is_plain_damping_and_heat_balances_the_energy():
     assert abs(energy[-1] - energy[0] - warm.heat()) < 1e-7 < abs(warm.heat())
 
 
-@pytest.mark.rotated
+@pytest.mark.second
 def test_metropolis_with_a_magnetic_field_has_a_direction_variable():
     # a charge in B = 2 and an asymmetric potential; flipped momenta would bias <x> by -.155 and <y^2> by .67
     charge = compiled(

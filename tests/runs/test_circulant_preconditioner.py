@@ -53,7 +53,7 @@ def products_of(stepper, q, h, *, steps=1, **given):
     run = stepper.start(q, h=h, **given)
     memory, binding = run._memory, run.stepper.binding
     report, null = binding.new("report *"), binding.null
-    assert binding.function("advance")(memory, steps, 0, run._arguments[0], *[null] * 5, report, null) == 0
+    assert binding.function("advance")(memory, steps, 1, run._arguments[0], *[null] * 5, report, null) == 0
     return report.products
 
 

@@ -37,7 +37,7 @@ def by_parameter(run: Any, name: str) -> NDArray[Any]:
     return np.asarray(run.sensitivity().parameters[-1, :, run.stepper.parameters.index(name)])
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("gap", [False, True])
 def test_an_oscillator_stops_at_x0_less_8_d(gap: bool) -> None:
     dry: Any = sc.contact("y", slip="x_dot", friction="d") if gap else sc.friction("x_dot", limit="d")
@@ -51,6 +51,7 @@ def test_an_oscillator_stops_at_x0_less_8_d(gap: bool) -> None:
     assert dict(zip(stepper.parameters, gradient.parameters.tolist(), strict=True))["d"] == pytest.approx(-8, abs=1e-10)
 
 
+@pytest.mark.second
 def test_an_input_releases_a_body_that_sticks_at_rest() -> None:
     system = sc.LagrangianSystem.from_text(
         name="pulled",
@@ -74,6 +75,7 @@ def test_an_input_releases_a_body_that_sticks_at_rest() -> None:
     assert run(0.13).pullback(seeds).parameters[0] == pytest.approx(exact, abs=1e-9)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("steps", [{"h": 0.1}, {"tolerance": 1e-12}])
 def test_a_falling_rod_sticks_slides_and_turns(steps: dict[str, float]) -> None:
     floor = sc.contact("y - cos(a)", slip="x_dot - cos(a)*a_dot", friction="mu")
@@ -86,6 +88,7 @@ def test_a_falling_rod_sticks_slides_and_turns(steps: dict[str, float]) -> None:
     assert by_parameter(run(0.3), "mu") == pytest.approx(exact, abs=1e-10)
 
 
+@pytest.mark.second
 def test_a_ladder_leaves_the_wall() -> None:
     contacts = [sc.contact("y - cos(a)"), sc.contact("x - sin(a)")]
     stepper = of(f"{PLANE} + a_dot**2/6 - g*y", "x y a", contacts, "svi:3", g=1)
@@ -98,6 +101,7 @@ def test_a_ladder_leaves_the_wall() -> None:
     assert run(0.2).tangent(along)[-1] == pytest.approx(exact, abs=1e-10)
 
 
+@pytest.mark.second
 def test_a_bouncing_ball_by_its_restitution_which_a_fit_finds() -> None:
     stepper = of("y_dot**2/2 - g*y", "y", [sc.contact("y - a*sin(t)", restitution="e")], "svi:2", g=1, e=0.8, a=0)
     run = stepper.integrate([0.5], velocity=[0], h=0.05, t_end=4.5)
@@ -125,6 +129,7 @@ def test_a_bouncing_ball_by_its_restitution_which_a_fit_finds() -> None:
     assert volume == pytest.approx(5 * 2 * np.log(0.8), abs=1e-9)  # e**2 at each of five impacts
 
 
+@pytest.mark.second
 def test_a_ball_comes_to_rest_and_slides() -> None:
     """Impacts accumulate: x(T) does not depend on e, since friction is mu times impulses with the mean mu m g."""
     floor = sc.contact("y", slip="x_dot", friction="mu", restitution="e")
@@ -140,6 +145,7 @@ def test_a_ball_comes_to_rest_and_slides() -> None:
     assert by_parameter(here, "e") == pytest.approx(0, abs=1e-5)
 
 
+@pytest.mark.second
 def test_several_impacts_at_once_are_refused() -> None:
     contacts = [sc.contact("b - a - 1", restitution=1), sc.contact("c - b - 1", restitution=1)]
     stepper = of("(a_dot**2 + b_dot**2 + c_dot**2)/2", "a b c", contacts, "svi:2")
@@ -173,6 +179,7 @@ def check_by_differences(stepper: Any, q: list[float], velocity: list[float], na
     assert np.abs(run(x).pullback(seeds).parameters.T - found.parameters[-1]).max() < 1e-10
 
 
+@pytest.mark.second
 def test_a_ball_in_space_slides_along_a_parabola_and_rolls() -> None:
     """The slip w0 keeps its direction d: v = v0 - mu g t d until t1 = 2 |w0|/(7 mu g), then v0 - 2 w0/7."""
     table = sc.contact("z - 1/2", slip=ROLLS, friction="mu")
@@ -188,18 +195,21 @@ def test_a_ball_in_space_slides_along_a_parabola_and_rolls() -> None:
     assert by_h == pytest.approx(20 * run.velocity[-1, :2], abs=1e-12)
 
 
+@pytest.mark.second
 def test_impacts_with_friction_in_space_turn_the_slip() -> None:
     floor = sc.contact("z - 1/2", slip=ROLLS, friction="mu", restitution="e")
     stepper = of(SPINS, "x y z a b", [floor], "svi:2", g=9.81, mu=0.03, e=0.7)
     check_by_differences(stepper, [0, 0, 1.5, 0, 0], [2, 3.2, 0, 0, 4], ["mu", "e"], h=0.05, t_end=1.5)
 
 
+@pytest.mark.second
 def test_slip_in_space_begins_at_rest_in_a_direction_that_depends_on_forces() -> None:
     table = sc.contact("z", slip=["x_dot", "y_dot"], friction="mu")
     stepper = of(f"{SPACE} - 9.81*z + F*x + G*x*y + H*y", "x y z", [table], "svi:3", F=3, G=0.5, H=1, mu=0.2)
     check_by_differences(stepper, [0, 0, 0], [0, 0, 0], ["mu", "F", "G", "H"], h=0.02, t_end=1.0)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("steps", "error"), [({"h": 0.05}, 1e-7), ({"h": 0.025}, 5e-9), ({"tolerance": 1e-12}, 5e-10)])
 def test_where_a_puck_on_a_slope_stops(steps: dict[str, float], error: float) -> None:
     """With u = log |w| as independent variable the angle of w has d angle/du = -f sin(angle)/(f cos(angle) - mu N)."""

@@ -56,6 +56,7 @@ def test_the_balance_of_energy_has_the_order_of_the_method(name: str, degree: in
         assert stepper.integrate(q, velocity=v, t_end=span).energy_error() < 2e-13
 
 
+@pytest.mark.second
 def test_work_is_exact_where_the_motion_is(tmp_path: Any) -> None:
     slides = of(POINT, "x y", [sc.contact("y", slip="x_dot", friction=0.3)])
     run = slides.integrate([0.0, 0.0], velocity=[2.0, 0.0], h=0.05, t_end=2.0)
@@ -125,6 +126,7 @@ def test_a_ball_misses_a_wall_of_finite_height(rise: float, meets: bool, steps: 
     assert run.q[-1] == pytest.approx([0.5 if meets else 2.0, rise - G / 2], abs=1e-13)
 
 
+@pytest.mark.tiers(0, 1)
 @STEPS
 def test_contacts_end_at_times_and_beside_others(steps: dict[str, float]) -> None:
     """A floor that is withdrawn at t = 1/3, and two floors side by side with other friction."""
@@ -227,6 +229,7 @@ def test_poissons_law_replaces_newtons_where_that_creates_energy() -> None:
     assert count > 10
 
 
+@pytest.mark.second
 def test_modes_have_names_in_messages_only() -> None:
     stepper = of("x_dot**2/2 - k*x**2/2", "x", [sc.friction("x_dot", limit="d")], "svi:2", k=1.0, d=0.13)
     run = stepper.integrate([1.0], velocity=[0.0], h=0.1, steps=80)

@@ -605,7 +605,7 @@ def test_lanes_converge_as_single_runs(h: float) -> None:
 
 
 @pytest.mark.second
-def test_what_an_ensemble_does_not_record_is_an_error():
+def test_what_an_ensemble_does_not_record_is_an_error(tmp_path: Path) -> None:
     """Neither 1.0 as the acceptance of a run that rejected steps, nor 0 as its iterations; slices and files remain."""
     system = sc.LagrangianSystem.from_text(
         "bath", ["x"], "x_dot**2/2 - x**4/4", parameters={"kT": 1.0}, temperature="kT", damping="0.5"
@@ -624,6 +624,12 @@ def test_what_an_ensemble_does_not_record_is_an_error():
             getattr(runs, name)
     assert "seed" not in repr(runs[0])
     assert "not recorded" in runs[0]._repr_html_()
+    runs[0].save(tmp_path / "member.npz")
+    runs[0].save(tmp_path / "member.csv")
+    with np.load(tmp_path / "member.npz") as file:
+        assert {*file} >= {"t", "q", "p"}
+        assert "iterations" not in file
+    assert (tmp_path / "member.csv").read_text().startswith("t,x,p_x,x_dot,energy\n")
     np.testing.assert_array_equal(runs[0].q, alone.q)
     with pytest.raises(sc.StateError, match=r"kT, is 1e\+300 .* must be below"):
         stepper.integrate([1.0], velocity=[0.0], **plan, parameters={"kT": 1e300})

@@ -247,6 +247,7 @@ def test_a_requested_check_is_of_every_tolerance_and_of_fixed_steps(steps):
             assert warned == (grows and requested is True)
 
 
+@pytest.mark.second
 def test_rounding_far_from_the_origin_is_no_amplification():
     """A million amplitudes away numbers are rounded by 1e-10 of the motion; the same motion around 0 is accurate."""
     system = sc.LagrangianSystem.from_text("far", ["x"], "x_dot**2/2 - (x - c)**4/4", parameters={"c": 0.0})

@@ -41,7 +41,7 @@ def test_snells_law_total_reflection_and_scattering(plan):
         assert run.energy_error() < 1e-15
 
 
-@pytest.mark.rotated
+@pytest.mark.second
 def test_a_square_well_and_a_moving_step():
     well = compiled("x_dot**2/2 - V*(1 - unit_step(x + 1)*unit_step(1 - x))", "x", V=2.0)
     run = well.integrate([0.3], [1.1], t_end=400 / 1.1)
@@ -105,7 +105,7 @@ def test_derivatives_through_refraction_are_those_of_runs():
         assert by == pytest.approx(np.transpose(exact), abs=1e-8)
 
 
-@pytest.mark.rotated
+@pytest.mark.second
 def test_corners_starts_and_grazes():
     corner = compiled(f"{PLANE} - where(x > 0, 0.3, 0) - where(y > 0, 0.2, 0)")
     for q, p in (((-1.0, -1.0), (0.4**0.5, 0.6**0.5)), ((0.0, -1.0), (1.0, 0.6**0.5)), ((0.0, 0.0), (1.0, 1.0))):
@@ -163,7 +163,7 @@ def outcome(name, step):
     return {0: MODES, 1: WARNS}.get(sum("kinks" in str(warning.message) for warning in issued))
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("name", ROWS)
 def test_features_locate_kinks_or_warn_or_refuse(name):
     assert (outcome(name, "positive_part(x)**2"), outcome(name, "unit_step(x)")) == ROWS[name]

@@ -70,16 +70,23 @@ def test_errors_have_sign_and_size(method):
 
 @pytest.mark.parametrize("method", ["svi:4", "svi:8"])
 def test_saving_seldom_and_output_times_do_not_change_the_errors(method):
-    """Random orbits, tolerances and directions, up to the error of the finer method's steps."""
+    """Random orbits, tolerances and directions, up to the error of the finer method's steps; in ensembles, too."""
     random = np.random.default_rng(5)
     for _ in range(3):
         start, tolerance = start_of(random.uniform(0.3, 0.7)), 10.0 ** random.uniform(-9.0, -7.0)
         end = {"t_end": random.choice([-20.0, 20.0]), "tolerance": tolerance}
         runs = [kepler(method).integrate(**start, **end, save_every=k) for k in (1, 7, 10**6)]
-        runs.append(kepler(method).integrate(**start, **end, t_eval=[0.2 * end["t_end"], end["t_end"]]))
+        late = {**end, "t_eval": [0.2 * end["t_end"], end["t_end"]]}
+        runs.append(kepler(method).integrate(**start, **late))
         ends = np.array([np.r_[run.error.q[-1], run.error.p[-1]] for run in runs])
         assert np.abs(ends - ends[0]).max() <= 3e-4 * np.abs(ends).max(), tolerance
         assert runs[-1].error.q[0].any()  # the error since the initial state, which is not among the times
+    two = {"q": [start["q"]] * 2, "velocity": [start["velocity"]] * 2, "parameters": start["parameters"]}
+    member = kepler(method).integrate_ensemble(**two, **late)[1]
+    assert np.array_equal(member.error.q, runs[-1].error.q)
+    assert member.initial[0] == runs[-1].initial[0] == runs[0].initial[0] == 0.0
+    assert not member[:].error.q[0].any()
+    assert member[:].initial[0] == late["t_eval"][0]
 
 
 def test_a_changed_state_changes_later_errors_by_the_tangent_map():

@@ -59,6 +59,7 @@ def consistent(rows: Matrix, slips: Matrix, forces: Matrix, friction: Matrix, ra
     return found
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("seed", "largest"), [(0, 2.0), (1, 5.0)])
 def test_runs_have_one_of_all_consistent_modes_and_say_whether_there_are_several(seed: int, largest: float) -> None:
     """Particles m = 1 of constant forces with up to three contacts, whose normals and slips are neither orthogonal."""

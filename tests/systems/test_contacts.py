@@ -213,6 +213,7 @@ def test_an_oscillator_stops_after_four_swings(degree: int, error: float, gap: b
     assert run.contact_forces()[-1, 0] / units["m"] == pytest.approx([float(gap), -0.04], abs=error)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("degree", "error"), [(1, 3e-3), (2, 2e-7), (3, 2e-11)])
 def test_a_falling_rod_sticks_and_slides(degree: int, error: float) -> None:
     floor = sc.contact("y - cos(a)", slip="x_dot - cos(a)*a_dot", friction=0.3)
@@ -228,6 +229,7 @@ def test_a_falling_rod_sticks_and_slides(degree: int, error: float) -> None:
     assert np.abs(adaptive - true).max() < 1e-11
 
 
+@pytest.mark.second
 def test_a_block_on_a_slope_creeps_nowhere() -> None:
     for degrees, slides in ((20, False), (35, True)):
         a = np.deg2rad(degrees)
@@ -475,6 +477,7 @@ def test_slip_in_space_that_begins_after_a_long_step_has_any_unit_of_time() -> N
     assert ends[2] == pytest.approx(ends[0], abs=1e-7)
 
 
+@pytest.mark.second
 def test_two_slips_in_space_begin_one_after_another() -> None:
     """Each as it does alone, while the other one slides."""
     blocks = [sc.contact(z, slip=[f"{x}_dot", f"{y}_dot"], friction=0.3) for x, y, z in ("xyz", "abc")]
@@ -572,6 +575,7 @@ span = 2.0
 """
 
 
+@pytest.mark.second
 @pytest.mark.filterwarnings("error")
 def test_contacts_are_part_of_a_system_and_of_its_model_file(tmp_path: Any) -> None:
     (tmp_path / "ball.toml").write_text(MODEL)
@@ -799,6 +803,7 @@ def test_static_friction_below_that_of_sliding_ends_a_run_at_rest(
     assert [modes for _, modes in run.contact_modes] == [("slip",)]
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("steps", [{"h": 0.05}, {"h": 0.7}, {}])
 def test_friction_that_is_negative_within_rounding_is_0(steps: dict[str, Any]) -> None:
     """Differences of large terms: 0 everywhere, and 0.7 (x - b)^2 at rest at and beside b; 1e-14 less is negative."""
@@ -821,6 +826,7 @@ def test_coefficients_of_open_contacts_do_not_count() -> None:
     assert run.velocity[-1, 0] == pytest.approx(-3.0, abs=1e-8)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("steps", [{"h": 0.05}, {"h": 0.7}, {}])
 def test_friction_that_vanishes_goes_on(steps: dict[str, Any]) -> None:
     for friction, loss in (("max(0, 0.3 - 0.2*t)", 0.225), ("0.1*(1 - cos(5*t))", 0.2 - 0.02 * np.sin(10))):

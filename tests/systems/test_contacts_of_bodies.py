@@ -125,6 +125,7 @@ def difference(run: Any, body: Body, s: Vector) -> float:
     return float(np.abs(np.concatenate([*ends, run.angular_velocity()[-1] - s[10:]])).max())
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("degree", "stop", "end"), [(1, 1e-15, 2e-3), (2, 1e-7, 2e-7), (3, 1e-12, 1e-11)])
 def test_a_sphere_slides_along_a_parabola_and_rolls(degree: int, stop: float, end: float) -> None:
     """The velocity in the end follows from momenta alone, to round-off; without side spin it is 5/7 of the first."""
@@ -142,6 +143,7 @@ def test_a_sphere_slides_along_a_parabola_and_rolls(degree: int, stop: float, en
         assert np.allclose(run.contact_forces()[0, 0], [19.62, *(-5.886 * direction)], atol=1e-11)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("mu", "e", "t", "n"), [(0, 1, 1, 1), (0.3, 0.5, 0.7, 1), (0, 0, 1.5, 4), (0.3, 0, 1, 2)])
 def test_a_tumbling_box_hits_the_floor_with_its_corner(mu: float, e: float, t: float, n: int) -> None:
     box = Body(BOX.inertia, BOX.c, mu=mu, e=e)
@@ -167,6 +169,7 @@ def test_a_sliding_top_keeps_the_order(degree: int, h: float, error: float) -> N
     assert np.log2(coarse / fine) == pytest.approx(2 * degree, abs=0.2)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("k", [0.0, 0.5])
 def test_a_tippe_top_inverts_and_conserves_jellett_s_integral(k: float) -> None:
     run = stepper_of("svi:3").integrate(**start_of(TOP, SPUN, k=k), t_end=1.4, tolerance=1e-10)
@@ -199,6 +202,7 @@ def test_all_kinds_of_runs_have_the_modes_of_single_ones(tmp_path: Path) -> None
     assert members[0].contact_modes == package.contact_modes == run.contact_modes
 
 
+@pytest.mark.second
 def test_a_free_base_of_a_robot_falls_on_the_floor(tmp_path: Path) -> None:
     (tmp_path / "foot.xml").write_text(
         '<mujoco model="foot"> <option> <flag contact="disable"/> </option> <worldbody> <body name="base"> '

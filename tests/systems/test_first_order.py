@@ -253,7 +253,7 @@ def test_unsupported_uses_are_named() -> None:
         sc.compile_stepper(particle, "svi:2", time_transformation="1 + x**2").integrate([1.0, 0.2], h=0.1, t_end=1.0)
 
 
-@pytest.mark.rotated
+@pytest.mark.second
 def test_inputs(tmp_path) -> None:
     driven = lagrange("driven", "x y", "(x + x**3)*y_dot - x**2/2 - y**2/2 - f*x - f**2*y", inputs="f")
     times = np.linspace(0.0, 2.0, 3)

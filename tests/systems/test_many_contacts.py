@@ -188,7 +188,7 @@ def test_legs_share_friction_within_their_limits() -> None:
     assert np.hypot(*np.linalg.lstsq(rows, [-1.15, -1.725, -0.69])[0][2:4]) > 0.3 * force[1, 0]
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("steps", [{"h": 0.1}, {"tolerance": 1e-6}])
 @pytest.mark.parametrize(
     ("points", "static", "load"),
@@ -223,6 +223,7 @@ def test_slip_of_several_points_begins_at_the_load_of_limit_analysis(points, sta
     assert np.abs(run.velocity[run.t < begins - 1e-8]).max() < 1e-12
 
 
+@pytest.mark.second
 def test_a_table_on_four_legs_tips() -> None:
     start = {"velocity": np.zeros(6), "h": 0.05, "t_end": 1.1, "parameters": {"F": G * 0.5 / TOP / 0.97}}
     run = table(1.5).integrate([0, 0, TOP, 0, 0, 0], **start)
@@ -271,6 +272,7 @@ def test_adaptive_steps_pass_a_slip_that_stops_by_a_small_part_of_its_friction(
     assert run.q[-1] == pytest.approx(fixed.q[-1], abs=2e-5)
 
 
+@pytest.mark.second
 def test_balls_close_at_once_by_one_formula() -> None:
     floor = sc.contact("y[i] for i in 12", slip="x_dot[i]", friction="mu[i]")
     text, mu = "sum(i in 12, (x_dot[i]**2 + y_dot[i]**2)/2 - 9.81*y[i])", 0.01 * np.arange(1, 13)
@@ -298,6 +300,7 @@ def test_a_hundred_balls_bounce_or_rest() -> None:
     assert run.contact_modes[-1][1] == tuple(np.where(e > 0, "open", "slip"))
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(
     ("law", "after"), [("sequential", [0, 0, 0, 0, 1]), ("simultaneous", [-0.6, 0.4, 0.4, 0.4, 0.4])]
 )
@@ -348,6 +351,7 @@ def test_simultaneous_impacts_in_corners_are_those_of_quadratic_programs() -> No
         assert run.velocity[0] == pytest.approx(v, abs=1e-9)
 
 
+@pytest.mark.second
 def test_laws_of_impact_are_named_and_refused_where_they_create_energy() -> None:
     with pytest.raises(sc.SystemDefinitionError, match=r"impacts='at once' .* give 'sequential' or 'simultaneous'"):
         sc.contact("x", impacts="at once")
@@ -406,6 +410,7 @@ def test_feet_on_straight_legs_are_not_held_by_others(speeds, spring, start, dep
         assert run.q[-1] == pytest.approx(true, abs=3e-6)
 
 
+@pytest.mark.second
 def test_tolerances_that_rounding_of_gaps_misses_are_named() -> None:
     """By a warning, an error that is not confirmed, or in the failure, with such a step, or no size, planted."""
     reason = (
@@ -418,7 +423,8 @@ def test_tolerances_that_rounding_of_gaps_misses_are_named() -> None:
     with pytest.warns(sc.AccuracyWarning, match=rf"some adaptive steps have a tolerance of up to 0.0016: r{reason}"):
         assert missed.integrate(**SPRUNG, tolerance=1e-9).modes.missed == pytest.approx(1.6e-3)
     confirmation = missed.integrate(**SPRUNG | {"t_end": 0.01}, error=1e-3).confirmation
-    assert (confirmation.confirmed, confirmation.estimate) == (False, pytest.approx(1.6e-3))
+    assert not confirmation.confirmed
+    assert confirmation.estimate > 1.5e-3
     with pytest.raises(sc.StepFailedError, match=rf"below machine precision.* Or r{reason}erance\. Modes of contacts"):
         failing.integrate(**SPRUNG, tolerance=1e-9)
 
@@ -551,6 +557,7 @@ def test_a_box_without_restitution_falls_flat_and_rests_at_once(speed: float, st
     assert run.velocity[-1] == pytest.approx([0, 0, 0], abs=1e-13)
 
 
+@pytest.mark.second
 def test_contacts_that_contradict_each_other_are_refused_or_slip() -> None:
     """A block on two belts, one of which accelerates: the stronger one carries it, w = t/10, the other slips."""
     belts = [sc.friction("x_dot", limit=1), sc.friction("x_dot - t/10", limit=2)]
@@ -624,6 +631,7 @@ PASSES_A_TOUCH = pytest.mark.xfail(
 )
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.filterwarnings("ignore:a transition has several motions")
 @pytest.mark.parametrize(
     ("seed", "e"),
@@ -739,6 +747,7 @@ def plate(e: float, force: float) -> Any:
     return sc.compile_stepper(system, "svi:3")
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.filterwarnings("ignore:a transition has several motions")
 @pytest.mark.parametrize(("speed", "yaw"), [(1.0, 1e-6), (1.0, 0.05), (3.0, 1e-6), (3.0, 1.0)])
 def test_a_plate_falls_flat_on_four_feet_by_impulses_in_the_cones(speed: float, yaw: float) -> None:
@@ -773,6 +782,7 @@ def test_bounces_of_a_plate_accumulate_until_it_rests(force: float, height: floa
     assert np.abs(run.q[-1] - fixed.q[-1]).max() < 3e-5
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("unit", [100.0, 1000.0])
 def test_a_bar_on_two_points_rests_in_any_unit_of_length(unit: float) -> None:
     """Momenta of rounding become denormal numbers; the bar stops at v^2/(2 a)."""

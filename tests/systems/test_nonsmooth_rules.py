@@ -59,7 +59,7 @@ def test_momenta_are_continuous_where_l_jumps_at_a_time(text: str, x: float, ste
     assert run.p[-1] == pytest.approx([0.0 if "x*unit" in text else 1.0], abs=1e-15)
 
 
-@pytest.mark.rotated
+@pytest.mark.second
 def test_fixed_steps_at_a_power_that_is_not_whole_have_its_order() -> None:
     """Of steps between 1/32 and 1/512 in steps of 2^(1/4), whose errors depend on the place of the zero."""
     text = "x_dot**2/2 - 40*positive_part(-x)**(5/2)"
@@ -105,7 +105,7 @@ def test_starts_at_rest_on_a_surface_take_a_consistent_side(force: str, x: float
     assert (run.q[-1], len(run.switches[0])) == (pytest.approx([x], abs=1e-15), 0)
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @STEPS
 def test_a_relay_accumulates_and_its_equilibrium_is_named(steps: dict[str, float]) -> None:
     """x'' = -sign(x) - x'/2: amplitudes fall as 1/t; at x = 0, x' = 0 both sides point to the surface."""
@@ -157,7 +157,7 @@ def test_forces_that_jump_along_a_slip_are_dry_friction(name: str, steps: dict[s
         assert stated.q[-1] == pytest.approx([-0.1], abs=1e-9)  # amplitudes 1, .7, .4, .1
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("contacts", [[], [sc.friction("x_dot", limit=0.15)]], ids=["force", "contact"])
 def test_friction_is_part_of_steppers_of_either_precision(contacts: list[sc.Friction]) -> None:
     system = lagrange("rule", "x", "x_dot**2/2 - x**2/2", forces={} if contacts else {"x": "-0.15*sign(x_dot)"})
@@ -172,7 +172,7 @@ def test_other_jumps_are_no_friction(force: str) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.MethodWarning")
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("size", [3, 200, "N"])
 def test_friction_of_arrays_is_one_contact_an_element_of_at_most_192(size: int | str) -> None:
     """Smooth forces of arrays of run-time sizes are no expressions."""
@@ -188,7 +188,7 @@ def test_friction_of_arrays_is_one_contact_an_element_of_at_most_192(size: int |
     assert sc.compile_stepper(smooth, "svi:2", flags=QUICK_FLAGS).run_time_sizes
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @STEPS
 @pytest.mark.parametrize(
     ("text", "given", "bend"),
@@ -224,7 +224,7 @@ def test_multiples_of_a_switching_function_are_one() -> None:
     assert made("x_dot**2/2 - positive_part(x - 1)**2 - positive_part(2 - 2*x)**2 - abs(5*x - 5)").modes == ("mode_1",)
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @STEPS
 @pytest.mark.parametrize("v", [1e-2, 1e-4, 1e-6])
 def test_a_slip_in_space_passes_near_zero_without_a_stop(v: float, steps: dict[str, float]) -> None:
@@ -255,7 +255,7 @@ def test_a_stop_sticks_only_below_the_static_limit(start: float) -> None:
     assert run.contact_modes == [(0.0, ("slip",)), (pytest.approx(swings * np.pi), ("stick",))]
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @STEPS
 @pytest.mark.parametrize("beyond", [0.0, 1e-16, 1e-14, 1e-12, 1e-10, 1e-9])
 def test_friction_at_its_limit_lets_a_body_go_that_is_pushed_harder(beyond: float, steps: dict[str, float]) -> None:
@@ -268,7 +268,7 @@ def test_friction_at_its_limit_lets_a_body_go_that_is_pushed_harder(beyond: floa
         assert run.q[-1] == pytest.approx([1 / 6 + f * beyond / 2, 0.0], abs=1e-14)
 
 
-@pytest.mark.rotated
+@pytest.mark.second
 def test_restored_runs_and_members_have_the_modes_and_bits_of_runs() -> None:
     ball = made(
         "(x_dot**2 + y_dot**2)/2 - 9.81*y",
@@ -297,7 +297,7 @@ def test_names_of_a_system_win_over_functions(name: str) -> None:
     assert stepper.integrate([1.0], [0.0], h=0.1, t_end=np.pi / 2).q[-1] == pytest.approx([-1.0], abs=1e-8)
 
 
-@pytest.mark.rotated
+@pytest.mark.second
 def test_a_closed_contact_takes_part_in_impacts_with_restitution_0() -> None:
     """A plate of mass 2 at rest on a floor of restitution 0.8 stays; a ball bounces on it with 0.5."""
     contacts = [sc.contact("y", restitution=0.8), sc.contact("z - y - 1", restitution=0.5)]

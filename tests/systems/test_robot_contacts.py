@@ -300,7 +300,7 @@ WALKER = f"""<body pos="0 0 .43"><joint name="x" type="slide" axis="1 0 0"/><joi
 
 @pytest.mark.filterwarnings("ignore:a transition has several motions")
 @pytest.mark.filterwarnings("ignore:the contacts depend")
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("speed", "changes"), [(0.0, 2), (0.1, None)])
 def test_a_robot_lands_on_straight_legs(speed, changes, tmp_path):
     """Gaps of three feet are of rank two where knees are straight, and almost so in the oscillation about it.
@@ -483,7 +483,7 @@ LEGS = """<body><joint name="z" type="slide" axis="0 0 1"/><joint name="x" type=
 <body pos="0 0 {}"><joint name="knee" axis="0 1 0" range="-150 0"/>{}</body></body></body>"""
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("length", "mass"), [(1.0, 1.0), (1e3, 1e-3)])
 def test_joints_at_their_limits_stay_there_in_free_fall(length, mass, tmp_path):
     """Forces of these joints are 0: what remains of the weights of their bodies is rounding."""

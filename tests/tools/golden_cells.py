@@ -235,15 +235,6 @@ RUBBED = partial(single, system=rubbed, q=(0.3, -0.4), p=(0.2, 0.5), h=0.05)
 CHAIN = partial(
     single, system=catalogue("fput-chain:12"), q=tuple(0.1 * k - 0.3 for k in range(12)), p=(0.2,) * 12, h=0.1
 )
-PLANETS = problem("outer-solar-system")
-MASSES = (1.0, 9.5e-4, 2.9e-4, 4.4e-5, 5.2e-5, 7.7e-9)
-SOLAR = partial(
-    single,
-    system=catalogue("outer-solar-system"),
-    q=PLANETS.q,
-    p=tuple(MASSES[k // 3] * v for k, v in enumerate(PLANETS.velocity or ())),
-    h=100.0,
-)
 DAMPED = partial(single, system=samples.damped_pendulum, q=(0.3, -0.4), p=(0.2, 0.5), h=0.05)
 RODS = partial(single, system=rods, q=(0.6, 0.8, 1.6, 0.8), p=(-0.8, 0.6, -0.4, 0.3), h=0.01)
 BODY = partial(single, system=body, q=(0.5, 0.5, -0.5, 0.5), p=(3.0, -5.0, 9.0, 12.0), h=0.4, steps=300)

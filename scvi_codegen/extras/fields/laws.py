@@ -16,7 +16,7 @@ at ends. Values at end points that elements share are means weighted by length.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 from typing import Any
@@ -355,8 +355,7 @@ class FieldHistory:
         spacing = np.where(np.abs(before) < np.abs(after), before, after) / 20
         times = self.t[:, np.newaxis] + steps * spacing[:, np.newaxis]
         q, p = self.run.at(times.ravel())
-        changed = {"t": times.ravel(), "q": q, "p": p, "tau": None, "step_sizes": np.full(times.size, np.nan)}
-        return times, FieldHistory(self.mesh, replace(self.run, **changed, iterations=np.zeros(times.size, np.int32)))
+        return times, FieldHistory(self.mesh, self.run._between_states(times.ravel(), q, p))
 
     def values(self, formula: Expr) -> Array:
         """Return a formula in functions and their derivatives."""

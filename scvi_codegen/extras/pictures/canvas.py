@@ -16,7 +16,6 @@ from scvi_codegen.api.checks import Kind
 from scvi_codegen.api.text import write_atomically
 from scvi_codegen.common.errors import PlotError, StateError, StepFailedError
 from scvi_codegen.runs.recording import RecordedRun
-from scvi_codegen.runs.results.recorded import changed
 from scvi_codegen.runs.stepping.step_plan import FixedSteps
 from scvi_codegen.runs.trajectory import Trajectory
 
@@ -172,12 +171,7 @@ def at_times(motion: Trajectory, times: Array) -> Trajectory:
         ahead = np.sign(motion.t[-1] - motion.t[0])
         rows = np.searchsorted(ahead * motion.t, ahead * inside, side="right") - 1
         q, p = (motion.stepper.named(np.asarray(states)[rows]) for states in (motion.q, motion.p))
-    unknown: dict[str, Any] = {
-        "iterations": np.zeros(len(q), np.int32),
-        "step_sizes": np.full(len(q), np.nan),
-        "tau": None,
-    }
-    return changed(motion, t=times, q=q, p=p, **unknown, pieces=(), observed=None, conserved=None)
+    return motion._between_states(times, q, p)
 
 
 def column(interface: Interface, states: Any, name: str) -> Array:

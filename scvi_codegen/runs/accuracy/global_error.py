@@ -182,11 +182,12 @@ def warn_of_unconfirmed_run(trajectory: Any) -> None:
     at_start = result.confirmed_until == float(trajectory.t[0])
     until = "at no time" if at_start else f"until t = {result.confirmed_until:.6g} only"
     why = f" ({result.reason})" if result.reason else f": that of the run is up to about {result.estimate:.1e}"
-    remedy = "Give a larger error" if at_start else "End the run there, or give a larger error"
-    remedy += _alternative(trajectory, result)
+    ways = ["end the run there"] * (not at_start) + ["give a larger error"] * (not result.reason)  # else it is unknown
+    remedy = (", or ".join(ways) + _alternative(trajectory, result)).removeprefix("; or ")
+    remedy = f" {remedy[:1].upper()}{remedy[1:]}" if remedy else ""
     if (trajectory.stepper.origin or trajectory.stepper)._finer is None:  # loaded: no bound is confirmed
-        remedy = "A package has a model.toml: load_model(..).stepper()"
-    warn(f"the global error {result.requested:g} is confirmed {until}{why}. {remedy}", AccuracyWarning)
+        remedy = " A package has a model.toml: load_model(..).stepper()"
+    warn(f"the global error {result.requested:g} is confirmed {until}{why}.{remedy}", AccuracyWarning)
 
 
 def _alternative(trajectory: Any, result: GlobalError) -> str:

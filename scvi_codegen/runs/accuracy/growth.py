@@ -15,8 +15,6 @@ from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.memory import Memory
 from scvi_codegen.runs.stepping.step_plan import Adaptive, StepPlan
 
-ROUNDINGS = 100
-"""Roundings of a number by which steps of round-off err: positions ten motions away are no cause."""
 UNCHECKED, MEANINGLESS = 1e-4, 1e-2
 """Tolerance from which on only a requested check is made, and error beyond which no digit is left."""
 
@@ -50,7 +48,7 @@ def warn_of_error_growth(run: Memory, t_end: float, *, requested: bool) -> None:
     else:
         left = counted(math.floor(-math.log10(error)), "digit")
         what = f"they grow far above the tolerance after t = {accurate_until:g}, which leaves {left} at t = {t_end:g}"
-    cause = _rounding_far_from_origin(run) or f"the motion amplifies errors: {what} (estimated)."
+    cause = _rounding_far_from_origin(run, error) or f"the motion amplifies errors: {what} (estimated)."
     warn(
         f"{cause} Use error= to find the time until which digits are confirmed, or check_growth=False to skip this "
         "check",
@@ -58,13 +56,18 @@ def warn_of_error_growth(run: Memory, t_end: float, *, requested: bool) -> None:
     )
 
 
-def _rounding_far_from_origin(run: Memory) -> str:
-    """Return the cause where positions are rounded by more than the error of steps: no motion amplifies that."""
-    memory, allowed = run._memory, max(getattr(run.plan, "tolerance", None) or 0.0, ROUNDINGS * roundoff(1))
+def _rounding_far_from_origin(run: Memory, error: float) -> str:
+    """Return the cause where rounding of positions makes the error, and would not near the motion.
+
+    The roundings r of N steps add up to N^(3/2) r or less where no motion amplifies them (D. Brouwer, On the
+    accumulation of errors in numerical integration, Astron. J. 46 (1937) 149-153).
+    """
+    memory, tolerance, sums = run._memory, getattr(run.plan, "tolerance", None) or 0.0, run.steps**1.5
     for i, name in enumerate(run.stepper.interface.coordinates):
         low, high = memory.lowest[i], memory.highest[i]
         size, motion = max(abs(low), abs(high)), high - low
-        if motion > 0.0 and (rounding := roundoff(1) * size / motion) > allowed:
+        rounding = roundoff(1) * size / motion if motion > 0.0 else 0.0
+        if rounding > tolerance and sums * roundoff(1) < error <= sums * rounding:
             return (
                 f"{name}, of size {size:.3g}, moves by {motion:.3g}, so that numbers are rounded by {rounding:.1e} of "
                 f"the motion, more than the steps err: choose an origin of {name} near the motion."

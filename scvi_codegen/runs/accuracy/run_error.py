@@ -181,7 +181,7 @@ class WithErrors:
 
     @property
     def error(self: Any) -> RunError:
-        """Global errors of all states since the first one, with their signs (:class:`RunError`), made at first access.
+        """Global errors of states since :attr:`initial`, with their signs (:class:`RunError`), made at first access.
 
         One step of a finer method and products with the Jacobian of the step for each step, about four to seven times
         the cost of the run and 0.2 ms, more where Newton's method solves it; a finer method is compiled once.
@@ -217,7 +217,10 @@ def error_of(run: Any) -> RunError:
     stepper = run.stepper
     require(stepper, "run_error")
     if run.modes is not None and run.modes.ambiguous:
-        raise StateError("the error is undefined: several motions of the contacts were consistent, and the run is one")
+        raise StateError(
+            "the error is undefined: several motions of the contacts were consistent, and the run is one; reduce the "
+            "friction, or change the geometry"
+        )
     finer = finer_of(stepper)
     if _is_compared(stepper, finer):
         return _compared(run, finer)
@@ -341,11 +344,9 @@ class _Replay:
     def of_run(self) -> tuple[Array, str]:
         """Return (1 + samples, 2m, n) errors and rounding errors, NaN where unknown, and the reason for that."""
         first, result = 0, np.full((*self.now.shape, len(self.run)), np.nan)
-        initial, reason = getattr(self.run, "_initial", None), ""
+        (t, q, p), reason = self.run.initial, ""
         try:
-            if initial is not None:  # t_eval without the initial time
-                t, q, p = initial
-                self._by_run(self.run, t, q, p, 0, steps=self.steps)
+            self._by_run(self.run, t, q, p, 0, steps=self.steps)
             result[..., 0] = self.now
             for piece in self.run._runs:
                 for row, vectors in self._along(piece):
@@ -496,10 +497,10 @@ class _Replay:
 
     def _by_run(self, piece: Any, t: float, q: Array, p: Array, end: int, *, steps: float) -> None:
         """Transport the errors to a row by a run of the finer method at round-off, over the events in between."""
-        parameters, stop = parameters_set_until(piece, t), float(piece.t[end])
+        stop = float(piece.t[end])
         if stop == t:
             return
-        plan = ending_at(Adaptive(stop), stop)
+        plan, parameters = ending_at(Adaptive(stop), stop), parameters_set_until(piece, t)
         run = self.finer._run(np.asarray(q), np.asarray(p), plan=plan, t=t, parameters=parameters)
         fine = run._recorded(None, ALL_STATES)
         if len(times_of_changes(fine)) or (fine.modes is not None and len(fine.modes.t)):
@@ -547,18 +548,19 @@ def _compared(run: Any, finer: Any) -> RunError:
 
 
 def _states_of(run: Any, finer: Any, begin: Callable[[Any], Any]) -> tuple[Any, Any]:
-    """Return (n, m) positions and momenta of the finer run at the times of a run, from ``begin`` of its first state."""
+    """Return (n, m) positions and momenta of the finer run at the times of a run, from ``begin`` of its start."""
     two_words, parts = finer.interface.words > 1, list[Any]()
-    start = [x if two_words else begin(x) for x in (run.q[0], run.p[0])]
+    t, *state = run.initial
+    start = [x if two_words else begin(x) for x in state]
     if two_words and begin is neighbouring:
         start = [with_low(np.asarray(x), low_words(x) + roundoff(2) * np.asarray(x)) for x in start]
     for piece in run._runs:
         end = float(piece.t[-1])
         control = Adaptive(end, float(finer.binding.function("smallest_tolerance")()) if two_words else None)
         plan = ending_at(piece.plan, end) if run.stepper.in_tau else control
-        fine = finer._run(*start, plan=plan, t=piece.t[0], parameters=piece.parameters)._recorded(None, ALL_STATES)
+        fine = finer._run(*start, plan=plan, t=t, parameters=piece.parameters)._recorded(None, ALL_STATES)
         parts.append(fine._states_at(piece.t))
-        start = [x[-1] for x in parts[-1]]
+        t, start = piece.t[-1], [x[-1] for x in parts[-1]]
     q, p = (concatenated(list(of)) for of in zip(*parts, strict=True))
     return q, p
 

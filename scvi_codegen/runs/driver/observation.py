@@ -169,10 +169,13 @@ class AtTimes(Saver):
     def __init__(self, times: Array) -> None:
         super().__init__()
         self.times = times
+        self.began: tuple[float, Array, Array] | None = None
 
     def receive(self, chunk: StateChunk) -> None:
         """Save the states at the times within the chunk, by partial steps."""
         part, forward = chunk.states, chunk.states.forward
+        if chunk.is_first:
+            self.began = part.initial
         left, right = forward * part.t[0], forward * part.t[-1]
         after = forward * self.times >= left if chunk.is_first else forward * self.times > left
         times = self.times[after & (forward * self.times <= right)]
@@ -183,6 +186,10 @@ class AtTimes(Saver):
 
     def cut_step(self, size: float) -> None:
         """Output times are within steps."""
+
+    def fields(self) -> dict[str, Any]:
+        """Return the state from which the run began, which may be at none of the times."""
+        return {"began": self.began}
 
 
 class Observed(Saver):

@@ -323,6 +323,7 @@ def plain_trajectory(
     trajectory.events = trajectory.transitions = trajectory.pieces = ()
     trajectory.bath = report_of(memory._memory) if memory._takes_noise else None
     trajectory.modes = trajectory.tau = trajectory.confirmation = trajectory.observed = trajectory.conserved = None
+    trajectory.began = None
     return trajectory
 
 

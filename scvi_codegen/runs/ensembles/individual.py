@@ -271,6 +271,7 @@ class IndividualRuns:
             plans=self.plans,
             confirmations=tuple(self.confirmations),
             parameters=ensemble.parameters,
+            initial=(ensemble.t0, ensemble.q, ensemble.p),
             stepper=stepper,
             spans=tuple(self._spans(t)) if ensemble.inputs else (),
         )

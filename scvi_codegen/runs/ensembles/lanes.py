@@ -21,7 +21,7 @@ from scvi_codegen.runs.driver.run_loop import record
 from scvi_codegen.runs.ensembles.batches import CHUNK_SECONDS, FIRST_CHUNK_STEPS, GROWTH, Batch, Rows, SuccessiveRuns
 from scvi_codegen.runs.ensembles.ensemble import Ensemble
 from scvi_codegen.runs.ensembles.observation import EnsembleObservation
-from scvi_codegen.runs.ensembles.result import INTERRUPTED, OK, EnsembleTrajectory
+from scvi_codegen.runs.ensembles.result import INTERRUPTED, OK, EnsembleTrajectory, failure_after
 from scvi_codegen.runs.ensembles.schedule import CommonSteps
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.states.words import from_block
@@ -145,6 +145,8 @@ class CommonRuns:
         if unfinished.any():
             status = np.where(unfinished & (status == OK), INTERRUPTED, status)
         spans = self.steps.spans() if ensemble.inputs else ()
+        failed = np.flatnonzero((status != OK) & (status != INTERRUPTED)).tolist() if self.times is None else ()
+        steps = {j: int(self.done[j]) for j in failed}
         return EnsembleTrajectory(
             t=self.steps.t.copy() if self.times is None else self.times,
             q=self.q,
@@ -154,10 +156,12 @@ class CommonRuns:
             steps=self.done,
             h=self.steps.h,
             parameters=ensemble.parameters,
+            initial=(ensemble.t0, ensemble.q, ensemble.p),
             stepper=ensemble.stepper,
             observed=None if self.observation is None else self.observation.result(),
             actions=self.actions,
             fallback_steps=self.fallback_steps,
+            messages={j: failure_after(self.steps.at(n)[1][0], n, str(status[j])) for j, n in steps.items()},
             spans=tuple((rows, slice(None), partial(ensemble.values_at, segment.middle)) for rows, segment in spans),
         )
 

@@ -51,6 +51,11 @@ Span: TypeAlias = tuple[slice, slice, Callable[[slice], Array]]
 """Rows of states, a slice of trajectories, and a function returning the parameters of trajectories in these rows."""
 
 
+def failure_after(t: float, steps: int, status: str) -> str:
+    """Return why a trajectory ended at time t after so many steps."""
+    return f"after t = {t:.6g}, {steps} steps: {'. '.join(FAILURES[status])}"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, OfEnsembles, TwoWords, OfMethod):
     """States of k trajectories, the initial state first.
@@ -77,6 +82,7 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, OfEnsembles, TwoWor
         events: (k,) crossings of the events of each trajectory, parallel to ``stepper.events``; empty without events.
         modes: (k,) values of ``stepper.modes`` along each trajectory, as of :class:`Trajectory`; empty without modes.
         messages: of the errors of trajectories that were integrated one by one, by their numbers; see :attr:`failures`.
+        initial: time, (k, m) positions and (k, m) momenta from which they began, which ``t_eval`` may omit.
     """
 
     t: Array
@@ -87,6 +93,7 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, OfEnsembles, TwoWor
     h: float | None
     parameters: Array
     stepper: Integrator = field(repr=False)
+    initial: tuple[float, Array, Array] = field(repr=False)
     tau: Array | None = None
     plans: Sequence[Adaptive] = ()
     observed: Array | None = field(default=None, repr=False)
@@ -159,9 +166,10 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, OfEnsembles, TwoWor
                 fallback_steps=0 if self.fallback_steps is None else int(self.fallback_steps[j]),
             )
             pieces.append(without(piece, *self._unset))
-        whole = joined(pieces) if len(pieces) > 1 else pieces[0]
+        whole, (t0, q0, p0) = joined(pieces) if len(pieces) > 1 else pieces[0], self.initial
         return changed(
             whole,
+            began=(t0, self.stepper.named(q0[j]), self.stepper.named(p0[j])),
             events=self.events[j] if self.events else (),
             modes=modes,
             confirmation=self.confirmations[j] if self.confirmations else None,
@@ -211,8 +219,8 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, OfEnsembles, TwoWor
 
         def cause_of(j: int) -> str:
             steps = int(self.steps[j])
-            t = ends[j] if self.h is None or self.tau is not None else self.times[0, j] + steps * self.h
-            return f"after t = {t:.6g}, {steps} steps: {'. '.join(FAILURES[str(self.status[j])])}"
+            t = ends[j] if self.h is None or self.tau is not None else self.initial[0] + steps * self.h
+            return failure_after(t, steps, str(self.status[j]))
 
         return {j: self.messages.get(j) or cause_of(j) for j in failed}
 

@@ -67,7 +67,7 @@ class States:
 
     Attributes:
         count: number n of states.
-        pieces: returns an iterator over chunks in order; may be called repeatedly.
+        pieces: returns an iterator over chunks in order, each with the arrays ``recorded``; may be called repeatedly.
         coordinates, momenta: the m names of the columns of q and of p.
         parameters: value by name.
         h: step size.
@@ -79,10 +79,11 @@ class States:
         units: of t, q, p and these, as far as known.
         low: low words of t, q, p and parameters in double-double arithmetic, by name of the file's arrays.
         errors: (n, m) errors of q and p and their rounding errors, by name of the file's arrays; or none.
+        recorded: t, q, p, and iterations where they were counted.
     """
 
     count: int
-    pieces: Callable[[], Iterator[Piece]]
+    pieces: Callable[[], Iterator[tuple[NDArray[Any], ...]]]
     coordinates: tuple[str, ...]
     momenta: tuple[str, ...]
     parameters: Mapping[str, float]
@@ -94,6 +95,7 @@ class States:
     units: Mapping[str, str] = field(default_factory=dict)
     low: Mapping[str, Array] = field(default_factory=dict)
     errors: Mapping[str, Array] = field(default_factory=dict)
+    recorded: tuple[str, ...] = COLUMNS
 
     @property
     def attributes(self) -> dict[str, Any]:
@@ -104,13 +106,14 @@ class States:
     def columns(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
         """Return shape and type of each array."""
         n, m = self.count, len(self.coordinates)
-        real = np.dtype(float)
-        return {"t": ((n,), real), "q": ((n, m), real), "p": ((n, m), real), "iterations": ((n,), np.dtype(np.int32))}
+        real, counts = np.dtype(float), np.dtype(np.int32)
+        columns = {"t": ((n,), real), "q": ((n, m), real), "p": ((n, m), real), "iterations": ((n,), counts)}
+        return {name: columns[name] for name in self.recorded}
 
     def labelled(self) -> Labelled:
         """Return the arrays with named dimensions, including derived quantities."""
         dimensions: dict[str, tuple[str, ...]] = {"t": ("t",), "coordinate": ("coordinate",)}
-        dimensions |= {"q": ("t", "coordinate"), "p": ("t", "coordinate"), "iterations": ("t",)}
+        dimensions |= {name: ("t", "coordinate")[: len(shape)] for name, (shape, _) in self.columns().items()}
         dimensions |= dict.fromkeys(self.errors, ("t", "coordinate"))
         whole = {"coordinate": np.array(self.coordinates)}
         if len(self.parameters) > MOST_IN_TEXT:
@@ -139,11 +142,12 @@ class States:
 
     def _labelled_pieces(self) -> Iterator[dict[str, NDArray[Any]]]:
         first = 0
-        for t, q, p, iterations in self.pieces():
+        for piece in self.pieces():
+            t, q, p, *_ = piece
             more = {} if self.quantities is None else self.quantities(t, q, p)
             errors = {name: values[first : first + len(t)] for name, values in self.errors.items()}
             first += len(t)
-            yield {"t": t, "q": q, "p": p, "iterations": iterations, **errors, **more}
+            yield {**dict(zip(self.recorded, piece, strict=True)), **errors, **more}
 
 
 def chunk_rows(dimension: int) -> int:
@@ -198,8 +202,8 @@ def to_dataframe(states: States) -> pandas.DataFrame:
 
 
 def _names(states: States) -> list[str]:
-    """Return column names: t, coordinates x, momenta p_x, iterations; velocities, energy and attitudes, if known."""
-    names = ["t", *states.coordinates, *states.momenta, "iterations"]
+    """Return column names: t, coordinates x, momenta p_x; iterations, velocities, energy and attitudes, if known."""
+    names = ["t", *states.coordinates, *states.momenta, *states.recorded[3:]]
     if states.quantities is not None:
         names += [*(f"{name}_dot" for name in states.coordinates), "energy"]
         names += [name for quantity in states.attitudes for name in quantity.columns]
@@ -208,13 +212,13 @@ def _names(states: States) -> list[str]:
 
 def _columns(states: States) -> Iterator[Iterator[NDArray[Any]]]:
     """Yield the columns of :func:`_names`, (n,) each, chunk by chunk."""
-    for t, q, p, iterations in states.pieces():
+    for t, q, p, *counted in states.pieces():
         derived = {} if states.quantities is None else states.quantities(t, q, p)
         more = (*derived["velocity"].T, derived["energy"]) if derived else ()
         if derived:
             tables = [derived[quantity.name].reshape(len(t), -1).T for quantity in states.attitudes if quantity.columns]
             more += tuple(column for table in tables for column in table)
-        yield iter((t, *q.T, *p.T, iterations, *more))
+        yield iter((t, *q.T, *p.T, *counted, *more))
 
 
 def _write_npz(states: States, path: Path) -> None:

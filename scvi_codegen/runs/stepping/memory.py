@@ -75,8 +75,8 @@ STEPS_NEAR_REST = 16
 """Number of steps in which a force moves a state away from rest."""
 EVENT_NUMBERS = ("undefined", "inseparable", "accumulated", "through", "jammed", "sliding", "chatters")
 """Numbers of events, from 1 on, in the state of the search for events; 0 for none, < 0 for an undefined change."""
-NO_OUTPUT, NO_PLAN = LARGEST_COUNT, Fixed(math.nan)
-"""Output stride that saves no state; plan of a run that was not started."""
+NO_PLAN = Fixed(math.nan)
+"""Plan of a run that was not started."""
 
 Called = TypeVar("Called", bound=Callable[..., Any])
 
@@ -143,9 +143,7 @@ class Memory:
         self._has_tau = stepper.in_tau  # whether steps are steps of tau
         self._report, self._workspace = binding.new("report *"), binding.workspace(memory)
         self._calls: tuple[Any, ...] = ()
-        width = max(2, stepper.dimension * stepper.interface.words)
-        self._discarded = *(binding.numbers(f"double[{width}]"),) * 3, binding.numbers("int *")
-        self._call = self._new_call(*self._discarded)
+        self._call = self._new_call(*(binding.null,) * 4)  # no arrays: no states are stored
         self._take = binding.call("advance", self._call)  # function of numbers of steps and of those between states
         self._untimed = len(self._q) <= MOST_UNTIMED  # whether ``advance`` takes steps without looking at the clock
         self._chunk = 1  # steps of the next C call otherwise
@@ -518,7 +516,7 @@ class Memory:
                     size = left if left < STEPS_PER_CALL else STEPS_PER_CALL
                     if self._unset_inputs:
                         self.check_inputs()
-                    if status := self._take(size, NO_OUTPUT):
+                    if status := self._take(size, 1):
                         raise self._failure(status)
                     left -= size if fixed else self._report.steps
             else:
@@ -544,7 +542,7 @@ class Memory:
     def _taken(self, steps: int) -> int:
         if self._unset_inputs and steps:
             self.check_inputs()
-        if status := self._take(steps, NO_OUTPUT):
+        if status := self._take(steps, 1):
             raise self._failure(status)
         taken: int = self._report.steps
         return taken
@@ -574,7 +572,7 @@ class Memory:
         try:
             return self._take(steps, save_every)
         finally:
-            call.t, call.q, call.p, call.iterations = self._discarded
+            call.t = call.q = call.p = call.iterations = self.stepper.binding.null
             if actions:
                 self._memory.actions = self.stepper.binding.null
 

@@ -305,10 +305,9 @@ class LinearisedMethod(StateFunctions):
         """Call a function of C that takes steps from states of its own; return its status and report."""
         binding = self.binding
         run, call, report = map(binding.new, ("run *", "call *", "report *"))
-        t, iterations, workspace = binding.numbers("double *"), binding.numbers("int *"), binding.workspace(run)
-        settings = binding.options(options)
+        settings, workspace = binding.options(options), binding.workspace(run)
         call.run, call.parameters, call.options = run, binding.pointer(parameters), settings
-        call.t, call.iterations, call.report, call.workspace = t, iterations, report, workspace
+        call.report, call.workspace = report, workspace
         call.coordinates = self.dimension
         return binding.call(name, call)(*arguments), report
 

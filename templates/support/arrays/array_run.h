@@ -15,7 +15,7 @@ typedef struct job {
   const solver_options *options;
   double t_end;
   const step_control *control; /* of adaptive steps; NULL: fixed steps */
-  long long steps, every; /* at most; between stored states, 0: none is stored */
+  long long steps, every; /* at most; between stored states, if t is not NULL */
   double *t, *q, *p;
   int *iterations;
 } job;
@@ -79,7 +79,7 @@ static void store_state(run_memory *run, const job *way, solver_report *report, 
   const section own = mine(run, n);
   const size_t size = sizeof(double) * (size_t)(own.end - own.first);
   const long long row = report->stored, first = row * n + own.first;
-  if (way->every == 0 || (run->step % way->every != 0 && !arrived))
+  if (!way->t || (run->step % way->every != 0 && !arrived))
     return;
   memcpy(way->q + first, run->q + own.first, size);
   memcpy(way->p + first, run->p + own.first, size);
@@ -118,7 +118,7 @@ static int take_steps(run_memory *run, const job *way, solver_report *report)
   const work_arrays work = bind_work_arrays(run, coordinates_of(way->arrays));
   while (report->steps < way->steps) {
     const long long left = way->steps - report->steps;
-    const long long next = way->every ? way->every - run->step % way->every : left;
+    const long long next = way->t ? way->every - run->step % way->every : left;
     TRY(PERFORM(run, way->arrays, &work, way->options, report, next < left ? next : left));
     store_state(run, way, report, work.n, 0);
   }
@@ -133,6 +133,7 @@ static int perform(run_memory *run, job way, const double *parameters, const sol
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
   report->t = run->t;
+  TRY(cannot_store(way.t, way.every) ? STATUS(EVERY_BELOW_1) : OK);
   TRY(use_parameters(run, parameters));
 #ifdef HEAT_BATH
   TRY(prepare_bath(run) ? OK : NOT_FINITE);
@@ -164,7 +165,7 @@ int NAME(step)(double t, double h, const double *q0, const double *p0, const dou
   int status;
   NAME(start)(run, t, h, q0, p0);
   run->error = INFINITY; /* not estimated */
-  status = NAME(advance)(run, 1, 0, parameters, options, NULL, NULL, NULL, NULL, report, NULL);
+  status = NAME(advance)(run, 1, 1, parameters, options, NULL, NULL, NULL, NULL, report, NULL);
   memcpy(q1, run->q, size);
   memcpy(p1, run->p, size);
   return status;

@@ -426,10 +426,8 @@ static int advance(fmu *one, double end, run_report *report)
 static int advance(fmu *one, double end, run_report *report)
 {
   run_memory *const run = &one->now.run;
-  double t, q[M], p[M];
-  int iterations;
-  const int status = NAME(advance)(run, plan(run, end), LLONG_MAX, one->now.values + FIRST_PARAMETER, NULL, &t, q, p,
-      &iterations, report, one->workspace);
+  const int status = NAME(advance)(run, plan(run, end), 1, one->now.values + FIRST_PARAMETER, NULL, NULL, NULL, NULL,
+      NULL, report, one->workspace);
   show_state(one, run->q, run->p);
   return status;
 }

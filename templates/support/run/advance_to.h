@@ -2,9 +2,10 @@
 
 /* Adaptive integration to a given time t_end.
  *
- * Stores every `every`-th state and the one at t_end, and returns after at most `steps` steps. On failure the run is
- * left at the last completed step and the status of the failed one is returned. Requires a controller: trial,
- * begin_trials, find_step, confirm_step, and accept_trial, which adds the increments to the state. */
+ * Stores every `every`-th state and the one at t_end if there are arrays for them, and returns after at most `steps`
+ * steps. On failure the run is left at the last completed step and the status of the failed one is returned. Requires
+ * a controller: trial, begin_trials, find_step, confirm_step, and accept_trial, which adds the increments to the
+ * state. */
 
 /* A run is at t_end only if no low word is left: beyond 2^53 step sizes t alone is t_end some steps too early. */
 static inline int has_arrived(real t, real t_low, real t_end)
@@ -37,11 +38,13 @@ int NAME(advance_to)(run_memory *run, real t_end, const step_control *control, l
   solver_options standard = NAME(default_options)();
   solver_report unread;
   trial now = {.t_end = t_end};
+  report = report ? report : &unread;
+  memset(report, 0, sizeof *report);
+  if (cannot_store(t, every))
+    return STATUS(EVERY_BELOW_1);
   begin_trials(run, &now, control, &standard);
   run->direction = (t_end - run->t) - run->t_low < 0 ? -1 : 1;
   options = options ? options : &standard;
-  report = report ? report : &unread;
-  memset(report, 0, sizeof *report);
   now.step = step_from(run->t, 0, now.at.q, now.at.p, now.at.carry_q, now.at.carry_p, parameters, workspace);
 #ifndef EXPLICIT_RUN
   now.step.motion_of = run;
@@ -71,7 +74,7 @@ int NAME(advance_to)(run_memory *run, real t_end, const step_control *control, l
     accept_trial(run, &now);
     run->iterations += report->iterations - before;
     report->steps++;
-    if ((every != 0 && run->step % every == 0) || has_arrived(now.at.t, now.at.t_low, t_end))
+    if (t && (run->step % every == 0 || has_arrived(now.at.t, now.at.t_low, t_end)))
       store_row(run, &now.at, report->stored++, t, q, p, iterations);
   }
   memcpy(run, &now.at, sizeof now.at);

@@ -98,13 +98,12 @@ static int is_accepted(const bath_call *call, const run_memory *run, const state
 static int step_of_bath(const bath_call *call, run_memory *run, double temperature)
 {
   const double h = run->h, signed_h = run->reversed ? -h : h;
-  double t[1], q[M], p[M];
-  int iterations[1], status;
+  double q[M], p[M];
   state before;
   memcpy(&before, run, sizeof before);
   run->h = signed_h;
-  status = phi_advance(
-      run, 1, LLONG_MAX, call->parameters, call->options, t, q, p, iterations, call->report, call->workspace);
+  int status = phi_advance(
+      run, 1, 1, call->parameters, call->options, NULL, NULL, NULL, NULL, call->report, call->workspace);
   run->h = h;
 #ifdef LIBRARY_FALLBACK
   if (status == STATUS(FALLBACK_REQUIRED))
@@ -143,6 +142,7 @@ int NAME(advance)(run_memory *run, long long steps, long long every, const real 
   double first[STEPS_DRAWN][DRAWN], second[STEPS_DRAWN][DRAWN];
   long long stored = 0;
   int status = steps == 0 || prepare_bath(&bath, run->t, run->h, run->q, parameters) ? OK : NOT_FINITE;
+  status = cannot_store(t, every) ? STATUS(EVERY_BELOW_1) : status;
   for (int k = 0; total.steps < steps && status == OK; k = (k + 1) % STEPS_DRAWN) {
     const double heat = run->heat, heat_low = run->heat_low;
     const long long step = run->step;
@@ -167,7 +167,7 @@ int NAME(advance)(run_memory *run, long long steps, long long every, const real 
     }
     half_of_bath(run, &bath, second[k]);
     total.steps++;
-    if (every != 0 && run->step % every == 0) {
+    if (t && run->step % every == 0) {
       memcpy(&now, run, sizeof now);
       store_row(run, &now, stored++, t, q, p, iterations);
     }

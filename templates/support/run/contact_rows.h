@@ -66,7 +66,9 @@ typedef struct {
 
 static real length_of(const real *x, int count)
 {
-  return count == 0 ? 0.0 : count == 1 ? fabs(x[0]) : hypot(x[0], x[1]);
+  if (count == 0)
+    return 0.0;
+  return count == 1 ? fabs(x[0]) : hypot(x[0], x[1]);
 }
 
 /* Mode of a contact by its parameters; of a slip in space with the direction `ahead`. */

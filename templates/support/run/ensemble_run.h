@@ -312,7 +312,7 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
     const double passed = (double)block->step * fabs(block->h);
     add_growth(&growth, &now, past, passed, fabs(block->h));
 #endif
-    if (every != 0 && block->step % every == 0) {
+    if (q && block->step % every == 0) {
 #ifdef TANGENTS
       store_growth(&growth, passed, count, q + stored * row_length);
 #else

@@ -926,7 +926,8 @@ static inline void change_to_newton(run_memory *run, const trial *now, int is_li
   const long long steps = run->step + 1;
   if (by_newton(now) && is_dear(run, UPDATES / 2))
     leave_newton(run);
-  if (!is_limited || run->change != 0 || by_newton(now) || run->avoiding < 0 || steps < COST_OF_NEWTON || (steps & (steps - 1)) != 0)
+  if (!is_limited || run->change != 0 || by_newton(now) || run->avoiding < 0 || steps < COST_OF_NEWTON ||
+      (steps & (steps - 1)) != 0)
     return;
   if (levels_within(run, now, gain) < gain || !may_grow(run, now, change))
     return;
