@@ -45,7 +45,14 @@ class Midpoint:
     defaults = MappingProxyType[str, float]({})
     flags = ("-O2",)
     interface = SimpleNamespace(
-        title="", rotations=(), map_names=(), inputs=(), mode_names=(), has_fallback=False, time_transformation=None
+        title="",
+        rotations=(),
+        map_names=(),
+        inputs=(),
+        mode_names=(),
+        modes=(),
+        has_fallback=False,
+        time_transformation=None,
     )
     source = SimpleNamespace(files={"a.h": "1", "a.c": "2"})
     _input_size, mode_columns = 4, ()
