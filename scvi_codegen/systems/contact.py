@@ -258,8 +258,7 @@ def contact(
             list of them. It opens where one fails; what is behind its surface passes freely.
         name: name in messages; by default the formula of the gap.
         impacts: with other contacts at the same time: ``"sequential"``, one after another until none approaches, or
-            ``"simultaneous"``, by Newton's law for all of this kind that touch, refused where that would create
-            kinetic energy by friction.
+            ``"simultaneous"``, by Newton's law for all of this kind that touch.
 
     >>> contact("y - r", slip="x_dot - r*a_dot", friction=0.3).friction
     0.3

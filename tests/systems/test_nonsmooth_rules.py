@@ -19,7 +19,7 @@
 | features | test_jumps, test_features |
 | names of functions and tables | here; refusals, test_tables |
 | where contacts are stated | test_contacts (model file), test_robot_contacts |
-| impacts: cradles, Poisson, plates and blocks | test_contacts, test_contact_runs; here |
+| impacts: cradles, restitution, plates and blocks | test_contacts, test_contact_runs; here |
 | rest after accumulating impacts, starts within rounding, gaps that are distances | test_contacts, test_contact_runs |
 | d x/d d = -8, d x/d mu, tippe top, shaken floors, balance | test_contact_derivatives, _of_bodies, _runs |
 """

@@ -166,8 +166,8 @@ def change_at(
     *errors, impulse, momentum = (float(np.abs(difference / roots).max()) for difference in differences)
     if not min(errors) <= SAME_IMPULSE * (impulse if closes else momentum) + SAME_MOMENTUM * momentum:
         raise StateError(
-            f"{event.title} at t = {t:.17g} with several impacts, at once or one after another, by Poisson's law, or "
-            "without collision: derivatives through them are not available"
+            f"{event.title} at t = {t:.17g} with several impacts, at once or one after another, of reduced "
+            "restitution, or without collision: derivatives through them are not available"
         )
     return changes[int(np.argmin(errors))]
 

@@ -20,17 +20,15 @@ REFUSALS = {
     3: "no impulses satisfy the law of impact with friction at t = {t:.17g}, contact {k}: reduce its friction",
     5: "friction of contact {k} is {value:.6g} at t = {t:.17g}: friction must not be negative, nor undefined. Correct "
     "the formula or the number, as with max(0, ..)",
-    8: "static friction of contact {k} is {value:.6g} at t = {t:.17g}: at rest it must not be less than that of "
+    7: "static friction of contact {k} is {value:.6g} at t = {t:.17g}: at rest it must not be less than that of "
     "sliding. Correct one of the formulas or numbers, as with max(..)",
-    9: "restitution of contact {k} is {value:.6g} at t = {t:.17g}: it must not be negative, nor exceed 1. Correct the "
+    8: "restitution of contact {k} is {value:.6g} at t = {t:.17g}: it must not be negative, nor exceed 1. Correct the "
     "formula or the number, as with max(0, min(1, ..))",
     2: "neither forces nor impulses of the contacts are consistent at t = {t:.17g}: the contacts contradict each "
     "other, or none were found. Reduce friction, or use fewer contacts",
     6: "contact {k} pulls, or exceeds its friction, at t = {t:.17g} in each mode that was tried: limit the steps by "
     "max_step= (or h=), or reduce its friction",
-    7: "simultaneous impacts with friction would create kinetic energy by Newton's law at t = {t:.17g}, contact {k}: "
-    'reduce their friction, or use impacts="sequential"',
-    10: "steps of all sizes create energy at t = {t:.17g}, at last {value:.3g}: the motion ends there (a collision, a "
+    9: "steps of all sizes create energy at t = {t:.17g}, at last {value:.3g}: the motion ends there (a collision, a "
     "singularity), or closed contacts nearly depend on each other, as of legs that pass straight. Set t_end before "
     "that time, or give another tolerance, or h (fixed step size)",
     4: "the impacts at t = {t:.17g} do not end: contacts close a corner; set a restitution to 0",
@@ -109,9 +107,12 @@ def warn_of_choices(stepper: Integrator, watch: Any) -> None:
             "(Painleve's paradox), and impulses, the limit of stiff contact, change the slip",
             EventWarning,
         )
-    if law := getattr(watch, "law", 0):
-        used = "it was 0" if law > 1 else "that of the impulses was used (Poisson's law)"
-        warn(f"the restitution of an impact would have created kinetic energy with friction: {used}", EventWarning)
+    if getattr(watch, "reduced", 0):
+        warn(
+            "the restitution of an impact would have created kinetic energy with friction: it was reduced, so that "
+            "none is created",
+            EventWarning,
+        )
     if missed := getattr(watch, "missed", 0.0):
         warn(
             f"some adaptive steps have a tolerance of up to {missed:.2g}: {ROUNDED.format(part=watch.rounded)}",

@@ -18,7 +18,7 @@ enum {
 /* Reduces the rows (A, b) by elimination with the pivots on the diagonal that are independent of those before but for
  * rounding, so that their rows and columns are: of nearly dependent ones the small pivots come last. Returns the number
  * of others. */
-static int eliminate(real (*line)[CONTACT_ROWS + 1], int count, int *independent)
+static int eliminate_rows(real (*line)[CONTACT_ROWS + 1], int count, int *independent)
 {
   int others = count;
   memset(independent, 0, (size_t)count * sizeof *independent);
@@ -131,7 +131,7 @@ static int reduce_equations(const contact_terms *of, const contact_unknowns *in,
         matrix[i][j] += W[r] * in->column[j][r];
     matrix[i][in->count] = -rate_after(of, right, force, in->row[i]);
   }
-  return eliminate(matrix, in->count, independent);
+  return eliminate_rows(matrix, in->count, independent);
 }
 
 /* Largest of some rates, and of those by moved forces, relative to the terms of right + W f, of given sizes at least,
@@ -211,7 +211,7 @@ static void centre_forces(const contact_terms *of, const contact_unknowns *in, r
       descent = 0.0;
       for (int e = 0; e < vectors; e++)
         slope[e] = line[e][vectors];
-      eliminate(line, vectors, independent);
+      eliminate_rows(line, vectors, independent);
       for (int e = 0; e < vectors; e++) {
         step[e] = independent[e] ? line[e][vectors] / line[e][e] : 0.0;
         descent += slope[e] * step[e];

@@ -2,88 +2,103 @@
 
 /* Impacts of contacts with friction (C. Glocker & F. Pfeiffer, Nonlinear Dyn. 7, 1995). */
 enum {
-  CONTACT_IMPACTS = 100, /* of a contact in a corner */
-  CONTACT_SECANTS = 50 /* for the rate after a restitution */
+  CONTACT_IMPACTS = 100 /* of a contact in a corner */
 };
 
-/* Laws of impact, each where those before create kinetic energy: restitution of rates (Newton), of impulses (Poisson),
- * none. */
-enum {
-  CONTACT_NEWTON,
-  CONTACT_POISSON,
-  CONTACT_PLASTIC
-};
-
-#define CONTACT_SLIGHT 1e-4 /* part of the rates of bodies of which those of an impact are at least */
 #define CONTACT_RESIDUALS 16.0 /* residuals of its located zero below which a rebound ends */
 #define CONTACT_AHEAD 1e-5 /* time step of an impact without collision, relative to that in which a slip would stop */
 #define CONTACT_GAIN 1e-9 /* part of the work of an impact by which energy may grow */
 
-/* Impulses of contacts that meet with the given rates, by Newton's law or without restitution, and of those that are
- * closed, in consistent modes, found from the impulses given; 0 if there are none. */
-static int impulses_of(const contact_terms *of, const int *meets, const int *closed, int law, const real *rate,
-    real *impulse)
+/* Poses the problem with b = `rates` + h times the second rates: of impulses without these, else those of a step of
+ * length h. Friction without gap is a force. */
+static void pose_impulses(const contact_terms *of, const real *rates, real h, cone_problem *in)
 {
-  real right[CONTACT_ROWS], after[CONTACT_ROWS], scale[CONTACT_ROWS];
-  contact_problem in = {.of = of, .scale = scale};
-  contact_mode mode[EVENT_CONTACTS];
-  memcpy(right, rate, sizeof right);
-  in.right = right;
-  for (int r = 0; r < CONTACT_ROWS; r++)
-    scale[r] = CONTACT_SLIGHT * of->speed[r];
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const int normal = CONTACTS[k].normal;
-    in.is_free[k] = normal < 0 || !(meets[k] || closed[k]);
-    if (meets[k] && law == CONTACT_NEWTON)
-      right[normal] *= 1.0 + of->coefficient[3 * k + 2];
-    in.rests[k] = !in.is_free[k] && CONTACTS[k].slips > 0;
-    in.role[k] = in.is_free[k] ? CONTACT_IS_OPEN : in.rests[k] ? CONTACT_STICKS
-                                                               : CONTACT_SLIPS;
-  }
-  return relax_modes(&in, impulse, mode) && is_consistent(&in, mode, impulse, after);
-}
-
-/* Adds to the impulses of a compression those of a restitution, with e times its normal impulse in the friction cone
- * (C. Glocker & F. Pfeiffer, Nonlinear Dyn. 7, 1995): as those of a contact that approaches with a rate, which follows
- * by secants. */
-static int restitute(const contact_terms *of, int contact, const int *meets, const int *closed, const real *rate,
-    real *impulse)
-{
-  const int normal = CONTACTS[contact].normal;
-  const real goal = of->coefficient[3 * contact + 2] * impulse[normal];
-  real after[CONTACT_ROWS], added[CONTACT_ROWS] = {0.0}, low = 0.0, of_low = 0.0;
-  real high = -of->coefficient[3 * contact + 2] * rate[normal];
-  int exists = 1, differs = goal > 0.0;
+  memset(in, 0, sizeof *in);
+  in->W = of->W;
   for (int r = 0; r < CONTACT_ROWS; r++) {
-    after[r] = rate[r];
-    for (int j = 0; j < CONTACT_ROWS; j++)
-      after[r] += of->W[r * CONTACT_ROWS + j] * impulse[j];
+    in->b[r] = rates[r] + (h > 0.0 ? h * of->second[r] : 0.0);
+    in->terms[r] = of->speed[r];
   }
-  for (int k = 0; exists && differs && k < CONTACT_SECANTS; k++) {
-    after[normal] = -high;
-    memset(added, 0, sizeof added);
-    exists = impulses_of(of, meets, closed, CONTACT_PLASTIC, after, added);
-    const real slope = (added[normal] - of_low) / (high - low);
-    low = high;
-    of_low = added[normal];
-    differs = fabs(of_low - goal) > 4.0 * DBL_EPSILON * goal;
-    high += (goal - of_low) / slope;
-  }
-  for (int r = 0; exists && goal > 0.0 && r < CONTACT_ROWS; r++)
-    impulse[r] += added[r];
-  return exists && !differs;
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    in->mu[k] = of->coefficient[3 * k] * (CONTACTS[k].normal < 0 ? h : 1.0);
 }
 
-/* Adds to impulses those of the rows of contacts that approach, one after another, until none does, by a law of
- * restitution, in the friction cone; simultaneous ones with those that touch and do not separate, by Newton's law,
- * which creates no energy without friction: T+ - T- = sum of (1 - e) Lambda v_n- / 2. Closed contacts take part with
- * e = 0. */
+/* Impulses of contacts that take part with given rates, of some with restitutions e (elastic, NULL: none), from the
+ * impulses given; 0 if there are none. */
+static int impulses_of(const contact_terms *of, const int *takes_part, const int *elastic, const real *rate,
+    real *impulse)
+{
+  cone_problem in;
+  pose_impulses(of, rate, 0.0, &in);
+  memcpy(in.f, impulse, sizeof in.f);
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    in.takes_part[k] = takes_part[k];
+    if (elastic && elastic[k])
+      in.b[CONTACTS[k].normal] *= 1.0 + of->coefficient[3 * k + 2];
+  }
+  const int solved = solve_cone(&in);
+  memcpy(impulse, in.f, sizeof in.f);
+  return solved;
+}
+
+/* Kinetic energy that impulses create from given rates, sum of f (u(before) + u(after)) / 2, and its size in *size. */
+static real energy_of(const contact_terms *of, const real *rate, const real *impulse, real *size)
+{
+  real energy = 0.0, work = 0.0;
+  for (int r = 0; r < CONTACT_ROWS; r++) {
+    energy += 0.5 * impulse[r] * (rate[r] + rate_after(of, rate, impulse, r));
+    work += impulse[r] * rate[r];
+  }
+  *size = fabs(work);
+  return energy;
+}
+
+/* Part s of the difference of impulses with and without restitution, the largest in [0, 1] that creates no energy, a
+ * quadratic function of s, not positive for s = 0: Newton's law with friction may create some (Kane's paradox). */
+static real restitution_part(const contact_terms *of, const real *rate, const real *plastic, const real *elastic)
+{
+  const real still[CONTACT_ROWS] = {0.0};
+  real moved[CONTACT_ROWS], size, bend, slope = 0.0;
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    moved[r] = elastic[r] - plastic[r];
+  bend = energy_of(of, still, moved, &size);
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    slope += moved[r] * rate_after(of, rate, plastic, r);
+  const real least = fmin(energy_of(of, rate, plastic, &size), 0.0);
+  const real root = sqrt(fmax(slope * slope - 4.0 * bend * least, 0.0)); /* without cancellation */
+  const real part = slope > 0.0 ? -2.0 * least / (slope + root) : (root - slope) / (2.0 * bend);
+  return fmin(fmax(part, 0.0), 1.0);
+}
+
+/* Impulses by Newton's law of restitution, v = v_c + s (v_e - v_c), v_c without restitution: s = 1 unless that creates
+ * energy. */
+static int restitute(const event_step *step, const contact_terms *of, const int *takes_part, const int *meets,
+    const real *rate, real *impulse)
+{
+  real plastic[CONTACT_ROWS], size;
+  if (!impulses_of(of, takes_part, meets, rate, impulse))
+    return 0;
+  if (energy_of(of, rate, impulse, &size) <= CONTACT_GAIN * size)
+    return 1;
+  memcpy(plastic, impulse, sizeof plastic);
+  if (!impulses_of(of, takes_part, NULL, rate, plastic))
+    return 0;
+  const real part = restitution_part(of, rate, plastic, impulse);
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    impulse[r] = plastic[r] + part * (impulse[r] - plastic[r]);
+  step->watch->reduced = 1;
+  return 1;
+}
+
+/* Adds to impulses those of the rows of contacts that approach, one after another, until none does, each with those to
+ * which W connects it: simultaneous ones that touch and do not separate, and closed ones with e = 0. Without friction
+ * Newton's law creates no energy: T+ - T- = sum of (1 - e) Lambda v_n- / 2. */
 static int find_impulses(const event_step *step, const contact_terms *of, const int *approaches, const int *closed,
-    int law, real *total)
+    real *total)
 {
   for (int round = 0; round < CONTACT_IMPACTS * EVENT_CONTACTS; round++) {
     real rate[CONTACT_ROWS], impulse[CONTACT_ROWS] = {0.0};
-    int meets[EVENT_CONTACTS], shut[EVENT_CONTACTS], first = -1, several = 0;
+    int meets[EVENT_CONTACTS], may_act[EVENT_CONTACTS], takes_part[EVENT_CONTACTS] = {0}, first = -1;
     for (int r = 0; r < CONTACT_ROWS; r++)
       rate[r] = rate_after(of, of->rate, total, r);
     for (int k = EVENT_CONTACTS - 1; k >= 0; k--)
@@ -95,29 +110,15 @@ static int find_impulses(const event_step *step, const contact_terms *of, const 
       const int normal = CONTACTS[k].normal, impacts = CONTACTS[k].impacts;
       const int together = impacts == CONTACT_SIMULTANEOUS && impacts == CONTACTS[first].impacts && approaches[k];
       meets[k] = k == first || (together && rate[normal] <= CONTACT_ROUNDING * of->speed[normal]);
-      several |= k != first && meets[k];
-      shut[k] = closed[k] || (approaches[k] && of->coefficient[3 * k + 2] == 0.0);
+      may_act[k] = meets[k] || closed[k] || (approaches[k] && of->coefficient[3 * k + 2] == 0.0);
     }
-    if (several && law != CONTACT_NEWTON)
-      return refuse(step, CONTACT_GAINS_ENERGY, first, 0.0);
-    if (!impulses_of(of, meets, shut, law, rate, impulse) ||
-        (law == CONTACT_POISSON && !restitute(of, first, meets, shut, rate, impulse)))
+    cone_connect(of->W, may_act, first, takes_part);
+    if (!restitute(step, of, takes_part, meets, rate, impulse))
       return refuse(step, CONTACT_WITHOUT_IMPULSE, first, 0.0);
     for (int r = 0; r < CONTACT_ROWS; r++)
       total[r] += impulse[r];
   }
   return refuse(step, CONTACT_IN_CORNER, -1, 0.0);
-}
-
-/* Kinetic energy that impulses create, relative to the sizes of its terms. */
-static real gain_of(const contact_terms *of, const real *impulse)
-{
-  real gain = 0.0, size = 0.0;
-  for (int r = 0; r < CONTACT_ROWS; r++) {
-    gain += 0.5 * impulse[r] * (of->rate[r] + rate_after(of, of->rate, impulse, r));
-    size += impulse[r] * of->rate[r];
-  }
-  return size != 0.0 ? gain / fabs(size) : 0.0;
 }
 
 /* Whether the height w^2 / (2 g'') of a rebound is of the size of rounding, or of the residuals of the located zeros of
@@ -166,15 +167,14 @@ static int is_met(const contact_terms *of, const contact_change *now, const int 
       (now->closes[k] || (!closed[k] && fabs(of->value[normal]) <= CONTACT_ROUNDING * of->size[normal]));
 }
 
-/* Impulses of all contacts that meet at a state after those of others, by the first law that creates no kinetic
- * energy, and which contacts touch and rest afterwards. */
+/* Impulses of all contacts that meet at a state after those of others, and which contacts touch and rest afterwards. */
 static int collide(const event_step *step, event_sample *at, contact_terms *of, const int *closed, const real *others,
     contact_change *now)
 {
   const contact_terms before = *of;
   contact_mode present[EVENT_CONTACTS];
   real impulse[CONTACT_ROWS], force[CONTACT_ROWS], residual = 0.0;
-  int approaches[EVENT_CONTACTS], law = CONTACT_NEWTON, status;
+  int approaches[EVENT_CONTACTS], status;
   forces_at(at->t, at->q, at->p, step->own, present, force, step->workspace);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal;
@@ -182,13 +182,7 @@ static int collide(const event_step *step, event_sample *at, contact_terms *of, 
     residual = fmax(residual, approaches[k] ? fabs(of->value[normal]) : 0.0);
   }
   memcpy(impulse, others, sizeof impulse);
-  status = find_impulses(step, of, approaches, closed, law, impulse);
-  while (status == OK ? law < CONTACT_PLASTIC && gain_of(of, impulse) > CONTACT_GAIN : law == CONTACT_POISSON) {
-    step->watch->refusal = 0;
-    memcpy(impulse, others, sizeof impulse);
-    status = find_impulses(step, of, approaches, closed, ++law, impulse);
-  }
-  step->watch->law = law > step->watch->law ? law : step->watch->law;
+  status = find_impulses(step, of, approaches, closed, impulse);
   if (status == OK)
     status = push(step, at, of, impulse);
   for (int k = 0; status == OK && k < EVENT_CONTACTS; k++) {
@@ -197,7 +191,7 @@ static int collide(const event_step *step, event_sample *at, contact_terms *of, 
       now->rests[k] = !now->begins[k] && length_of(of->rate + slip, slips) <= CONTACT_ROUNDING * before.speed[slip];
     if (normal < 0 || !(approaches[k] || closed[k]))
       continue;
-    if (impulse[normal] > 0.0 && (closed[k] || law == CONTACT_PLASTIC || before.coefficient[3 * k + 2] == 0.0))
+    if (impulse[normal] > 0.0)
       now->touches[k] = 1;
     if (of->rate[normal] > CONTACT_ROUNDING * before.speed[normal])
       now->touches[k] = 0;
@@ -216,21 +210,16 @@ static int collide(const event_step *step, event_sample *at, contact_terms *of, 
  * T+ - T- = Lambda r+ - Lambda W Lambda / 2 < 0. Returns whether there are any. */
 static int jump(const event_step *step, event_sample *at, contact_terms *of, contact_change *now)
 {
-  contact_problem in = {.of = of, .lifts = 1};
-  contact_mode mode[EVENT_CONTACTS];
-  real right[CONTACT_ROWS], after[CONTACT_ROWS], impulse[CONTACT_ROWS] = {0.0};
-  real speed = 0.0, approach = 0.0, largest = 0.0;
+  cone_problem in;
+  real rate[CONTACT_ROWS], speed = 0.0, approach = 0.0, largest = 0.0, size;
   int closed[EVENT_CONTACTS], first = -1;
   const int none[EVENT_CONTACTS] = {0};
+  memcpy(rate, of->rate, sizeof rate);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, slips = CONTACTS[k].slips;
-    allow_modes(&in, k, now, step->watch->fastest[k]);
-    closed[k] = is_met(of, now, none, k) || (normal >= 0 && !in.is_free[k]); /* also one that separates */
-    in.is_free[k] &= !closed[k];
-    in.begins[k] = in.limit[k] = 0;
-    in.rests[k] = !in.is_free[k] && slips > 0;
-    if (!in.is_free[k])
-      in.role[k] = in.rests[k] ? CONTACT_STICKS : CONTACT_SLIPS;
+    closed[k] = is_met(of, now, none, k) || (normal >= 0 && !is_open(of, now, k)); /* also one that separates */
+    if (closed[k] && rate[normal] <= CONTACT_ROUNDING * of->speed[normal])
+      rate[normal] = 0.0;
     if (closed[k])
       approach = fmax(approach, -of->second[normal]);
     if (closed[k] && slips > 0)
@@ -238,29 +227,18 @@ static int jump(const event_step *step, event_sample *at, contact_terms *of, con
   }
   if (!(speed > 0.0 && approach > 0.0))
     return 0;
-  const real h = CONTACT_AHEAD * speed / approach;
-  for (int r = 0; r < CONTACT_ROWS; r++)
-    right[r] = of->second[r] + of->rate[r] / h;
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const int normal = CONTACTS[k].normal;
-    if (closed[k] && of->rate[normal] <= CONTACT_ROUNDING * of->speed[normal])
-      right[normal] = of->second[normal];
-  }
-  in.right = right;
-  if (!relax_modes(&in, impulse, mode) || !is_consistent(&in, mode, impulse, after))
-    return 0;
-  for (int r = 0; r < CONTACT_ROWS; r++)
-    impulse[r] *= h;
-  if (!impulses_of(of, none, closed, CONTACT_PLASTIC, of->rate, impulse))
-    return 0;
-  if (gain_of(of, impulse) > CONTACT_GAIN)
+  pose_impulses(of, rate, CONTACT_AHEAD * speed / approach, &in);
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    in.takes_part[k] = closed[k] || (CONTACTS[k].normal < 0 && !is_open(of, now, k));
+  if (!solve_cone(&in) || !impulses_of(of, closed, NULL, of->rate, in.f) ||
+      energy_of(of, of->rate, in.f, &size) > CONTACT_GAIN * size)
     return 0;
   for (int k = 0; k < EVENT_CONTACTS; k++)
-    if (closed[k] && in.rests[k] && impulse[CONTACTS[k].normal] > largest) {
-      largest = impulse[CONTACTS[k].normal];
+    if (closed[k] && CONTACTS[k].slips > 0 && in.f[CONTACTS[k].normal] > largest) {
+      largest = in.f[CONTACTS[k].normal];
       first = k;
     }
-  if (first < 0 || collide(step, at, of, closed, impulse, now) != OK)
+  if (first < 0 || collide(step, at, of, closed, in.f, now) != OK)
     return 0;
   if (!step->watch->jumps) {
     step->watch->jumps = first + 1;

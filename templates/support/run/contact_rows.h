@@ -1,3 +1,4 @@
+#include "cone.h"
 #include "events.h"
 #include "impacts.h"
 
@@ -16,7 +17,6 @@ enum {
   CONTACT_IN_CORNER,
   CONTACT_IMPOSSIBLE, /* friction, or a coefficient that is undefined */
   CONTACT_LEAVES_CONE,
-  CONTACT_GAINS_ENERGY,
   CONTACT_WEAKENS, /* static friction at rest, below that of sliding */
   CONTACT_REPELS, /* restitution */
   CONTACT_CREATES_ENERGY /* in steps of all sizes */
@@ -37,7 +37,6 @@ enum {
   CONTACT_STUCK = 4 /* sticks by others */
 };
 
-#define CONTACT_ROUNDING 1e-10 /* part of their size below which gaps, rates and forces count as 0 */
 /* Second rate whose change of a slip in a step counts as 0, relative to the fastest so far, by CONTACT_ROUNDING. */
 #define CONTACT_AT_REST (DBL_EPSILON / CONTACT_ROUNDING)
 
@@ -63,13 +62,6 @@ typedef struct {
   int closes[EVENT_CONTACTS], leaves[EVENT_CONTACTS], stops[EVENT_CONTACTS], begins[EVENT_CONTACTS];
   int lifts, touches[EVENT_CONTACTS], rests[EVENT_CONTACTS];
 } contact_change;
-
-static real length_of(const real *x, int count)
-{
-  if (count == 0)
-    return 0.0;
-  return count == 1 ? fabs(x[0]) : hypot(x[0], x[1]);
-}
 
 /* Mode of a contact by its parameters; of a slip in space with the direction `ahead`. */
 static contact_mode mode_of(const real *mode, int k)

@@ -85,7 +85,7 @@ static int forces_at_end(const event_step *step, const event_sample *at, const s
     contact_terms *end, contact_mode *mode, real *right, real *force)
 {
   event_sample next = {.t = at->t + stage->part, .q = step->memory, .p = step->memory + M};
-  contact_problem in = {.of = end, .right = right};
+  cone_problem in;
   real after[CONTACT_ROWS];
   solver_report own;
   put_modes(step->watch->mode, step->own);
@@ -94,20 +94,25 @@ static int forces_at_end(const event_step *step, const event_sample *at, const s
   modes_at(end, step->watch->mode, mode);
   solve_contacts(end, mode, end->second, force, after, NULL);
   memcpy(right, end->second, BYTES(CONTACT_ROWS));
-  memcpy(in.role, mode, sizeof in.role);
+  memset(&in, 0, sizeof in);
+  in.W = end->W;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int slip = CONTACTS[k].tangential;
-    in.limit[k] = mode[k].sticks != 0;
-    if (!turns[k])
-      continue;
-    in.role[k] = CONTACT_STICKS;
-    in.directed[k] = stage->given;
-    memcpy(in.role[k].direction, stage->base[k], sizeof stage->base[k]);
-    for (int i = 0; i < 2; i++)
+    const real part = turns[k] ? stage->given : 1.0;
+    in.takes_part[k] = mode[k].closed;
+    in.mu[k] = end->coefficient[3 * k + (mode[k].sticks && !turns[k])];
+    for (int i = 0; i < CONTACTS[k].slips; i++)
+      in.given[k][i] = part * (turns[k] ? stage->base[k][i] : mode[k].sticks ? 0.0
+                                                                             : mode[k].direction[i]);
+    for (int i = 0; i < 2 && turns[k]; i++)
       right[slip + i] += end->rate[slip + i] / stage->part - after[slip + i];
   }
-  solve_cones(&in, force);
-  return OK;
+  memcpy(in.b, right, sizeof in.b);
+  memcpy(in.terms, end->second_terms, sizeof in.terms);
+  memcpy(in.f, force, sizeof in.f);
+  const int solved = solve_cone(&in);
+  memcpy(force, in.f, sizeof in.f);
+  return solved ? OK : NOT_CONVERGED;
 }
 
 /* Directions at the end of a stage by forces there, and their largest change. Others that stick may begin: *begin. */

@@ -25,7 +25,6 @@ static int stops_at(const event_step *step, const contact_terms *of, int k)
  * part of the rates. Returns the first; EVENT_CONTACTS if contacts contradict each other, -1: none. */
 static int find_outside(const event_step *step, const contact_terms *of, real part, int *outside)
 {
-  const contact_problem in = {.of = of, .right = of->second};
   contact_mode mode[EVENT_CONTACTS];
   real force[CONTACT_ROWS], after[CONTACT_ROWS];
   int first;
@@ -34,7 +33,7 @@ static int find_outside(const event_step *step, const contact_terms *of, real pa
   for (int k = EVENT_CONTACTS - 1; k >= 0; k--) {
     const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
     const int row = normal < 0 ? slip : normal; /* those of open contacts may be undefined */
-    const real small = part / CONTACT_ROUNDING * rounding_at_row(&in, after, row) / of->W[row * (CONTACT_ROWS + 1)];
+    const real small = part / CONTACT_ROUNDING * rounding_at_row(of, after, row) / of->W[row * (CONTACT_ROWS + 1)];
     const int pushes = normal < 0 || force[normal] >= -small;
     outside[k] = mode[k].closed &&
         !(pushes && (!mode[k].sticks || length_of(force + slip, slips) <= friction_limit(of, k, 1, force) + small));
@@ -388,19 +387,17 @@ static int is_released(const event_step *step, const event_sample *at, int k, in
 {
   contact_terms of;
   contact_mode mode[EVENT_CONTACTS];
-  contact_problem in = {.of = &of};
   const int row = CONTACTS[k].normal;
   int rank;
   TRY(terms_at(step, at, &of));
-  in.right = of.second;
   modes_at(&of, step->watch->mode, mode);
   *released = fabs(of.value[row]) > CONTACT_ROUNDING * of.size[row];
   if (!*released || (!mode[k].closed && of.value[row] > 0.0))
     return OK;
   mode[k] = CONTACT_IS_OPEN;
-  rank = rank_of(&in, mode);
+  rank = rank_of(&of, mode);
   mode[k] = CONTACT_SLIPS;
-  *released = rank_of(&in, mode) > rank;
+  *released = rank_of(&of, mode) > rank;
   return OK;
 }
 
