@@ -151,7 +151,7 @@ def benchmark(
     """
     sections = tuple(section for name in names for section in _sections(name))
     if plot_path is not None:
-        from scvi_codegen.interfaces.pictures.canvas import check_plot_path
+        from scvi_codegen.extras.pictures.canvas import check_plot_path
 
         check_plot_path(plot_path)
     for report in _reports(tuple(dict.fromkeys(sections or SECTIONS)), plan or Plan(), report_activity, show):

@@ -10,7 +10,7 @@ from scipy.integrate import quad
 
 from benchmarks.report import ResultTable
 from benchmarks.settings import Plan, ReportActivity
-from scvi_codegen.analysis.estimation.averages import average
+from scvi_codegen.extras.fits.averages import average
 from scvi_codegen.runs.compiler import compile_stepper
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 

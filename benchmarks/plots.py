@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from benchmarks.report import OURS, CaseResult
-from scvi_codegen.interfaces.pictures.canvas import COLORS, check_plot_path, save, style
+from scvi_codegen.extras.pictures.canvas import COLORS, check_plot_path, save, style
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

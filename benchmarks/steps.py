@@ -24,7 +24,7 @@ from benchmarks.settings import Plan, ReportActivity
 from scvi_codegen.codegen.native.building import PORTABLE_FLAGS, TUNED_FLAGS
 from scvi_codegen.codegen.variants import SUMS
 from scvi_codegen.common.errors import StepFailedError
-from scvi_codegen.fields.system import FieldSystem
+from scvi_codegen.extras.fields.system import FieldSystem
 from scvi_codegen.runs.compiler import compile_stepper
 
 Start = tuple[Array, Array]

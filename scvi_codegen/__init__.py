@@ -11,15 +11,14 @@
 
 The rooms, in the order of the way from L to a run; imports go up:
 
-* ``common``: what every room uses: errors, checks of arguments, the cache, atomic files, displays.
+* ``common``: what every room uses: errors, checks of arguments, the cache, atomic files, displays, the registry.
 * ``systems``: what the user states: formulas, Lagrangians, Hamiltonians, constraints, bodies, events.
-* ``methods``: tables of numbers, discretisations, controllers of step sizes, reference solutions in 60 digits.
+* ``methods``: tables of numbers, discretisations, controllers of step sizes.
 * ``codegen``: the way to C: intermediate form, lowering, statements of steps, rendering of ``templates/``, compilers.
-* ``fields``: densities, meshes, semi-discretisation, conservation laws.
 * ``runs``: states, steps, runs, events, ensembles, accuracy, results, recordings; ``compile_stepper``.
-* ``analysis``: chaos, periodic orbits, paths, estimation, advice, verification.
-* ``interfaces``: command line, model files, packages, FMU, frameworks, pictures, pages, derivation.
-* ``paper``: the reproduction of the paper.
+* ``interfaces``: command line, model files, packages, FMU.
+* ``api``: what extras may use of the rooms above: at most 60 names in nine modules.
+* ``extras``: products on top, a folder each: robots, fields, pictures, chaos, orbits, verification and others.
 
 Names are imported when they are first used, so code that only steps never imports SymPy.
 """

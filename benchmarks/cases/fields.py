@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.cases.unforced import SYSTEMS, Array, Case
 from benchmarks.contenders.ours import compiled
 from benchmarks.report import OURS, Contender
-from scvi_codegen.fields.system import FieldSystem
+from scvi_codegen.extras.fields.system import FieldSystem
 
 Points = Mapping[str, Array]
 FREQUENCY = 0.6

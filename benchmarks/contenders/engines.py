@@ -14,8 +14,8 @@ from benchmarks.cases.unforced import Array, Case
 from benchmarks.contenders.arrays import step_counts
 from benchmarks.contenders.dop853 import LOOSE, dop853, start_of
 from benchmarks.report import Contender
-from scvi_codegen.systems.multibody.trees.energies import Tree
-from scvi_codegen.systems.multibody.trees.mjcf import links_of_mjcf
+from scvi_codegen.extras.robots.trees.energies import Tree
+from scvi_codegen.extras.robots.trees.mjcf import links_of_mjcf
 
 LARGEST_STEP, HALVINGS = 0.02, 6
 """Largest step size, ten times MuJoCo's default, and number of step sizes, each half of the one before."""

@@ -17,9 +17,9 @@ import numpy as np
 from benchmarks.cases.unforced import Array, Case
 from benchmarks.report import OURS, Contender
 from benchmarks.settings import set_variable
-from scvi_codegen.analysis.advice.advice import advise
 from scvi_codegen.codegen.native import building
 from scvi_codegen.common.errors import StateError
+from scvi_codegen.extras.advice.advice import advise
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.compiler import compile_stepper

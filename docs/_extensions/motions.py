@@ -35,7 +35,7 @@ MADE_OF = b"".join(
         path
         for name in ("pages", "pictures")
         for path in sorted(
-            (HERE.parents[1] / "scvi_codegen" / "interfaces" / name).glob("*.py")
+            (HERE.parents[1] / "scvi_codegen" / "extras" / name).glob("*.py")
         )
     ]
 )

@@ -11,10 +11,10 @@
                                    statements of explicit and constrained steps (:mod:`.statements.steps`);
                                    plus event detection, if requested (:mod:`scvi_codegen.codegen.rendering.events`)
 
-Two other consumers read a ``StageSystem``: :func:`scvi_codegen.interfaces.derivation.equations.derive` prints the
-equations in the paper's notation, and :func:`scvi_codegen.methods.exact.step.derived_step` solves them in 60-digit
-arithmetic. :mod:`scvi_codegen.interfaces.frameworks` extends the C source of one step and its derivatives to many steps
-for JAX, PyTorch and CasADi; :func:`scvi_codegen.interfaces.frameworks.casadi.casadi_step` exports the stage equations
+Two other consumers read a ``StageSystem``: :func:`scvi_codegen.extras.derivation.equations.derive` prints the
+equations in the paper's notation, and :func:`scvi_codegen.extras.exact.step.derived_step` solves them in 60-digit
+arithmetic. :mod:`scvi_codegen.extras.frameworks` extends the C source of one step and its derivatives to many steps
+for JAX, PyTorch and CasADi; :func:`scvi_codegen.extras.frameworks.casadi.casadi_step` exports the stage equations
 as CasADi expressions.
 """
 

@@ -32,7 +32,7 @@ def one_line(value: Any, title: str, facts: str) -> str:
     return f"{head}{clipped(title, LONGEST - len(head) - len(tail))}{tail}"
 
 
-def clipped(text: str, length: int) -> str:
+def clipped(text: str, length: int = LONGEST) -> str:
     """Return the text, or its beginning and "..", in at most ``length`` characters."""
     return text if len(text) <= length else f"{text[: max(length - 2, 0)]}.."
 

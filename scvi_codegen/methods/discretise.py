@@ -12,6 +12,7 @@ the method equals that of the Lagrangian, step for step: (35f) is the Legendre t
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import sympy
 from sympy import Add, Expr, Symbol
@@ -335,3 +336,52 @@ def _diagonal(blocks: Sequence[Matrix]) -> Matrix:
         lines += [(*(mp.zero,) * offset, *line, *(mp.zero,) * after) for line in block]
         offset += len(block)
     return tuple(lines)
+
+
+@dataclass(frozen=True)
+class Discretisation:
+    """A method for a system: its equations and what its steps preserve."""
+
+    system: MechanicalSystem
+    method: Method
+    MIDDLE: ClassVar[Symbol] = MIDDLE
+    """Time in the middle of a step in :attr:`reference`."""
+
+    @property
+    def form(self) -> MechanicalSystem:
+        """See :func:`discretised_form`."""
+        return discretised_form(self.system, self.method)
+
+    @property
+    def equations(self) -> StageSystem:
+        """The compiled equations, see :func:`discretise`; MethodError where the method does not apply."""
+        return discretise(self.system, self.method)
+
+    @property
+    def paper(self) -> StageSystem:
+        """The equations in the paper's notation; MethodError as of :attr:`equations`."""
+        return paper_equations(self.system, self.method)
+
+    @property
+    def reference(self) -> StageSystem:
+        """See :func:`reference_equations`."""
+        return reference_equations(self.system, self.method)
+
+    @property
+    def in_moving_frame(self) -> bool:
+        """See :func:`in_moving_frame`."""
+        return in_moving_frame(self.system, self.method)
+
+    @property
+    def symplectic(self) -> bool:
+        """Whether the steps preserve dq ^ dp: not with forces, damping, rolling or prescribed motion."""
+        return is_symplectic(self.method, self.system)
+
+    @property
+    def conformally_symplectic(self) -> bool:
+        """Whether the steps multiply dq ^ dp by exp(-gamma h), where gamma is the damping rate."""
+        return is_conformally_symplectic(self.method, self.system)
+
+    def check(self) -> None:
+        """Raise MethodError for a Hamiltonian with singular d2H/dp2 and a method that requires regularity."""
+        check_regular(self.method, self.system)

@@ -42,7 +42,7 @@ from scvi_codegen.runs.ensembles.lanes import CommonRuns
 from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
 from scvi_codegen.runs.events.contacts import in_first_modes
 from scvi_codegen.runs.events.refinement import WithEventsInDouble, constantly
-from scvi_codegen.runs.forwarding import SteppersAnalysis
+from scvi_codegen.runs.forwarding import Forwarded, OfSteppers
 from scvi_codegen.runs.results.dense_output import check_has_end, times_of_run
 from scvi_codegen.runs.results.output import ALL_STATES, Output
 from scvi_codegen.runs.states.layout import InitialData
@@ -84,7 +84,7 @@ from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
 Called = TypeVar("Called", bound=Callable[..., Any])
 
 
-class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
+class Stepper(WithEventsInDouble, OfSteppers, Integrator):
     """Compiled integrator of one system: :class:`Integrator` with integrations, runs, ensembles and projections."""
 
     _trajectory_type = Trajectory
@@ -627,6 +627,23 @@ def _bound(method: Called, *, at_rest: bool = False) -> Called:
     return cast(Called, call)
 
 
+def _bound_path(method: Called) -> Called:
+    """Return the method ``path``; the positions that determine the sizes are q0, or of closed paths the first."""
+
+    @wraps(method)
+    def call(self: StepperOfRunTimeSizes, q0: Any = None, *arguments: Any, **named: Any) -> Any:
+        start = named.get("start")
+        if q0 is not None or start is None:
+            return self._call_bound(method, False, q0, arguments, **named)
+        if callable(start):
+            first = start(named.get("t", 0.0))
+        else:
+            first = {name: x[0] for name, x in start.items()} if isinstance(start, Mapping) else start[0]
+        return self.bind(first, named.get("parameters"))[0].path(None, *arguments, **named)
+
+    return cast(Called, call)
+
+
 class StepperOfRunTimeSizes(Stepper):
     """Stepper of arrays whose sizes each call determines: its methods bind a stepper to the arrays of the call."""
 
@@ -639,7 +656,8 @@ class StepperOfRunTimeSizes(Stepper):
     project = _bound(Stepper.project, at_rest=True)
     integrate_ensemble = _bound(Stepper.integrate_ensemble, at_rest=True)
     _ensemble = _bound(Stepper._ensemble, at_rest=True)
-    chaos_indicators_ensemble = _bound(Stepper.chaos_indicators_ensemble, at_rest=True)
+    chaos_indicators_ensemble: Any = Forwarded("steppers", "chaos_indicators_ensemble", partial(_bound, at_rest=True))
+    path: Any = Forwarded("steppers", "path", _bound_path)
     multipliers, constraint_values = _bound(Stepper.multipliers), _bound(Stepper.constraint_values)
     step, step_positions = _bound(Stepper.step), _bound(Stepper.step_positions)
     discrete_lagrangian = _bound(Stepper.discrete_lagrangian)
@@ -651,19 +669,6 @@ class StepperOfRunTimeSizes(Stepper):
     initial_momentum = _bound(Stepper.initial_momentum)
     jacobian, sensitivity = _bound(Stepper.jacobian), _bound(Stepper.sensitivity)
     jvp, vjp = _bound(Stepper.jvp), _bound(Stepper.vjp)
-
-    def _path(self, q0: Any = None, *arguments: Any, **named: Any) -> Any:
-        """Return a path; the positions that determine the sizes are q0, or of closed paths the first of ``start``."""
-        start = named.get("start")
-        if q0 is not None or start is None:
-            return self._call_bound(Stepper.path, False, q0, arguments, **named)
-        if callable(start):
-            first = start(named.get("t", 0.0))
-        else:
-            first = {name: x[0] for name, x in start.items()} if isinstance(start, Mapping) else start[0]
-        return self.bind(first, named.get("parameters"))[0].path(None, *arguments, **named)
-
-    path: Any = wraps(Stepper.path)(_path)
 
     def _call_bound(
         self,

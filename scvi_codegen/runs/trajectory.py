@@ -27,7 +27,7 @@ from scvi_codegen.runs.derivatives.actions import actions_until, shadow_energy
 from scvi_codegen.runs.derivatives.trajectory_derivatives import TrajectoryDerivatives
 from scvi_codegen.runs.events.contacts import contact_forces, contact_modes
 from scvi_codegen.runs.events.refinement import crossings_of
-from scvi_codegen.runs.forwarding import ChaosOfRun, Pictured
+from scvi_codegen.runs.forwarding import OfRuns
 from scvi_codegen.runs.results.dense_output import states_at, times_of_words, within
 from scvi_codegen.runs.results.energy import energy_account
 from scvi_codegen.runs.results.export import COLUMNS, States, to_dataframe, write_states
@@ -65,15 +65,7 @@ MOST_DRAWN, MOST_CURVES = 400, 6
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class Trajectory(
-    WithUnsetAttributes,
-    TrajectoryDerivatives,
-    ChaosOfRun,
-    AttitudeHistory,
-    Confirmed,
-    WithErrors,
-    Pictured,
-    TwoWords,
-    OfMethod,
+    WithUnsetAttributes, TrajectoryDerivatives, OfRuns, AttitudeHistory, Confirmed, WithErrors, TwoWords, OfMethod
 ):
     """States along a run, the initial state first.
 
@@ -445,7 +437,7 @@ class Trajectory(
     def unresolved(self) -> Array:
         """Return (n,) parts of the squared amplitude in the highest modes of the mesh of fields (resolution monitor).
 
-        See :meth:`~scvi_codegen.fields.mesh.Mesh.unresolved`; the largest of all fields.
+        See :meth:`~scvi_codegen.extras.fields.mesh.Mesh.unresolved`; the largest of all fields.
 
         Raises:
             MethodError: if the system is not that of a mesh.

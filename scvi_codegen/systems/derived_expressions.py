@@ -25,6 +25,7 @@ from sympy import Expr, Matrix, Symbol
 from sympy.utilities.iterables import connected_components
 
 from scvi_codegen.common.precision import Number, mp
+from scvi_codegen.systems import constraints
 from scvi_codegen.systems.formulas.expressions import (
     NEGLIGIBLE,
     Tape,
@@ -103,6 +104,45 @@ class Forms:
         if self.system.damping == 0:
             return self.force
         return tuple(f - self.system.damping * p for f, p in zip(self.force, self.momentum, strict=True))
+
+    @cached_property
+    def multipliers(self) -> tuple[Symbol, ...]:
+        """Lagrange multipliers lambda, one for each constraint."""
+        return multipliers(self.system)
+
+    @cached_property
+    def auxiliary_multipliers(self) -> tuple[Symbol, ...]:
+        """Multipliers nu of the constitutive equations, one for each auxiliary variable."""
+        return auxiliary_multipliers(self.system)
+
+    @cached_property
+    def position_conditions(self) -> tuple[Expr, ...]:
+        """See :func:`~scvi_codegen.systems.constraints.position_conditions`: g(q, t) of each constraint."""
+        return constraints.position_conditions(self.system)
+
+    @cached_property
+    def velocity_conditions(self) -> tuple[Expr, ...]:
+        """See :func:`~scvi_codegen.systems.constraints.velocity_conditions`: A v + b of each constraint."""
+        return constraints.velocity_conditions(self.system)
+
+    @cached_property
+    def constraint_rates(self) -> tuple[Expr, ...]:
+        """See :func:`~scvi_codegen.systems.constraints.constraint_rates`: g_q v + g_t, or A v + b."""
+        return constraints.constraint_rates(self.system)
+
+    @cached_property
+    def force_directions(self) -> Entries:
+        """See :func:`~scvi_codegen.systems.constraints.force_directions`: D of the forces D^T lambda."""
+        return constraints.force_directions(self.system)
+
+    @cached_property
+    def idle_multipliers(self) -> tuple[Expr, ...]:
+        """See :func:`~scvi_codegen.systems.constraints.idle_multipliers`: 0 where the constraint is imposed."""
+        return constraints.idle_multipliers(self.system)
+
+    def with_constraint_forces(self, forces: Sequence[Expr]) -> tuple[Expr, ...]:
+        """Return m forces plus those of the constraints."""
+        return constraints.with_constraint_forces(self.system, forces)
 
     @cached_property
     def mass(self) -> Entries:

@@ -8,9 +8,9 @@ from functools import partial
 from numbers import Real
 from typing import TYPE_CHECKING, Any, Literal
 
-from scvi_codegen.common.atomic import naming_folders
 from scvi_codegen.common.collection import without_collection
-from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, warn
+from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.common.registry import part
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import FORMULAS, MAPPED, NAMES, NUMBERS, TEXTS, ArgumentType, checks_arguments
 from scvi_codegen.systems.contact import Impacts
@@ -99,8 +99,7 @@ class LagrangianSystem(MechanicalSystem):
     @property
     def keyframes(self) -> dict[str, dict[str, Any]]:
         """States of a robot as arguments of ``integrate``: ``"qpos0"``, at rest at its reference, and its file's."""
-        from scvi_codegen.systems.multibody.trees.keyframes import keyframe
-
+        keyframe = part("readers", "keyframe")
         return {name: keyframe(self.links, self.inputs, key) for name, key in {"qpos0": {}, **self.keys}.items()}
 
     @property
@@ -274,8 +273,6 @@ class LagrangianSystem(MechanicalSystem):
         """
         from sympy import sympify
 
-        from scvi_codegen.systems.multibody.readers import forces_of_lagranges_method
-
         holonomic = [sympify(g) for g in method._hol_coneqs]  # private attribute: SymPy has no public one
         rolling = list(method.coneqs)[len(holonomic) :]  # coneqs begins with the rates of the holonomic constraints
         lagrangian = method._L[0]  # private attribute: SymPy has no public one
@@ -284,7 +281,7 @@ class LagrangianSystem(MechanicalSystem):
             lagrangian=lagrangian,
             coordinates=list(method.q),
             parameters=parameters,
-            forces=forces_of_lagranges_method(method),
+            forces=part("readers", "of_lagranges_method")(method),
             constraints=[*holonomic, *rolling],
             inputs=inputs,
         )
@@ -318,9 +315,8 @@ class LagrangianSystem(MechanicalSystem):
             SystemDefinitionError: if generalised speeds are not an invertible combination of the rates of the
                 coordinates, bodies are missing, or a symbol has no value.
         """
-        from scvi_codegen.systems.multibody.readers import of_kanes_method
-
-        return cls.from_sympy(name=name, parameters=parameters, inputs=inputs, **of_kanes_method(method).formulas())
+        formulas = part("readers", "of_kanes_method")(method).formulas()
+        return cls.from_sympy(name=name, parameters=parameters, inputs=inputs, **formulas)
 
     @classmethod
     @checks_arguments(SystemDefinitionError, system=BODIES)
@@ -346,9 +342,8 @@ class LagrangianSystem(MechanicalSystem):
             system: its equations need not have been formed.
             name, parameters, inputs: see :meth:`from_kanes_method`.
         """
-        from scvi_codegen.systems.multibody.readers import of_system
-
-        return cls.from_sympy(name=name, parameters=parameters, inputs=inputs, **of_system(system).formulas())
+        formulas = part("readers", "of_system")(system).formulas()
+        return cls.from_sympy(name=name, parameters=parameters, inputs=inputs, **formulas)
 
     @classmethod
     @checks_arguments(SystemDefinitionError, gravity=NUMBERS, **ROBOT)
@@ -394,10 +389,18 @@ class LagrangianSystem(MechanicalSystem):
         Raises:
             SystemDefinitionError: naming file and element, if something is malformed, unknown or not read.
         """
-        from scvi_codegen.systems.multibody.trees.urdf import links_of_urdf
-
-        robot, links = links_of_urdf(path, floating=floating, parts=_read_parts(limits=limits, friction=friction))
-        return cls._of_tree(path, name or robot, links, gravity, actuated, check_inertias, (restitution, impacts))
+        read: LagrangianSystem = part("readers", "of_urdf")(
+            cls,
+            path,
+            parts={"limits": limits, "friction": friction},
+            law=(restitution, impacts),
+            floating=floating,
+            gravity=gravity,
+            actuated=actuated,
+            check_inertias=check_inertias,
+            name=name,
+        )
+        return read
 
     @classmethod
     @checks_arguments(SystemDefinitionError, contacts=PLANES, **ROBOT)
@@ -439,44 +442,18 @@ class LagrangianSystem(MechanicalSystem):
                 and is not read: equalities of flexible bodies, tendons around geoms; or if it names a file that
                 is neither in its folder nor in ``folders``.
         """
-        from scvi_codegen.systems.multibody.trees.mjcf import links_of_mjcf
-
-        parts = _read_parts(limits=limits, friction=friction, contacts=contacts)
-        with naming_folders(folders):
-            model, links, gravity, *others = links_of_mjcf(path, [*parts, *["actuators"] * actuators])
-        return cls._of_tree(
-            path, name or model, links, gravity, actuated, check_inertias, (restitution, impacts), *others
+        read: LagrangianSystem = part("readers", "of_mjcf")(
+            cls,
+            path,
+            parts={"limits": limits, "friction": friction, "contacts": contacts},
+            law=(restitution, impacts),
+            actuators=actuators,
+            folders=folders,
+            actuated=actuated,
+            check_inertias=check_inertias,
+            name=name,
         )
-
-    @classmethod
-    def _of_tree(
-        cls, path: Any, name: str, links: Any, gravity: Any, actuated: Any, checked: bool, law: Any, *others: Any
-    ) -> LagrangianSystem:
-        from scvi_codegen.systems.multibody.trees.closures import conditions_of
-        from scvi_codegen.systems.multibody.trees.contacts import contacts_of
-        from scvi_codegen.systems.multibody.trees.energies import exact_number, system_of_tree
-        from scvi_codegen.systems.multibody.trees.keyframes import outside_limits
-        from scvi_codegen.systems.multibody.trees.tendons import contacts_of_tendons, energies_of
-
-        try:
-            closures, tendons, touches, actuators, keys = others or ((), (), (), (), {})
-            of_impacts = {"restitution": exact_number(law[0]), "impacts": law[1]}
-            touching = contacts_of(links, touches, of_impacts) + contacts_of_tendons(links, tendons, of_impacts)
-            added = (
-                conditions_of(links, closures),
-                checked,
-                energies_of(links, tendons),
-                touching,
-                of_impacts,
-                actuators,
-            )
-            system: LagrangianSystem = system_of_tree(cls, name, links, gravity, actuated, *added, keys=keys)
-        except SystemDefinitionError as error:
-            raise SystemDefinitionError(f"{path}: {error}") from error
-        if beyond := outside_limits(system.contacts, system.keyframes):
-            remedy = "pass other positions, correct ref, qpos or range, or limits='ignore'"
-            warn(f"{path}: no run begins outside limits, as {beyond}: {remedy}", SystemDefinitionWarning)
-        return system
+        return read
 
     @classmethod
     def _read(cls, arguments: Mapping[str, Any]) -> tuple[Any, bool]:
@@ -494,8 +471,3 @@ class LagrangianSystem(MechanicalSystem):
             for coordinate, velocity in zip(self.coordinates, self.velocities, strict=True)
         }
         return rf"$\displaystyle L = {latex(self._shown_formula, symbol_names=dotted)}$"
-
-
-def _read_parts(**parts: str) -> list[str]:
-    """Return the names of the parts of a robot that are not ignored."""
-    return [part for part, how in parts.items() if how != "ignore"]

@@ -12,7 +12,7 @@ function readColors() {
 const mixed = (from, to, share, white = 0) => `rgb(${rgb[from].map((x, k) => { const u = x + (255 - x) * white; return Math.round(u + (rgb[to][k] - u) * share); }).join()})`;
 const hue = (k) => "c" + (k % 6);
 
-// ---- points of a shape: registers of a straight-line program (scvi_codegen/interfaces/pictures/shape.py)
+// ---- points of a shape: registers of a straight-line program (scvi_codegen/extras/pictures/shape.py)
 const { shape } = about, flat = shape.dimension === 2, START = 1 + 2 * m + about.values;
 const unit = (list) => { const norm = Math.hypot(...list) || 1; return list.map((x) => x / norm); };
 const registers = new Float64Array(START + shape.program.length);

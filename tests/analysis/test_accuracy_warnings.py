@@ -11,7 +11,7 @@ from commands import error_of, invoke, output_of
 from notation import lagrange
 
 import scvi_codegen as sc
-from scvi_codegen.analysis.advice.advice import missed_tolerance
+from scvi_codegen.extras.advice.advice import missed_tolerance
 from scvi_codegen.interfaces.cli.reports import in_known_digits
 
 
@@ -171,7 +171,7 @@ class TestTolerances:
         assert "is missed: the error is" in missed_tolerance(found, error / 5)
 
     def test_withdrawn_tolerance_is_reported(self, monkeypatch):
-        command = "scvi_codegen.interfaces.cli.commands.run.missed_tolerance"
+        command = "scvi_codegen.extras.advice.advice.missed_tolerance"
         monkeypatch.setattr(command, lambda *_: "the tolerance is not kept")
         assert "the tolerance is not kept" in error_of("run kepler --span 5 --advise 1e-6", status=1)
 

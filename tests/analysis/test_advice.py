@@ -127,9 +127,7 @@ class TestDegree:
     def test_time_of_evidence_is_per_unit_of_time(self, monkeypatch: pytest.MonkeyPatch):
         """Pilot runs over the whole span of one second each."""
         times = count()
-        monkeypatch.setattr(
-            "scvi_codegen.analysis.advice.advice.time", SimpleNamespace(perf_counter=lambda: next(times))
-        )
+        monkeypatch.setattr("scvi_codegen.extras.advice.advice.time", SimpleNamespace(perf_counter=lambda: next(times)))
         advice = advise(pendulum(), SVI(6), [1.5], [0.0], -20.0, 1e-6)
         assert {row.seconds for row in advice.evidence} == {1 / 20}
         found = re.findall(r"h = (-\S+) .* (\S+ \w+) for the whole span\n", _text(advice))

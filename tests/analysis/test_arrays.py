@@ -13,13 +13,13 @@ from commands import output_of
 from either_system import either_system
 
 import scvi_codegen as sc
-from scvi_codegen.analysis.verification.arrays import small_start
-from scvi_codegen.analysis.verification.arrays.whole import WholeStart
 from scvi_codegen.codegen import pipeline
 from scvi_codegen.codegen.ir.equations import Control
 from scvi_codegen.codegen.ir.program import ArrayProgram
 from scvi_codegen.codegen.rendering.program_source import render_arrays
 from scvi_codegen.codegen.rendering.source import Source
+from scvi_codegen.extras.verification.arrays import small_start
+from scvi_codegen.extras.verification.arrays.whole import WholeStart
 from scvi_codegen.runs import compiler
 from scvi_codegen.runs.stepping.array_interface import read_arrays
 

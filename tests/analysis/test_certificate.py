@@ -17,18 +17,18 @@ from notation import lagrange
 from samples import QUICK_FLAGS, pushed_pendulum
 
 import scvi_codegen as sc
-from scvi_codegen.analysis.verification import system_under_test
-from scvi_codegen.analysis.verification.certificate import Check, Finding, Outcome, ViolationError, checked
-from scvi_codegen.analysis.verification.stepping import step_checks
-from scvi_codegen.analysis.verification.structure import structure_checks
 from scvi_codegen.codegen.ir import kernel
 from scvi_codegen.codegen.lowering import stage_groups
 from scvi_codegen.codegen.native import announcements
 from scvi_codegen.codegen.rendering.kernels import printer
 from scvi_codegen.common.precision import mp
+from scvi_codegen.extras.exact.solution import exact_motion
+from scvi_codegen.extras.exact.step import derived_step
+from scvi_codegen.extras.verification import system_under_test
+from scvi_codegen.extras.verification.certificate import Check, Finding, Outcome, ViolationError, checked
+from scvi_codegen.extras.verification.stepping import step_checks
+from scvi_codegen.extras.verification.structure import structure_checks
 from scvi_codegen.methods import constraints, stage_system
-from scvi_codegen.methods.exact.solution import exact_motion
-from scvi_codegen.methods.exact.step import derived_step
 from scvi_codegen.runs import compiler
 from scvi_codegen.systems import derived_expressions
 from scvi_codegen.systems.formulas.expressions import evaluate

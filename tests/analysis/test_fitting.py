@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import curve_fit
 
 import scvi_codegen as sc
-from scvi_codegen.analysis.estimation.multiple_shooting import _bounded_update, _equality_constrained_update
+from scvi_codegen.extras.fits.multiple_shooting import _bounded_update, _equality_constrained_update
 
 TRUE = {"m": 1.3, "alpha": -1.0, "beta": 0.8, "delta": 0.2, "gamma": 0.3, "omega": 1.2}
 NOISE = 0.01

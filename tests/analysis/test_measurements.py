@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.analysis import verification
-from scvi_codegen.analysis.verification import arrays, convergence, roundoff, variable_steps
-from scvi_codegen.analysis.verification.certificate import Certificate, Check, Outcome, information
-from scvi_codegen.analysis.verification.derivatives import derivative_checks
-from scvi_codegen.analysis.verification.impacts import impact_checks
-from scvi_codegen.analysis.verification.roundoff import roundoff_checks
-from scvi_codegen.analysis.verification.stepping import _agree, _solves, predictor_checks, step_checks
-from scvi_codegen.analysis.verification.structure import _reversal, _symplecticity, structure_checks
-from scvi_codegen.analysis.verification.system_under_test import State, SystemUnderTest
-from scvi_codegen.analysis.verification.variable_steps import variable_step_checks
 from scvi_codegen.common.precision import mp
+from scvi_codegen.extras import verification
+from scvi_codegen.extras.verification import arrays, convergence, roundoff, variable_steps
+from scvi_codegen.extras.verification.certificate import Certificate, Check, Outcome, information
+from scvi_codegen.extras.verification.derivatives import derivative_checks
+from scvi_codegen.extras.verification.impacts import impact_checks
+from scvi_codegen.extras.verification.roundoff import roundoff_checks
+from scvi_codegen.extras.verification.stepping import _agree, _solves, predictor_checks, step_checks
+from scvi_codegen.extras.verification.structure import _reversal, _symplecticity, structure_checks
+from scvi_codegen.extras.verification.system_under_test import State, SystemUnderTest
+from scvi_codegen.extras.verification.variable_steps import variable_step_checks
 
 
 def lagrangian(formula: str, coordinates: str = "q", **others: Any) -> sc.LagrangianSystem:

@@ -6,9 +6,9 @@ from notation import lagrange
 from scipy.special import ellipk
 
 import scvi_codegen as sc
-from scvi_codegen.analysis.paths import solver
-from scvi_codegen.analysis.paths.intervals import Intervals, ManyCoordinates
 from scvi_codegen.common.errors import MethodError, PathError, StateError
+from scvi_codegen.extras.paths import solver
+from scvi_codegen.extras.paths.intervals import Intervals, ManyCoordinates
 
 pytestmark = pytest.mark.second
 

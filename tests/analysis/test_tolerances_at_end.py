@@ -6,7 +6,7 @@ import pytest
 from notation import lagrange
 
 import scvi_codegen as sc
-from scvi_codegen.analysis.advice.advice import missed_tolerance
+from scvi_codegen.extras.advice.advice import missed_tolerance
 
 
 @pytest.mark.rotated

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.analysis.verification import Outcome
-from scvi_codegen.analysis.verification.impacts import run_of, transition_checks
-from scvi_codegen.analysis.verification.system_under_test import State, SystemUnderTest
+from scvi_codegen.extras.verification import Outcome
+from scvi_codegen.extras.verification.impacts import run_of, transition_checks
+from scvi_codegen.extras.verification.system_under_test import State, SystemUnderTest
 from scvi_codegen.systems.contacts.modes import in_all_modes
 from scvi_codegen.systems.kinks import located_kinks
 

@@ -9,8 +9,8 @@ from samples import linkage
 from strict_c import check_strict
 
 import scvi_codegen as sc
+from scvi_codegen.extras.exact.step import compiled_equations, derived_step
 from scvi_codegen.interfaces.models.model_files.model_file import dump_model, parse_model
-from scvi_codegen.methods.exact.step import compiled_equations, derived_step
 
 pytestmark = pytest.mark.rotated
 

@@ -16,9 +16,9 @@ from samples import QUICK_FLAGS
 
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import StepFailedError
+from scvi_codegen.extras.exact.step import derived_step
 from scvi_codegen.interfaces.models.problems import problem
 from scvi_codegen.methods import SCVI, SVI, SpectralCollocation
-from scvi_codegen.methods.exact.step import derived_step
 from scvi_codegen.runs.compiler import compile_stepper
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
 

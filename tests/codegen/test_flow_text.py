@@ -6,8 +6,8 @@ from strict_c import check_strict
 
 from scvi_codegen import SCVI, SVI, Gauss, SpectralCollocation, StoermerVerlet, problem
 from scvi_codegen.codegen.pipeline import Sources
-from scvi_codegen.codegen.rendering.program_source import with_casadi_flow, with_flow_of_rows, with_xla_flow
 from scvi_codegen.codegen.variants import Derivatives
+from scvi_codegen.extras.frameworks.sources import with_casadi_flow, with_flow_of_rows, with_xla_flow
 
 CASES = {
     "linkage": (linkage(), SVI(2, "gauss-lobatto:3")),

@@ -6,7 +6,7 @@ from notation import lagrange
 from samples import QUICK_FLAGS
 
 from scvi_codegen import SVI, RadauIIA, SolverOptions, StepFailedError, compile_stepper
-from scvi_codegen.methods.exact.step import derived_step
+from scvi_codegen.extras.exact.step import derived_step
 
 STIFFNESS = 1e8
 EPSILON = 2.0**-52

@@ -13,8 +13,8 @@ from notation import lagrange
 from samples import compile_quickly
 
 import scvi_codegen as sc
-from scvi_codegen.analysis.verification.certificate import Check, Outcome
 from scvi_codegen.common.display.cards import card, listed, plain, sparkline
+from scvi_codegen.extras.verification.certificate import Check, Outcome
 from scvi_codegen.methods.tables.number_tables import number_table
 
 METHODS = [

@@ -16,7 +16,7 @@ from printed_formulas import mp, names, trees_of_mathml, value
 from sympy import Float, Function, Matrix, Mul, Pow, Rational, Symbol, cos, exp, pi, sin, sqrt, symbols
 
 from scvi_codegen.common.display.mathml import latex_name, mathml, mathml_terms
-from scvi_codegen.common.display.page import mathematics_font
+from scvi_codegen.extras.derivation.writing import mathematics_font
 
 x, y, h = symbols("x y h")
 

@@ -31,8 +31,8 @@ from operators import Place, places
 from reach import Reach
 
 PACKAGE = (
-    *("common", "systems", "methods", "codegen", "runs", "analysis/advice"),
-    *("interfaces/cli", "interfaces/derivation", "interfaces/models"),
+    *("common", "systems", "methods", "codegen", "runs", "extras/advice"),
+    *("interfaces/cli", "extras/derivation", "interfaces/models"),
 )
 """Folders of which Python is drawn; the others draw pictures, measure, or need programs that CI may not have."""
 DERIVING = ("systems", "methods", "codegen/ir", "codegen/lowering", "codegen/rendering")

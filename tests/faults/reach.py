@@ -44,7 +44,7 @@ if FOLDER:
 '''
 """Contents of ``sitecustomize.py`` of all processes."""
 GOLDEN = "tests/golden/test_golden.py"
-NOT_GENERATING = ("common", "runs", "analysis", "interfaces")
+NOT_GENERATING = ("common", "runs", "interfaces", "api")
 """Folders of the package that no generated source depends on."""
 LONGEST = 900
 """Seconds after which a test file is ended; what it reached until then is lost."""

@@ -7,7 +7,7 @@ from numpy import cos, exp, pi, sin
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.fields.laws import vanishes
+from scvi_codegen.extras.fields.laws import vanishes
 
 pytestmark = pytest.mark.second
 

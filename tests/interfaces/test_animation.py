@@ -7,7 +7,7 @@ from samples import compile_quickly
 
 import scvi_codegen as sc
 from scvi_codegen.common.errors import PlotError, StateError
-from scvi_codegen.interfaces.pictures.animation import drawn_shape, positions_of
+from scvi_codegen.extras.pictures.animation import drawn_shape, positions_of
 
 pytest.importorskip("matplotlib")
 

@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.methods.exact.step import compiled_equations
+from scvi_codegen.extras.exact.step import compiled_equations
 
 ca = pytest.importorskip("casadi", reason="needs the extra 'casadi'")
 

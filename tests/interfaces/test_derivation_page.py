@@ -22,14 +22,13 @@ import scvi_codegen as sc
 from scvi_codegen.codegen.ir.equations import IterationName
 from scvi_codegen.codegen.lowering.program import step_texts
 from scvi_codegen.codegen.pipeline import program_of
-from scvi_codegen.codegen.rendering.outline import functions_of
 from scvi_codegen.codegen.rendering.program_source import render
-from scvi_codegen.common.display.page import MOST_LINES, Formula, Paragraph, formulas
-from scvi_codegen.interfaces.derivation import derivation_html
-from scvi_codegen.interfaces.derivation.equations import derive
-from scvi_codegen.interfaces.derivation.notation import table_entries
-from scvi_codegen.interfaces.derivation.page.document import ITERATIONS, kernels_of
-from scvi_codegen.interfaces.derivation.page.drawings import curve_section, jacobian_pattern
+from scvi_codegen.extras.derivation.equations import derive
+from scvi_codegen.extras.derivation.notation import table_entries
+from scvi_codegen.extras.derivation.outline import functions_of
+from scvi_codegen.extras.derivation.page.document import ITERATIONS, derivation_html, kernels_of
+from scvi_codegen.extras.derivation.page.drawings import curve_section, jacobian_pattern
+from scvi_codegen.extras.derivation.writing import MOST_LINES, Formula, Paragraph, formulas
 from scvi_codegen.methods.discretise import paper_equations
 from scvi_codegen.methods.tables.number_tables import positions
 

@@ -9,8 +9,8 @@ import pytest
 from matplotlib import pyplot
 
 import scvi_codegen as sc
-from scvi_codegen.interfaces.pictures.arrays import plot_arrays
-from scvi_codegen.interfaces.pictures.conserved import ResidualPlot, plot_momentum_maps
+from scvi_codegen.extras.pictures.arrays import plot_arrays
+from scvi_codegen.extras.pictures.conserved import ResidualPlot, plot_momentum_maps
 from scvi_codegen.runs.states.words import named
 from scvi_codegen.runs.stepping.step_plan import Fixed
 

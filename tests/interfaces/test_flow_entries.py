@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 from pumped_leapfrog import EVERY, ROWS, STEP_INPUTS, STEPS, hessian, stepper, weights
 
-from scvi_codegen.interfaces.frameworks.flow import FlowOfRows
+from scvi_codegen.extras.frameworks.flow import FlowOfRows
 
 EVERY_STEP, NOT_FINITE_STATUS = 1, 3
 SAVED, SIZE = STEPS // EVERY + 1, len(STEP_INPUTS)

@@ -12,7 +12,7 @@ from commands import invoke, json_of
 from scipy.special import ellipk
 
 import scvi_codegen as sc
-from scvi_codegen.analysis import verification
+from scvi_codegen.extras import verification
 from scvi_codegen.interfaces.cli import command_group, main
 from scvi_codegen.interfaces.models.model_files.model_file import dump_model, parse_model
 

@@ -7,9 +7,9 @@ import pytest
 
 import scvi_codegen
 from scvi_codegen import Model, ModelFileError
-from scvi_codegen.interfaces.cli.commands.derive import derive
-from scvi_codegen.interfaces.cli.commands.family import family
-from scvi_codegen.interfaces.cli.commands.path import path
+from scvi_codegen.extras.derivation.command import derive
+from scvi_codegen.extras.orbits.command import family
+from scvi_codegen.extras.paths.command import path
 from scvi_codegen.interfaces.cli.commands.run import run
 from scvi_codegen.interfaces.models.model_files.model_file import dump_model, parse_model
 from scvi_codegen.interfaces.models.options import FIELDS, OPTIONS, alternatives, options_of

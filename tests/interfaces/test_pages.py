@@ -17,7 +17,7 @@ from programs import needs
 
 import scvi_codegen as sc
 from scvi_codegen.codegen.native.building import PORTABLE_FLAGS
-from scvi_codegen.interfaces.pages import page as pages
+from scvi_codegen.extras.pages import page as pages
 
 MOTIONS = Path(__file__).parents[2] / "docs" / "motions"
 OSCILLATOR = """[system]

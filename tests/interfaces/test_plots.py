@@ -10,8 +10,8 @@ import pytest
 from matplotlib import pyplot
 
 import scvi_codegen as sc
-from scvi_codegen.interfaces.pictures.canvas import check_plot_path
-from scvi_codegen.interfaces.pictures.conserved import largest_in_bins, plot_energy, plot_momentum_maps
+from scvi_codegen.extras.pictures.canvas import check_plot_path
+from scvi_codegen.extras.pictures.conserved import largest_in_bins, plot_energy, plot_momentum_maps
 
 
 def trajectory_of(name: str, steps: int = 300, h: float | None = None) -> sc.Trajectory:
@@ -64,7 +64,7 @@ def test_failed_picture_leaves_no_file(kepler, tmp_path, monkeypatch):
     def fail(trajectory: sc.Trajectory, ax: object) -> None:
         raise RuntimeError("no picture")
 
-    monkeypatch.setattr("scvi_codegen.interfaces.pictures.overview.plot_energy", fail)
+    monkeypatch.setattr("scvi_codegen.extras.pictures.overview.plot_energy", fail)
     with pytest.raises(RuntimeError, match="no picture"):
         sc.plot_trajectory(kepler, tmp_path / "orbit.png")
     assert list(tmp_path.iterdir()) == []

@@ -22,8 +22,8 @@ from printed_formulas import FUNCTIONS, mp, names, trees_of_mathml, value
 
 import scvi_codegen as sc
 from scvi_codegen.common.display.mathml import mathml_terms
-from scvi_codegen.interfaces.derivation import derivation_html
-from scvi_codegen.interfaces.derivation.equations import derive
+from scvi_codegen.extras.derivation.equations import derive
+from scvi_codegen.extras.derivation.page.document import derivation_html
 from scvi_codegen.methods.discretise import discretise, paper_equations
 from scvi_codegen.methods.stage_system import EntryName
 from scvi_codegen.methods.tables.number_tables import Part

@@ -8,7 +8,7 @@ import pytest
 from printed_formulas import mp
 
 import scvi_codegen as sc
-from scvi_codegen.interfaces.derivation.equations import derive
+from scvi_codegen.extras.derivation.equations import derive
 
 COUNT, H, T, K = 5, 0.125, 0.375, 0.6875
 MASSES = [1.25, 0.75, 1.5, 2.0, 0.875]

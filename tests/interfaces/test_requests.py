@@ -10,7 +10,7 @@ from pages import ROOT
 
 from scvi_codegen.codegen.native import building
 from scvi_codegen.common.errors import BuildError
-from scvi_codegen.interfaces.pages import webassembly
+from scvi_codegen.extras.pages import webassembly
 
 START = "[initial]\nq = [1.0]\nq_dot = [0.0]\n"
 SWING = '[system]\nname = "swing"\ncoordinates = ["q"]\nlagrangian = "q_dot**2/2 + cos(q)"\n'

@@ -9,6 +9,8 @@ from commands import output_of
 
 import scvi_codegen as sc
 from scvi_codegen.common.errors import ModelFileError
+from scvi_codegen.extras.pages.section import drawn_system_of_model
+from scvi_codegen.extras.pictures.recognition import shape_of
 from scvi_codegen.interfaces.models.model_files.model_file import (
     document_in,
     dump_model,
@@ -16,8 +18,6 @@ from scvi_codegen.interfaces.models.model_files.model_file import (
     model_texts,
     parse_model,
 )
-from scvi_codegen.interfaces.models.model_files.page_section import drawn_system_of_model
-from scvi_codegen.interfaces.pictures.recognition import shape_of
 from scvi_codegen.methods.galerkin import SVI
 
 ROBOTS = Path(__file__).parents[1] / "systems" / "robots"

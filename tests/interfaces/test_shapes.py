@@ -11,10 +11,10 @@ from notation import lagrange
 from programs import needs
 
 import scvi_codegen as sc
+from scvi_codegen.extras.pages.section import drawn_system_of_model
+from scvi_codegen.extras.pictures.recognition import shape_of
+from scvi_codegen.extras.pictures.shape import shape_of_picture
 from scvi_codegen.interfaces.models.model_files.model_file import parse_model
-from scvi_codegen.interfaces.models.model_files.page_section import drawn_system_of_model
-from scvi_codegen.interfaces.pictures.recognition import shape_of
-from scvi_codegen.interfaces.pictures.shape import shape_of_picture
 from scvi_codegen.systems.formulas.expressions import ARGUMENTS, FUNCTIONS
 
 ROOT = Path(__file__).parents[2]

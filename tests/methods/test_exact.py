@@ -7,8 +7,8 @@ from samples import driven_duffing, linkage, pumped_cart_pole, pushed_pendulum
 
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.precision import mp
+from scvi_codegen.extras.exact.discrete_lagrangian import exact_discrete_lagrangian, exact_map
 from scvi_codegen.interfaces.models.problems import problem
-from scvi_codegen.methods.exact.discrete_lagrangian import exact_discrete_lagrangian, exact_map
 
 OSCILLATOR = problem("harmonic-oscillator").system
 PENDULUM = problem("planar-pendulum").system

@@ -21,7 +21,7 @@ from scipy.optimize import brentq
 
 import scvi_codegen as sc
 from scvi_codegen import StateError, StepFailedError, load_run, record_run, resume_run
-from scvi_codegen.interfaces.frameworks.flow import FlowOfRows
+from scvi_codegen.extras.frameworks.flow import FlowOfRows
 from scvi_codegen.runs.derivatives import gradients
 from scvi_codegen.runs.stepping import chunks, memory
 from tests.motions.motions import LOW, STOP, truth_of

@@ -4,9 +4,9 @@ import re
 
 import pytest
 
-from scvi_codegen.paper.catalogue import EXPERIMENTS
-from scvi_codegen.paper.experiment import CLAIMS, EVIDENCE, Verdict
-from scvi_codegen.paper.runner import Failure, run_experiments
+from scvi_codegen.extras.paper.catalogue import EXPERIMENTS
+from scvi_codegen.extras.paper.experiment import CLAIMS, EVIDENCE, Verdict
+from scvi_codegen.extras.paper.runner import Failure, run_experiments
 
 PAPER = {*(f"figure-{n}" for n in range(1, 31) if n != 2), *("table-8", "table-9", "claims", "correction")}
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.paper import correction
-from scvi_codegen.paper.catalogue import EXPERIMENTS
-from scvi_codegen.paper.experiment import Verdict, draw, statement
-from scvi_codegen.paper.runs import (
+from scvi_codegen.extras.paper import correction
+from scvi_codegen.extras.paper.catalogue import EXPERIMENTS
+from scvi_codegen.extras.paper.experiment import Verdict, draw, statement
+from scvi_codegen.extras.paper.runs import (
     KEPLER,
     SETTINGS,
     MeasuredRun,

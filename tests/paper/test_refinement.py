@@ -7,8 +7,8 @@ import pytest
 
 import scvi_codegen as sc
 from scvi_codegen.common.precision import mp
-from scvi_codegen.paper.experiment import Verdict
-from scvi_codegen.paper.refinement import (
+from scvi_codegen.extras.paper.experiment import Verdict
+from scvi_codegen.extras.paper.refinement import (
     CASES,
     ErrorCurve,
     Law,

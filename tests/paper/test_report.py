@@ -12,10 +12,10 @@ from commands import error_of, json_of, output_of
 from html_page import Page
 from toy_experiments import EXPERIMENTS, GOOD
 
-from scvi_codegen.common.display.page import cell, prose
-from scvi_codegen.paper.command import experiments_table, experiments_titles
-from scvi_codegen.paper.experiment import Result, draw, report_html
-from scvi_codegen.paper.runner import Failure, run_experiments, with_needs
+from scvi_codegen.extras.derivation.writing import cell, prose
+from scvi_codegen.extras.paper.command import experiments_table, experiments_titles
+from scvi_codegen.extras.paper.experiment import Result, draw, report_html
+from scvi_codegen.extras.paper.runner import Failure, run_experiments, with_needs
 
 if TYPE_CHECKING:
     pass
@@ -131,7 +131,7 @@ class TestPage:
 
 @pytest.fixture
 def toys(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scvi_codegen.paper.catalogue.EXPERIMENTS", EXPERIMENTS)
+    monkeypatch.setattr("scvi_codegen.extras.paper.catalogue.EXPERIMENTS", EXPERIMENTS)
 
 
 COMMAND = ("reproduce", "--jobs", "1")

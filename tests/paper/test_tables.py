@@ -5,11 +5,11 @@ import pickle
 import numpy as np
 import pytest
 
+from scvi_codegen.extras.paper import experiment, iterations
+from scvi_codegen.extras.paper.catalogue import EXPERIMENTS
+from scvi_codegen.extras.paper.experiment import Comparison, Result, Verdict, statement
+from scvi_codegen.extras.paper.runs import KEPLER, perihelion, stepper_of
 from scvi_codegen.methods import SVI, SpectralCollocation
-from scvi_codegen.paper import experiment, iterations
-from scvi_codegen.paper.catalogue import EXPERIMENTS
-from scvi_codegen.paper.experiment import Comparison, Result, Verdict, statement
-from scvi_codegen.paper.runs import KEPLER, perihelion, stepper_of
 
 
 def test_the_printed_iterations_are_those_of_the_paper():

@@ -50,6 +50,7 @@ def extended(tmp_path_factory: pytest.TempPathFactory) -> Path:
             shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     new, changes = additions()
     for path, text in new:
+        (folder / path).parent.mkdir(exist_ok=True)
         (folder / path).write_text(text)
     for path, change in changes:
         (folder / path).write_text(changed((folder / path).read_text(), change))
@@ -70,7 +71,7 @@ def test_documented_additions_need_one_file_and_one_line() -> None:
     new, changes = additions()
     lines = [line for _, change in changes for line in change.splitlines() if line[:1] in "+-"]
     of_package = [path for path, _ in new if path.startswith("scvi_codegen/")]
-    assert len(of_package) == len(new) == 9
+    assert len(of_package) == len(new) == 10
     assert not any((ROOT / path).exists() for path, _ in new)
     assert all(line.startswith("+") for line in lines)
     assert sum("import" not in line for line in lines) == len(of_package) + 1, "an option is one entry"
@@ -84,7 +85,7 @@ def test_the_pages_name_the_rooms_alike() -> None:
     tables = [dict(re.findall(rows, page.split("to a run")[1].split("\n\n")[1], re.M)) for page in pages]
     assert tables[0] == tables[1] == tables[2]
     assert [name for name in tables[0] if (Path(scvi_codegen.__file__).parent / name).is_dir()] == [*tables[0]]
-    assert len(tables[0]) == 9
+    assert len(tables[0]) == 8
 
 
 def test_documented_method_is_the_midpoint_rule(extended: Path) -> None:
@@ -324,6 +325,22 @@ for observe in ("variance", Variance()):
     print(np.allclose(run.observed, saved.var(axis=0), rtol=1e-12), len(run.q), np.array_equal(run.q[-1], saved[-1]))
 """
     assert run(extended, script).split() == ["True", "2", "True"] * 2
+
+
+def test_documented_extra_is_a_method_of_runs(extended: Path) -> None:
+    """The registry imports it when it is called; of a harmonic oscillator q p = -cos(t) sin(t)."""
+    script = """
+import numpy as np, inspect
+from scvi_codegen import LagrangianSystem, StateError, compile_stepper
+stepper = compile_stepper(LagrangianSystem.from_text("spring", ["x"], "x_dot**2/2 - x**2/2"), "svi:8")
+run = stepper.integrate([1.0], [0.0], h=0.1, steps=40)
+print("scvi_codegen.extras.virial.methods" in sys.modules, np.allclose(run.virial(), -np.sin(2*run.t)/2, atol=1e-12))
+try:
+    stepper.integrate([1.0], [0.0], h=0.1, steps=0).virial()
+except StateError as refusal:
+    print("at least one step" in str(refusal), "units of action" in inspect.getdoc(type(run).virial))
+"""
+    assert run(extended, script).split() == ["False", "True", "True", "True"]
 
 
 @pytest.mark.quick

@@ -15,43 +15,34 @@ from programs import needs
 
 import scvi_codegen
 from scvi_codegen import Model, generate_package, problem
+from scvi_codegen.common.registry import EXTRAS, MODULES, homes, part
 
 PACKAGE = Path(scvi_codegen.__file__).parent
 
-ROOMS = ("common", "systems", "methods", "codegen", "fields", "runs", "analysis", "interfaces", "paper")
+ROOMS = ("common", "systems", "methods", "codegen", "runs", "interfaces", "api", "extras")
 """Folders of the package in the order of the way from L to a run; imports go to the left, those for the type checker
 and those inside functions, too."""
 ROOT = ("__init__", "__main__", "version")
-FORWARDING = {
-    "runs.forwarding": {
-        "analysis.chaos.ensemble",
-        "analysis.chaos.indicators",
-        "analysis.paths.path",
-        "interfaces.pictures.animation",
-        "interfaces.pictures.overview",
-    },
-    "analysis.estimation.fitting": {"interfaces.pictures.conserved"},
-    "analysis.orbits.family": {"interfaces.pictures.family"},
-}
-"""Methods that forward to a higher room import inside."""
+FOR_TYPES = {"runs.forwarding": {f"extras.{name}.methods" for name in ("chaos", "paths", "pictures")}}
+"""Where the core tells type checkers of the methods that extras add; at run time it knows their names alone."""
 
 OWNERS = {
-    "casadi": "interfaces",
+    "casadi": "extras",
     "cffi": "codegen",
-    "click": "interfaces paper",
-    "distributed": "interfaces",
+    "click": "interfaces extras",
+    "distributed": "extras",
     "filelock": "runs",
     "h5netcdf": "common runs",
     "h5py": "common runs",
-    "jax": "interfaces",
-    "jaxlib": "interfaces",
-    "jinja2": "common codegen",
-    "markupsafe": "common paper",
-    "matplotlib": "interfaces paper",
-    "mpmath": "common methods runs",
+    "jax": "extras",
+    "jaxlib": "extras",
+    "jinja2": "codegen extras",
+    "markupsafe": "extras",
+    "matplotlib": "extras",
+    "mpmath": "common methods runs extras",
     "pandas": "common runs",
     "platformdirs": "common",
-    "scipy": "analysis codegen interfaces runs systems",
+    "scipy": "codegen runs systems extras",
     "tomli_w": "interfaces",
     "xarray": "common runs",
     "zarr": "common runs",
@@ -119,7 +110,7 @@ def circle(used: dict[str, set[str]]) -> list[str]:
     return []
 
 
-def test_the_package_has_nine_rooms():
+def test_the_package_has_eight_rooms():
     assert {room_of(module) for module in names()} == {*ROOMS, *ROOT}
 
 
@@ -130,8 +121,8 @@ def test_folders_have_at_most_16_files():
 
 
 def downwards() -> dict[str, set[str]]:
-    """The modules of the package that each imports, but for those to which it forwards."""
-    return {module: others - FORWARDING.get(module, set()) for module, others in used().items()}
+    """The modules of the package that each imports, but for those that only type checkers need."""
+    return {module: others - FOR_TYPES.get(module, set()) for module, others in used().items()}
 
 
 def test_imports_go_to_lower_rooms_only():
@@ -142,11 +133,32 @@ def test_imports_go_to_lower_rooms_only():
     assert {other for m, other in pairs if room_of(m) in ROOMS and room_of(other) not in ROOMS} == {"version"}
 
 
-@pytest.mark.parametrize(("module", "forwarded"), FORWARDING.items())
-def test_forwarding_methods_import_inside(module, forwarded):
-    tree = ast.parse((PACKAGE / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8"))
-    assert forwarded <= used()[module]
-    assert forwarded.isdisjoint(map(own_module, imports(ast.Module(body=tree.body, type_ignores=[]), deep=False)))
+def test_extras_import_those_above_them_in_the_registry():
+    folders = {module.split(".")[1] for module in names() if room_of(module) == "extras" and "." in module}
+    assert folders == set(EXTRAS)
+    order = list(EXTRAS)
+    pairs = {
+        (module.split(".")[1], other.split(".")[1])
+        for module, others in downwards().items()
+        for other in others
+        if room_of(module) == room_of(other) == "extras" and "." in module and "." in other
+    }
+    assert len(pairs) > 20
+    assert {(one, other) for one, other in pairs if order.index(one) < order.index(other)} == set()
+
+
+def test_types_of_methods_that_extras_add_are_for_type_checkers_only():
+    for module, others in FOR_TYPES.items():
+        assert others <= used()[module]
+        tree = ast.parse((PACKAGE / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8"))
+        at_run_time = [node for node in tree.body if not isinstance(node, ast.If)]
+        assert others.isdisjoint(map(own_module, imports(ast.Module(body=at_run_time, type_ignores=[]))))
+
+
+@pytest.mark.parametrize("kind", MODULES)
+def test_every_registered_name_is_a_part_of_its_extra(kind):
+    assert homes(kind)
+    assert all(part(kind, name) is not None for name in homes(kind))
 
 
 def folders() -> dict[str, set[str]]:

@@ -8,9 +8,9 @@ from notation import lagrange
 from tiers import family, first_of_each
 
 import scvi_codegen as sc
-from scvi_codegen.analysis.verification.certificate import Outcome
-from scvi_codegen.analysis.verification.convergence import convergence_checks
-from scvi_codegen.analysis.verification.system_under_test import State, SystemUnderTest
+from scvi_codegen.extras.verification.certificate import Outcome
+from scvi_codegen.extras.verification.convergence import convergence_checks
+from scvi_codegen.extras.verification.system_under_test import State, SystemUnderTest
 
 PLATEAU = 1e-11
 """Errors below are left out; round-off and the reference contribute up to 1e-13."""

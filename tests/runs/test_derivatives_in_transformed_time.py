@@ -9,9 +9,9 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen.common.precision import mp
+from scvi_codegen.extras.exact.solution import exact_motion
+from scvi_codegen.extras.exact.step import compiled_equations
 from scvi_codegen.methods.discretise import is_symplectic
-from scvi_codegen.methods.exact.solution import exact_motion
-from scvi_codegen.methods.exact.step import compiled_equations
 from scvi_codegen.systems.formulas.expressions import Tape
 
 KEPLER = sc.problem("kepler").system

@@ -13,7 +13,7 @@ import pytest
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.interfaces.distributed import _slices, integrate_ensemble
+from scvi_codegen.extras.distributed.blocks import _slices, integrate_ensemble
 
 COUNT = 70
 

@@ -8,9 +8,9 @@ from mpmath import mp
 from notation import lagrange
 
 import scvi_codegen as sc
+from scvi_codegen.extras.exact.step import derived_step
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretised_form
-from scvi_codegen.methods.exact.step import derived_step
 from scvi_codegen.runs.states.attitudes import momenta_of_body
 from scvi_codegen.runs.states.words import fraction_of, two_words, word
 

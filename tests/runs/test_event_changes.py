@@ -15,12 +15,12 @@ from commands import error_of, invoke
 from notation import lagrange
 
 import scvi_codegen as sc
-from scvi_codegen.analysis.verification.certificate import Outcome
-from scvi_codegen.analysis.verification.impacts import impact_checks
-from scvi_codegen.analysis.verification.system_under_test import State, SystemUnderTest
 from scvi_codegen.codegen.rendering.events import with_events
 from scvi_codegen.codegen.variants import WithEvents
-from scvi_codegen.interfaces.derivation.page.document import derivation_html
+from scvi_codegen.extras.derivation.page.document import derivation_html
+from scvi_codegen.extras.verification.certificate import Outcome
+from scvi_codegen.extras.verification.impacts import impact_checks
+from scvi_codegen.extras.verification.system_under_test import State, SystemUnderTest
 from scvi_codegen.interfaces.models.model_files.model_file import dump_model, parse_model
 from scvi_codegen.runs.stepping.compiled_method import Variants
 

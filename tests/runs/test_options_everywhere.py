@@ -16,7 +16,7 @@ from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.common.errors import ScviCodegenError
-from scvi_codegen.interfaces.distributed import integrate_ensemble
+from scvi_codegen.extras.distributed.blocks import integrate_ensemble
 from scvi_codegen.runs.ensembles import batches
 
 PENDULUM = sc.LagrangianSystem.from_text("pendulum", ["x"], "x_dot**2/2 + k*cos(x)", parameters={"k": 1.0})

@@ -6,7 +6,7 @@ from notation import lagrange
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.interfaces.pictures.animation import positions_of
+from scvi_codegen.extras.pictures.animation import positions_of
 
 pytest.importorskip("matplotlib")
 

@@ -13,8 +13,8 @@ from scipy.linalg import block_diag
 
 import scvi_codegen as sc
 from scvi_codegen.common.precision import mp
+from scvi_codegen.extras.exact.step import DerivedStep
 from scvi_codegen.methods.discretise import is_symplectic, paper_equations
-from scvi_codegen.methods.exact.step import DerivedStep
 from scvi_codegen.runs.stepping.step_derivatives import Starts
 
 

@@ -13,11 +13,11 @@ from benchmarks.cases import robots
 from scvi_codegen.codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.codegen.pipeline import Sources
 from scvi_codegen.common.precision import mp
+from scvi_codegen.extras.robots.trees import energies
 from scvi_codegen.methods import as_method
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.formulas.expressions import Tape, gradient
 from scvi_codegen.systems.formulas.intermediates import intermediate, intermediates, separated, written_out
-from scvi_codegen.systems.multibody.trees import energies
 
 pytestmark = pytest.mark.rotated
 

@@ -15,7 +15,7 @@ from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 
 import scvi_codegen as sc
-from scvi_codegen.interfaces.derivation import derivation_html
+from scvi_codegen.extras.derivation.page.document import derivation_html
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.stage_system import straight
 from scvi_codegen.systems.constraints.kind import Reaction

@@ -17,9 +17,9 @@ from sympy.physics.mechanics import (
 )
 
 from scvi_codegen import SVI, LagrangianSystem, SystemDefinitionError, compile_stepper
+from scvi_codegen.extras.robots.kinetics import potential_of
 from scvi_codegen.systems.constraints import kind_of
 from scvi_codegen.systems.constraints.kind import HOLONOMIC
-from scvi_codegen.systems.multibody.kinetics import potential_of
 
 T = dynamicsymbols._t
 Q1, Q2, U1, U2 = dynamicsymbols("q1 q2 u1 u2")

@@ -9,7 +9,7 @@ from random_robots import RECORDED, SEEDS, Mjcf, Urdf, by_mujoco, by_pinocchio, 
 
 import scvi_codegen as sc
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.systems.multibody.trees.schema import MJCF
+from scvi_codegen.extras.robots.trees.schema import MJCF
 
 
 def read(robot: Mjcf | Urdf, path: Any) -> Any:

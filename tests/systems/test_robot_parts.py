@@ -8,7 +8,7 @@ from random_robots import FACES, errors_of_motion
 
 import scvi_codegen as sc
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.systems.multibody.trees.mjcf import links_of_mjcf
+from scvi_codegen.extras.robots.trees.mjcf import links_of_mjcf
 
 LEG = """<mujoco model="leg"><compiler angle="radian" eulerseq="ZYX"/><default><geom size=".1"/></default><worldbody>
 <body name="thigh" pos="0 0 -.3"><joint name="hip" ref=".2"/><geom pos="0 .1 -.2"/><frame name="f" euler=".3 .2 .1">

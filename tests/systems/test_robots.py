@@ -15,8 +15,8 @@ from random_robots import errors_of_motion
 
 import scvi_codegen as sc
 from scvi_codegen.common.errors import ContactError, SystemDefinitionError, SystemDefinitionWarning
+from scvi_codegen.extras.robots.trees.shapes import SHAPES
 from scvi_codegen.systems.formulas.expressions import evaluate
-from scvi_codegen.systems.multibody.trees.shapes import SHAPES
 
 ROBOTS = Path(__file__).parent / "robots"
 

@@ -8,7 +8,7 @@ from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.common.precision import mp
-from scvi_codegen.methods.exact.solution import ExactMotion, numbers
+from scvi_codegen.extras.exact.solution import ExactMotion, numbers
 from scvi_codegen.systems.derived_expressions import sample_points
 from scvi_codegen.systems.formulas.expressions import evaluate
 from scvi_codegen.systems.formulas.symbols import symbol

@@ -14,7 +14,7 @@ from typing import Any
 
 from benchmarks.plots import label_times
 from benchmarks.report import OURS, Point, common_error, frontier, time_at
-from scvi_codegen.interfaces.pictures.canvas import COLORS, save, style
+from scvi_codegen.extras.pictures.canvas import COLORS, save, style
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORD, DOCS = ROOT / "benchmarks" / "curves.json", ROOT / "docs"

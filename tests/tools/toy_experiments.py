@@ -8,8 +8,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from scvi_codegen.common.display.page import TableBlock
-from scvi_codegen.paper.experiment import (
+from scvi_codegen.common.display.tables import TableBlock
+from scvi_codegen.extras.paper.experiment import (
     Comparison,
     Experiment,
     Panel,

@@ -340,7 +340,7 @@ class ArrayLayout(ArrayDeclarations):
         symmetric: whether the linear part of a step is symmetric: without momenta and forces of velocities.
         data: values of fields and tables by name for runs that pass none.
         neighbours: names of the lists of neighbours.
-        mesh: of the fields of a density (:class:`~scvi_codegen.fields.mesh.Mesh`).
+        mesh: of the fields of a density (:class:`~scvi_codegen.extras.fields.mesh.Mesh`).
         links: of a robot from a file.
     """
 

@@ -37,25 +37,19 @@ cannot be written; 2 if the command line or a model is invalid; 130 after Ctrl-C
 
 ABOUT = {
     "cache": "Show or clear the cache of compiled integrators.",
-    "derive": "Print the equations of one step of MODEL.",
     "doctor": "Check compiler and libraries of this machine.",
     "export": "Write the states of a run in a folder to one file.",
-    "family": "Continue periodic orbits; locate bifurcations.",
     "generate": "Generate C code and a Python package for MODEL.",
     "methods": "List the methods and their properties.",
-    "page": "Write a page that computes the motion in the browser.",
-    "path": "Find motions between two positions, and closed paths.",
-    "reproduce": "Reproduce the paper's experiments, with verdicts.",
     "run": "Integrate MODEL and report conserved quantities.",
     "systems": "List the catalogue, or print a system as a file.",
-    "verify": "Measure the guaranteed properties of an integrator.",
 }
+"""Commands of the core by the text of the overview; those of extras follow from the registry."""
 
 
 @click.group(
     cls=Commands,
     folder="scvi_codegen.interfaces.cli.commands",
-    modules={"reproduce": "scvi_codegen.paper.command"},
     about=ABOUT,
     help=OVERVIEW,
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -34,6 +34,7 @@ from scvi_codegen.common.errors import (
     UnresolvedError,
     closest,
 )
+from scvi_codegen.common.registry import EXTRAS, part
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 REPORT, QUIET = f"{__name__}.report", f"{__name__}.quiet"
@@ -46,7 +47,7 @@ FAILURE, USAGE, INTERRUPTED = 1, 2, 130
 class CommandFailure(click.ClickException):
     """Error of a command: a message for the user and an exit status."""
 
-    def __init__(self, message: str, status: int) -> None:
+    def __init__(self, message: str, status: int = FAILURE) -> None:
         super().__init__(message)
         self.status = status
 
@@ -57,17 +58,16 @@ class CommandFailure(click.ClickException):
 
 
 class Commands(click.Group):
-    """Command group that imports the module ``folder``.NAME, or another, for the function NAME of a command.
+    """Command group that imports the module ``folder``.NAME, or that of an extra, for the function NAME of a command.
 
     The module of a command can therefore import what it needs at the top, while ``--help`` imports none of them. Every
     error that a user can cause becomes one message and an exit status.
     """
 
-    def __init__(
-        self, *words: Any, folder: str, modules: Mapping[str, str], about: Mapping[str, str], **settings: Any
-    ) -> None:
+    def __init__(self, *words: Any, folder: str, about: Mapping[str, str], **settings: Any) -> None:
         super().__init__(*words, **settings)
-        self.folder, self.modules, self.about = folder, modules, about
+        added = {name: text for extra in EXTRAS.values() for name, text in extra.commands.items()}
+        self.folder, self.own, self.about = folder, about, {**about, **added}
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names in alphabetical order."""
@@ -77,8 +77,9 @@ class Commands(click.Group):
         """Return the command of a name; imports its module."""
         if cmd_name not in self.about:
             return None
-        module = import_module(self.modules.get(cmd_name, f"{self.folder}.{cmd_name}"))
-        command: click.Command = getattr(module, cmd_name)
+        if cmd_name not in self.own:
+            return part("commands", cmd_name)  # type: ignore[no-any-return]
+        command: click.Command = getattr(import_module(f"{self.folder}.{cmd_name}"), cmd_name)
         return command
 
     def resolve_command(
@@ -140,7 +141,7 @@ def errors_as_messages() -> Iterator[None]:
         with _warnings_as_lines():
             yield
     except (StepFailedError, UnresolvedError, PathError, BuildError, RecordingError) as error:
-        raise CommandFailure(str(error), FAILURE) from error
+        raise CommandFailure(str(error)) from error
     except ScviCodegenError as error:
         cause = error.__cause__
         unwritten = isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError)
@@ -148,9 +149,9 @@ def errors_as_messages() -> Iterator[None]:
     except BrokenPipeError:
         raise
     except OSError as error:
-        raise CommandFailure(str(error), FAILURE) from error
+        raise CommandFailure(str(error)) from error
     except MemoryError as error:
-        raise CommandFailure("not enough memory", FAILURE) from error
+        raise CommandFailure("not enough memory") from error
     except KeyboardInterrupt as error:
         raise CommandFailure("interrupted", INTERRUPTED) from error
 

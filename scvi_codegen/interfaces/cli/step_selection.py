@@ -7,9 +7,9 @@ from typing import Any
 
 import click
 
-from scvi_codegen.analysis.advice.advice import Advice, Evidence, advise
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.common.errors import AccuracyWarning, StateError
+from scvi_codegen.common.registry import part
 from scvi_codegen.common.representation import counted
 from scvi_codegen.common.validation import check_tolerance
 from scvi_codegen.interfaces.cli.command_group import tell
@@ -76,9 +76,7 @@ def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalEr
     return replace(bounded, **steps, error=None, precision=precision), result
 
 
-def model_with_advised_step(
-    model: Model, tolerance: float, states: EnsembleStates | None = None
-) -> tuple[Model, Advice]:
+def model_with_advised_step(model: Model, tolerance: float, states: EnsembleStates | None = None) -> tuple[Model, Any]:
     """Return the model with the fixed step size that errors of pilot runs recommend, and the advice.
 
     Of an ensemble it is the one for all of its initial states. Prints the recommendation and its pilot runs to stdout,
@@ -88,7 +86,7 @@ def model_with_advised_step(
         raise refusal("advice", "with a time transformation")
     stepper = model.stepper()
     require(stepper, "advice")
-    advice = advise(
+    advice = part("services", "advise")(
         model.system,
         model.method,
         model.q if states is None else states.q,
@@ -114,13 +112,13 @@ def model_with_advised_step(
     return model._with_step_size(h=advice.h, steps=steps), advice
 
 
-def _text(advice: Advice) -> str:
+def _text(advice: Any) -> str:
     """Return the recommendation and one line for each pilot run."""
     lines = [f"  h = {row.h:<12.6g} {_outcome(row, abs(advice.h) * advice.steps)}" for row in advice.evidence]
     return "\n".join([advice.message, *lines, ""])
 
 
-def _outcome(row: Evidence, span: float) -> str:
+def _outcome(row: Any, span: float) -> str:
     if not math.isfinite(row.error):
         return "fails"
     error = f"error {row.error:.2g}" if row.error < 1.0 else "no correct digit"

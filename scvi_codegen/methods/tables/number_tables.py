@@ -8,7 +8,7 @@ import sympy
 
 from scvi_codegen.common.display.cards import Html, grid, plain
 from scvi_codegen.common.display.mathml import mathml
-from scvi_codegen.common.display.page import TableBlock
+from scvi_codegen.common.display.tables import TableBlock
 from scvi_codegen.common.precision import Number, Vector, mp
 from scvi_codegen.methods.tables.closed_forms import exact_points, exact_rule, exact_tableau
 from scvi_codegen.methods.tables.nodes import Nodes

@@ -21,7 +21,7 @@ from scvi_codegen.common.labelled_arrays import AXES, Labelled, checked_units, t
 from scvi_codegen.common.representation import one_line
 from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.runs.accuracy.global_error import ConfirmedEnsemble, GlobalError
-from scvi_codegen.runs.forwarding import Pictured
+from scvi_codegen.runs.forwarding import OfEnsembles
 from scvi_codegen.runs.results.export import FORMATS, LABELLED, check_format, write_whole
 from scvi_codegen.runs.results.joining import joined, relative_changes
 from scvi_codegen.runs.results.quantities import quantities, short_title
@@ -57,7 +57,7 @@ def failure_after(t: float, steps: int, status: str) -> str:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, Pictured, TwoWords, OfMethod):
+class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, OfEnsembles, TwoWords, OfMethod):
     """States of k trajectories, the initial state first.
 
     Attributes:
@@ -188,10 +188,6 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, Pictured, TwoWords,
             "transitions": bool(self.stepper.interface.contacts or self.stepper.interface.kinks),
         }
         return tuple(name for name, is_unset in conditions.items() if is_unset)
-
-    @property
-    def _pictured(self) -> list[Trajectory]:
-        return [self[j] for j in range(min(len(self), MOST_DRAWN))]
 
     def __repr__(self) -> str:
         states = f"{len(self.t)} states of each of {len(self)} trajectories, {np.count_nonzero(self.ok)} of them ok"

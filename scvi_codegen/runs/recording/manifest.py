@@ -21,6 +21,7 @@ from scvi_codegen.codegen.rendering.source import Interface, Source, check_inter
 from scvi_codegen.codegen.variants import NewtonFallback
 from scvi_codegen.common.atomic import read_text, regular, sync_folder, write_atomically, write_text
 from scvi_codegen.common.errors import RecordingError
+from scvi_codegen.common.registry import part
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.driver.run import Run
 from scvi_codegen.runs.events.refinement import constantly
@@ -240,12 +241,8 @@ class Manifest:
         """Return the mesh of the fields of a density, or ``None``."""
         if self.mesh is None:
             return None
-        from scvi_codegen.fields.system import FieldSystem  # here, because it imports SymPy
-
         try:
-            section = dict(self.mesh["field"])
-            options = section.pop("discretisation")
-            return FieldSystem.from_text(**section, parameters=self.mesh["parameters"]).discretise(**options)
+            return part("readers", "mesh_of")(self.mesh["field"], self.mesh["parameters"])
         except (ValueError, LookupError, TypeError, AttributeError) as error:
             raise RecordingError(f"the mesh in '{folder / MANIFEST}' is damaged: {error}") from error
 

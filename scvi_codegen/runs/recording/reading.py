@@ -14,7 +14,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from scvi_codegen.common.errors import RecordingError
 from scvi_codegen.common.labelled_arrays import checked_units
-from scvi_codegen.common.representation import LONGEST, clipped
+from scvi_codegen.common.representation import clipped
 from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.runs.driver.run import Run
 from scvi_codegen.runs.driver.run_loop import first_step_size, trajectory_of
@@ -83,7 +83,7 @@ class RecordedRun(AttitudeHistory, OfMethod):
             end = f"step {self.steps} of {self.manifest.steps}"
         else:
             end = f"t = {self.t[-1]:g} of {plan.t_end:g}"
-        return clipped(f"<RecordedRun '{self.folder}': {len(self)} states, {end}>", LONGEST)
+        return clipped(f"<RecordedRun '{self.folder}': {len(self)} states, {end}>")
 
     @overload
     def __getitem__(self, rows: slice) -> Trajectory: ...
@@ -106,7 +106,7 @@ class RecordedRun(AttitudeHistory, OfMethod):
 
     @cached_property
     def mesh(self) -> Any:
-        """Mesh of the fields of a density (:class:`~scvi_codegen.fields.mesh.MeshSystem`), or ``None``."""
+        """Mesh of the fields of a density (:class:`~scvi_codegen.extras.fields.mesh.MeshSystem`), or ``None``."""
         return self.manifest.mesh_of_fields(self.folder)
 
     @property
@@ -340,7 +340,7 @@ class LazyArray:
         return len(self._run)
 
     def __repr__(self) -> str:
-        return clipped(f"<LazyArray {COLUMNS[self._column]}{self.shape} of '{self._run.folder}'>", LONGEST)
+        return clipped(f"<LazyArray {COLUMNS[self._column]}{self.shape} of '{self._run.folder}'>")
 
     def __iter__(self) -> Iterator[Any]:
         for number in range(-(-len(self) // self._run.manifest.rows)):

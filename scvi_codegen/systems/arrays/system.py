@@ -294,7 +294,7 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
         arrays: coordinates, those of rotations, momenta, fields, tables.
         definition: the arguments of ``from_text`` other than name and parameters, for model files.
         data: values of fields and tables by name for runs that pass none.
-        mesh: of the fields of a density, their :class:`~scvi_codegen.fields.mesh.Mesh`.
+        mesh: of the fields of a density, their :class:`~scvi_codegen.extras.fields.mesh.Mesh`.
     """
 
     coordinates: tuple[Array, ...]

@@ -1,5 +1,5 @@
 /* Growth of tangent vectors, which are coordinates after those of their trajectory (the series are those of
- * scvi_codegen/analysis/chaos/indicators.py). Requires: trajectories.h, the type state, and TANGENTS, the number of
+ * scvi_codegen/extras/chaos/indicators.py). Requires: trajectories.h, the type state, and TANGENTS, the number of
  * vectors. */
 enum { OWN = M / (TANGENTS + 1) }; /* coordinates of the trajectory */
 

@@ -20,7 +20,7 @@ from scvi_codegen.codegen.native.building import FLAGS_VARIABLE, TUNED_FLAGS
 from scvi_codegen.codegen.native.compilers import compiler_title, find_compiler, from_wheel, running
 from scvi_codegen.common.cache import CACHE_VARIABLE, cache_folder, cache_info, exposed, remedy_of
 from scvi_codegen.common.errors import BuildError
-from scvi_codegen.interfaces.cli.command_group import FAILURE, CommandFailure, reporting, tell
+from scvi_codegen.interfaces.cli.command_group import CommandFailure, reporting, tell
 
 OF_FIRST_RUNS, OF_DEVELOPERS = ("compiler", "data", "plot"), ("bench", "docs", "release", "test")
 """Extras that are listed first and last."""
@@ -223,4 +223,4 @@ def doctor() -> None:
     failing = [finding.name for finding in findings if finding.status == FAILED]
     tell(ok=not failing, findings=[finding._asdict() for finding in findings])
     if failing:
-        raise CommandFailure(f"integrators cannot be compiled and run on this machine: {', '.join(failing)}", FAILURE)
+        raise CommandFailure(f"integrators cannot be compiled and run on this machine: {', '.join(failing)}")

@@ -1,17 +1,15 @@
 """Command ``scvi-codegen run``: integrate a model or an ensemble, in memory or into a folder, and print a summary."""
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 
-from scvi_codegen.analysis.advice.advice import missed_tolerance
 from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE
 from scvi_codegen.common.errors import ScviCodegenError
+from scvi_codegen.common.registry import part
 from scvi_codegen.interfaces.cli.command_group import (
-    FAILURE,
     INTERRUPTED,
     CommandFailure,
     check_writable,
@@ -48,8 +46,6 @@ from scvi_codegen.interfaces.models.options import (
     WITH_INPUTS,
     check_available,
 )
-from scvi_codegen.interfaces.pictures.animation import FILMS
-from scvi_codegen.interfaces.pictures.canvas import PICTURES, check_plot_path
 from scvi_codegen.runs.accuracy.global_error import GlobalError
 from scvi_codegen.runs.results.export import FORMATS
 
@@ -218,7 +214,7 @@ def _fail_for(missed: str, where: str = "") -> None:
     """End with exit status 1 if a run misses an error bound; ``missed``: how, or ""."""
     if missed:
         tell(missed=missed)
-        raise CommandFailure(f"{where}{missed}", FAILURE)
+        raise CommandFailure(f"{where}{missed}")
 
 
 def _with_steps(
@@ -248,7 +244,7 @@ def _check_outputs(output: str | None, plot: str | None, ensemble: str | None, c
         check_output(output, ensemble=ensemble is not None)
     if plot is not None:
         check_writable(Path(plot), "'--plot'")
-        check_plot_path(plot, PICTURES + FILMS)
+        part("services", "check_picture")(plot, films=True)
 
 
 def _check_combination(
@@ -281,29 +277,28 @@ def _run_one(
     account = known_account(outcome.trajectory)
     tell(summary(model, outcome, final_error, account), **run_numbers(model, outcome, final_error, account))
     result = outcome.trajectory
-    draw = result.plot if model.array_system is None else result.plot.field
+    with_error = {"error": True} if error_bars else {}
     if error_bars:
         _tell_error(result)
-        draw = partial(result.plot, error=True) if model.array_system is None else draw
-    written = _write_outputs(model, result, output, plot, draw=draw, **{"error": True} if error_bars else {})
+    written = _write_outputs(model, result, output, plot, **with_error)
     tell(written=written)
     if outcome.failure is not None:
-        raise CommandFailure(f"{outcome.failure}\n{_kept(outcome, written)}", FAILURE) from outcome.failure
+        raise CommandFailure(f"{outcome.failure}\n{_kept(outcome, written)}") from outcome.failure
     if outcome.interrupted:
         raise CommandFailure(f"interrupted at t = {outcome.run.t:g}\n{_kept(outcome, written)}", INTERRUPTED)
     if outcome.missed is not None:
-        raise CommandFailure(f"{outcome.missed}\n{_kept(outcome, written)}", FAILURE)
+        raise CommandFailure(f"{outcome.missed}\n{_kept(outcome, written)}")
     for path in written:
         tell(f"wrote {path}")
     if advised is not None:
-        _fail_for(missed_tolerance(outcome.trajectory, advised))
+        _fail_for(part("services", "missed_tolerance")(outcome.trajectory, advised))
 
 
 def _finish_recording(outcome: RecordedOutcome) -> None:
     """Print the summary of a run in a folder, and how to continue it."""
     tell(outcome.summary(), **outcome_numbers(outcome))
     if outcome.failure is not None:
-        raise CommandFailure(f"{outcome.failure}\n{outcome.continuation()}", FAILURE) from outcome.failure
+        raise CommandFailure(f"{outcome.failure}\n{outcome.continuation()}") from outcome.failure
     if outcome.interrupted:
         raise CommandFailure(f"interrupted at t = {outcome.run.t:g}\n{outcome.continuation()}", INTERRUPTED)
     tell(f"wrote {outcome.recorded.folder}", written=[outcome.recorded.folder])
@@ -316,7 +311,7 @@ def _run_ensemble(
     outcome = integrate_states(states)
     balance = energy_balance(outcome.result)
     tell(ensemble_summary(model, outcome, balance), **ensemble_numbers(model, outcome, balance))
-    written = _write_outputs(model, outcome.result, *outputs, draw=outcome.result.plot)
+    written = _write_outputs(model, outcome.result, *outputs, overview=True)
     stored = f"written: {' and '.join(written)}" if written else "not written to a file (-o)"
     continuation = f"the computed states were {stored}"
     if outcome.interrupted:
@@ -324,11 +319,11 @@ def _run_ensemble(
             f"interrupted after {outcome.result.steps.mean():.0f} steps on average\n{continuation}", INTERRUPTED
         )
     if not outcome.result.ok.any():
-        raise CommandFailure(f"every trajectory failed\n{continuation}", FAILURE)
+        raise CommandFailure(f"every trajectory failed\n{continuation}")
     for path in written:
         tell(f"wrote {path}", written=written)
     if advised is not None and outcome.result.ok[member]:
-        missed = missed_tolerance(outcome.result[member], advised)
+        missed = part("services", "missed_tolerance")(outcome.result[member], advised)
         _fail_for(missed, f"trajectory {member}: ")
 
 
@@ -337,21 +332,24 @@ def _tell_error(trajectory: Any) -> None:
     try:
         error = trajectory.error
     except ScviCodegenError as unknown:
-        raise CommandFailure(f"--error-bars: {unknown}", FAILURE) from unknown
+        raise CommandFailure(f"--error-bars: {unknown}") from unknown
     numbers = {"relative": error.relative[-1], "signed": error.signed, "lost": error.lost, "reason": error.reason}
     tell(str(error), error=numbers | {"q": error.q[-1].tolist(), "p": error.p[-1].tolist()})
 
 
 def _write_outputs(
-    model: Model, result: Any, output: str | None, plot: str | None, *, draw: Any, **saved: bool
+    model: Model, result: Any, output: str | None, plot: str | None, *, overview: bool = False, **saved: bool
 ) -> list[str]:
+    """Write states and picture; of arrays a picture is one of their fields, unless an ``overview`` is drawn."""
     if output is not None:
         result.save(output, **saved)
-    if plot is not None and Path(plot).suffix.lower() in FILMS:
+    if plot is not None and part("services", "is_film")(plot):
         progress = (lambda *_: None) if is_quiet() else None
         result.animate(plot, picture=model.picture or None, progress=progress)
+    elif plot is not None and (overview or model.array_system is None):
+        result.plot(plot, **saved)
     elif plot is not None:
-        draw(plot)
+        result.plot.field(plot)
     return [path for path in (output, plot) if path is not None]
 
 

@@ -18,13 +18,13 @@ from typing import Any
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE
 from scvi_codegen.common.atomic import naming_folders, write_text
 from scvi_codegen.common.errors import ModelFileError, SystemDefinitionWarning
+from scvi_codegen.common.registry import homes, part
 from scvi_codegen.common.toml_text import read_toml
 from scvi_codegen.common.validation import ExactNumber, checks_arguments, of
 from scvi_codegen.interfaces.models.input_tables import InputTable
 from scvi_codegen.interfaces.models.model import DEFAULT_METHOD, Model
 from scvi_codegen.interfaces.models.model_files.document import document_of, with_files
 from scvi_codegen.interfaces.models.model_files.entries import FORMAT_KEYS, ROBOT_KEYS, Entry, is_robot, read_entry
-from scvi_codegen.interfaces.models.model_files.page_section import PAGE_KEYS, PICTURE_KEYS, check_page, check_picture
 from scvi_codegen.interfaces.models.model_files.sections import (
     FORMULAS,
     LISTS,
@@ -59,11 +59,7 @@ SYSTEM_KEYS = (
     *("temperature", "noise"),
     *("catalogue", *ROBOT_KEYS, *chain(*FORMAT_KEYS.values())),
 )
-FIELD_KEYS = (
-    *("name", "fields", "momenta", "space", "boundary", "density", "hamiltonian", "dissipation"),
-    *("scalars", "point_lagrangians", "discretisation"),
-)
-KEYS = {"system": SYSTEM_KEYS, "field": FIELD_KEYS, "page": PAGE_KEYS, "picture": PICTURE_KEYS} | {
+KEYS = {"system": SYSTEM_KEYS} | {
     section: tuple(option.key for option in options_of(section)) for section in ("initial", "run", "path", "family")
 }
 SECTIONS = (
@@ -139,8 +135,9 @@ def parse_model(text: str, changes: Document | None = None, *, folder: str | os.
         if "q_dot" in initial:
             raise ModelFileError("[initial] velocity and q_dot are two names of one key: give one of them")
         initial["q_dot"] = initial.pop("velocity")
-    for name, keys in KEYS.items():
-        check_keys(document.get(name, {}), keys, "key", f"[{name}]")
+    for name, content in document.items():
+        if name in KEYS or name in homes("sections"):
+            check_keys(content, KEYS[name] if name in KEYS else part("sections", name).keys, "key", f"[{name}]")
     return _read_model(document, changes or {}, folder)
 
 
@@ -204,11 +201,7 @@ def _read_model(document: Document, changes: Document, folder: str | os.PathLike
     with warnings.catch_warnings():  # other formulas than that of the system may use its parameters
         warnings.simplefilter("ignore", SystemDefinitionWarning)
         if "field" in document:
-            from scvi_codegen.interfaces.models.model_files.field_section import (
-                read_field,  # not needed for other systems
-            )
-
-            system = read_field(document)
+            system = part("sections", "field").system(document)
         else:
             system = read_system(document, entry and entry.system)
         system, values = read_values(document, system, folder)
@@ -218,8 +211,9 @@ def _read_model(document: Document, changes: Document, folder: str | os.PathLike
     values |= {name: document.get(name, {}) for name in FURTHER} | read_run(document["run"])
     method = DEFAULT_METHOD if not is_named and method == DEFAULT_METHOD else method
     model = Model(system=system, method=method, events=events, **values)
-    check_page(model.page, model)
-    check_picture(model)
+    for name in homes("sections"):
+        if getattr(model, name, None):
+            part("sections", name).check(model)
     return _with_time_transformation(model, document, specification)
 
 

@@ -3,6 +3,7 @@
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from itertools import chain
 from typing import Any, Final, TypeVar
 
@@ -73,6 +74,24 @@ def key_hint(key: str, names: Iterable[str], section: str) -> str:
 Built = TypeVar("Built")
 Section = Mapping[str, Any]
 Document = Mapping[str, Section]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelSection:
+    """A section of model files that an extra adds.
+
+    Attributes:
+        keys: known ones.
+        system: function of the document, with an exact (m,) state; returns the system that the section defines.
+        initial: function of ``[initial]`` and this system; returns it with numbers instead of formulas.
+        check: function of the model; raises ModelFileError, naming the key at fault.
+    """
+
+    keys: tuple[str, ...]
+    system: Callable[[Document], Any] | None = None
+    initial: Callable[[Section, Any], Section] | None = None
+    check: Callable[[Any], None] | None = None
+
 
 ALTERNATIVES = ({"lagrangian", "hamiltonian"}, {"density", "hamiltonian"}, *ALTERNATIVE_KEYS)
 """Groups of alternative keys, of which one is given."""

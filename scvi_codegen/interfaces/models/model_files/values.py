@@ -18,6 +18,7 @@ from sympy import Expr
 from scvi_codegen.codegen.native.arguments import real_array
 from scvi_codegen.common.atomic import inside, read_text
 from scvi_codegen.common.errors import ExpressionError, ModelFileError
+from scvi_codegen.common.registry import part
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.interfaces.models.input_tables import parse_table
 from scvi_codegen.interfaces.models.model_files.sections import (
@@ -130,11 +131,7 @@ def _values_of_arrays(
         name = system.rotations[0].member.name
         raise ModelFileError(f"sizes of arrays of rotations, directions and spins must be numbers, as '{name}[3]'")
     if system.mesh is not None:
-        from scvi_codegen.interfaces.models.model_files.field_section import (
-            fields_at_points,  # not needed for other systems
-        )
-
-        document = {**document, "initial": fields_at_points(document["initial"], system)}
+        document = {**document, "initial": part("sections", "field").initial(document["initial"], system)}
     for key, value in document.get("tables", {}).items():
         table = in_section("[tables]", partial(parse_array, key))
         entries["tables", table.name] = ArrayValue(table, value, f"[tables] {table.name}")

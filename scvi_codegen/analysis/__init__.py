@@ -1,1 +1,0 @@
-"""Questions about motions: chaos, periodic orbits, paths, estimation, advice, verification."""

@@ -1,0 +1,1 @@
+"""Products beyond the core, one folder each; they import the api and each other downward."""

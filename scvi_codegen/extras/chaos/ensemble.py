@@ -1,0 +1,197 @@
+"""Chaos indicators of many initial states: tangent vectors propagated along each trajectory, in parallel threads.
+
+In SIMD lanes the variations are additional coordinates (:mod:`scvi_codegen.systems.derived_systems`) of an ensemble.
+After each step C replaces the tangent vectors by Q of their QR factorisation and sums their growth
+(``templates/support/run/tangent_growth.h``). Systems without variational
+equations in lanes, and lanes whose step fails, are computed trajectory by trajectory. Only the indicators are stored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.api.checks import checked_count
+from scvi_codegen.api.program import Source
+from scvi_codegen.api.runs import EnsembleSettings
+from scvi_codegen.api.states import Array, Fixed, Starts, States, checked_number, checked_step, require
+from scvi_codegen.codegen.native import building
+from scvi_codegen.codegen.native.binding import Binding
+from scvi_codegen.codegen.native.options import SolverOptions, checked_options
+from scvi_codegen.codegen.variants import TangentVectors
+from scvi_codegen.common.errors import StateError, StepFailedError
+from scvi_codegen.common.thread_pool import StopCheck, run_jobs
+from scvi_codegen.extras.chaos.indicators import MOST as LARGEST_CHUNK
+from scvi_codegen.extras.chaos.indicators import (
+    SERIES,
+    ChaosIndicators,
+    InitialTangents,
+    StepSegment,
+    TangentPropagation,
+)
+from scvi_codegen.runs.accuracy.local_error import warn_of_large_steps
+from scvi_codegen.runs.driver.run_loop import record
+from scvi_codegen.runs.ensembles.ensemble import Ensemble, momenta_of_each, start_of_ensemble
+from scvi_codegen.runs.ensembles.lanes import LaneRuns
+from scvi_codegen.runs.ensembles.result import OK
+from scvi_codegen.runs.ensembles.schedule import CommonSteps
+from scvi_codegen.runs.states.times import times_after
+from scvi_codegen.runs.states.validation import EnsembleParameters
+from scvi_codegen.runs.stepping.integrator import Integrator
+from scvi_codegen.runs.stepping.memory import Memory
+
+CHECKED_STRIDE: Final = 64
+"""Stride of the trajectories whose step error is estimated."""
+
+
+class ChaosIndicatorsEnsemble:
+    """Computation of the chaos indicators of many initial states; arguments as of ``chaos_indicators_ensemble``."""
+
+    def __init__(
+        self,
+        stepper: Integrator,
+        q: States,
+        p: States,
+        *,
+        h: float,
+        steps: int,
+        count: int | None,
+        directions: ArrayLike | None,
+        save_every: int | None,
+        t: float,
+        parameters: EnsembleParameters,
+        options: SolverOptions | None,
+    ) -> None:
+        require(stepper, "chaos_ensemble")
+        self.stepper, self.options = stepper, checked_options(options)
+        self.h, steps = checked_step(h), checked_count(steps, "steps", least=1)
+        self.save_every = steps if save_every is None else checked_count(save_every, "save_every", least=1)
+        if steps % self.save_every:
+            raise StateError(
+                f"steps={steps} must be a multiple of save_every={self.save_every}, so that the last value is saved"
+            )
+        start = checked_number(t, "the time t")
+        self.t = times_after(start, self.h, np.arange(steps + 1))[0]
+        self.q, self.p, self.parameters = start_of_ensemble(stepper, q, p, start, parameters)
+        self.changes = InitialTangents.checked(stepper, count, directions)
+        self.status = np.full(len(self.q), OK, dtype="<U32")
+        self.values = np.full((len(SERIES), len(self.t[:: self.save_every]), len(self.q), self._width()), np.nan)
+
+    def run(self, *, progress: Callable[[int], None] | None, threads: int | None) -> ChaosIndicators:
+        """Compute the indicators; ``progress`` is called with the number of finished trajectories and may raise.
+
+        Trajectories without SIMD support, or whose SIMD steps failed, use the derivatives of single steps.
+        """
+        report, left = progress or (lambda _: None), np.arange(len(self.q))
+        if (source := self._source()) is not None:
+            left = self._in_lanes(source, report, threads)
+        if len(left):
+            self.stepper.tangent  # noqa: B018  (compiled once, before threads ask for it)
+            before = len(self.q) - len(left)
+            run_jobs(
+                len(left),
+                lambda k, check_stop: self._follow(int(left[k]), check_stop),
+                progress=lambda done: report(before + done),
+                threads=threads,
+            )
+        self._warn_of_long_steps()
+        return ChaosIndicators.of(self.t[:: self.save_every], self.values, self.status)
+
+    def _warn_of_long_steps(self) -> None:
+        """Warn of too large steps: rerun every ``CHECKED_STRIDE``-th trajectory, as SIMD steps estimate no error."""
+        steps, runs = len(self.t) - 1, {}
+        for j in range(0, len(self.q), CHECKED_STRIDE):
+            start = self.q[j], self.p[j]
+            arguments: dict[str, Any] = {"t": self.t[0], "parameters": self.parameters[j], "options": self.options}
+            memory = Memory.started(self.stepper, *start, plan=Fixed(self.h), **arguments)
+            with suppress(StepFailedError):
+                runs[j] = record(memory, steps, save_every=steps)
+        worst = max(runs, key=lambda j: np.nan_to_num(runs[j].step_error), default=None)
+        if worst is not None:
+            warn_of_large_steps(runs[worst], remedy=f" (trajectory {worst} of {len(self.q)})")
+
+    def _source(self) -> Source | None:
+        """Return the source of an ensemble with tangent vectors, or ``None``."""
+        if self.stepper.interface.constraints or self.stepper.interface.rotations:
+            return None
+        return self.stepper._variants[TangentVectors(self.values.shape[-1])]
+
+    def _in_lanes(self, source: Source, report: Callable[[int], None], threads: int | None) -> NDArray[np.intp]:
+        """Process all trajectories in SIMD lanes; return those that failed."""
+        count, steps, tangents = len(self.q), len(self.t) - 1, self._first(0)
+        orthonormal, triangle = np.linalg.qr(tangents)
+        frames = (np.tile(half.T.ravel(), (count, 1)) for half in np.split(orthonormal, 2))  # one vector after another
+        q, p = (np.hstack(pair) for pair in zip((self.q, self.p), frames, strict=True))
+        with np.errstate(divide="ignore"):  # linearly dependent directions span zero volume
+            diagonal = np.log(np.abs(np.diagonal(triangle)))
+        k = tangents.shape[1]
+        growth = np.concatenate([np.zeros(2 * k), diagonal, np.zeros(3 * k), triangle.ravel()])  # of tangent_growth.h
+        plan = CommonSteps(self.t[0], self.h, self.save_every, steps)
+        saved = np.full((len(plan.numbers), count, len(SERIES), k), np.nan)
+        saved[0] = growth[: len(SERIES) * k].reshape(len(SERIES), k)
+        binding = Binding(building.load(source, flags=self.stepper.flags), source.prefix)
+        settings = EnsembleSettings(options=self.options)
+        start: dict[str, Any] = {"t0": plan.t0, "q": q, "p": p, "parameters": self.parameters}
+        ensemble = Ensemble(stepper=self.stepper, settings=settings, **start, fixed=plan)
+        runs = LaneRuns(binding, ensemble, {"positions": saved, "growth": growth})
+        runs.run(progress=lambda _: report(int(np.count_nonzero(runs.status == 0))), threads=threads)
+        ended = runs.status == 0
+        self.values[:, :, ended] = saved.transpose(2, 0, 1, 3)[:, :, ended]
+        return np.flatnonzero(~ended)
+
+    def _width(self) -> int:
+        """Return the number of tangent vectors of the first trajectory that can be started (constraints reduce it)."""
+        for j in range(len(self.q)):
+            with suppress(StepFailedError):
+                return int(self._first(j).shape[1])
+        return self.changes.count or self.changes.size
+
+    def _first(self, j: int) -> Array:
+        """Return the (2m, k) initial tangent vectors of trajectory j."""
+        start = self.q[j], self.p[j], self.h, float(self.t[0])
+        return self.changes.at(*start, self.parameters[j], self.options)
+
+    def _follow(self, j: int, check_stop: StopCheck) -> None:
+        """Integrate trajectory j with tangent vectors, by derivatives of single steps; NaN after a failed step."""
+        stepper, steps = self.stepper, len(self.t) - 1
+
+        def propagate_chunk(part: Starts, numbers: NDArray[np.intp], vectors: Array) -> None:
+            check_stop(int(numbers[-1]))
+            stepper._propagate(part, vectors, self.parameters[j], self.options)
+
+        def step_segments() -> Iterator[StepSegment]:
+            now = self.q[j], self.p[j]
+            for first in range(0, steps, LARGEST_CHUNK):
+                last = min(first + LARGEST_CHUNK, steps)
+                starts = Starts.chain(*now, self.t[first:last], np.full(last - first, self.h))
+                reached = np.arange(first, last + 1)
+                yield starts, np.where(reached % self.save_every, -1, reached // self.save_every)
+                now = starts.q[-1], starts.p[-1]
+
+        propagation = None
+        try:
+            propagation = TangentPropagation(self.changes, self._first(j), self.t[:: self.save_every])
+            propagation.follow(step_segments(), propagate_chunk)
+        except StepFailedError as failure:
+            self.status[j] = failure.status
+        self.values[:, :, j] = np.nan if propagation is None else propagation.growth.values
+
+
+def indicators_of_ensemble(
+    stepper: Any,
+    q: States,
+    p: States | None,
+    velocity: States | None,
+    *,
+    progress: Callable[[int], None] | None,
+    threads: int | None,
+    **settings: Any,
+) -> ChaosIndicators:
+    """Return the indicators of :meth:`scvi_codegen.Stepper.chaos_indicators_ensemble`."""
+    q, p, velocity = stepper._states.start(q, p, velocity)
+    p = momenta_of_each(stepper, q, p, velocity, settings["t"], settings["parameters"])
+    return ChaosIndicatorsEnsemble(stepper, q, p, **settings).run(progress=progress, threads=threads)
