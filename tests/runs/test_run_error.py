@@ -68,6 +68,16 @@ def test_errors_have_sign_and_size(method):
         assert off <= 4e-16 * (abs(c) + length) * 4.0
 
 
+@pytest.mark.second
+def test_what_iterations_leave_does_not_grow_at_pericentres():
+    """Nine orbits of eccentricity 0.99: with 1e-3 of transported errors left by iterations they are half too large."""
+    run = kepler("svi:4").integrate(**start_of(0.99), t_end=60.0, tolerance=1e-9)
+    rows = np.arange(len(run) - 1, 0, -50)
+    true = truth(run, rows)
+    assert 1e-3 < run.error.relative[-1] < 0.1
+    assert np.abs(estimate(run, rows) - true).max() <= 0.05 * np.abs(true).max()
+
+
 @pytest.mark.parametrize("method", ["svi:4", "svi:8"])
 def test_saving_seldom_and_output_times_do_not_change_the_errors(method):
     """Random orbits, tolerances and directions, up to the error of the finer method's steps; in ensembles, too."""
@@ -125,7 +135,7 @@ def test_error_of_a_slice_is_that_since_its_first_state():
 
 
 def test_errors_do_not_depend_on_the_number_of_threads(monkeypatch):
-    run = kepler().integrate(**start_of(0.2), h=0.02, steps=5000)
+    run = kepler().integrate(**start_of(0.2), h=0.02, steps=10000)
     errors = [run.error]
     monkeypatch.setattr("os.cpu_count", lambda: 1)
     errors.append(replace(run).error)
@@ -167,6 +177,7 @@ def test_files_pictures_and_the_command_line_show_errors(tmp_path):
     assert "is not available" in error_of("run", "kepler", "--error-bars", "-o", tmp_path / "k.run", status=2)
 
 
+@pytest.mark.second
 def test_errors_of_steps_that_no_method_resolves_are_right_or_lost():
     """Pendulums that turn by up to 60 rad a step: single steps of any degree see nothing of the force."""
     system = sc.LagrangianSystem.from_text("turning", ["x"], "m*(x_dot**2/2 + cos(x))", parameters={"m": 1.0})

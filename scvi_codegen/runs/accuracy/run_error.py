@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 import sys
+from bisect import bisect_left
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -59,15 +60,19 @@ mean square of k is Student's t with k degrees of freedom, above 6 in 0.9 % for 
 """
 ROUNDINGS = 1024.0
 """Errors of coordinates that constraints determine below so many roundings are those of rounding."""
-MOST_STEPS = 2048
-"""Number of steps of one call of C; threads share such intervals, whatever their number is."""
+MOST_STEPS = 8192
+"""Number of steps of one call of C, several times as long as the start of the threads that share such calls."""
 LEFT = 1e-6
 """Relative change of transported errors that the iterations of all steps together leave, as it compounds.
 
 A pericentre enlarges it: with 1e-3 errors of an orbit of eccentricity 0.99 are 5 to 13 times too large, with 1e-6 .2 %.
 """
-COMPARED = 512
-"""One of so many steps of the finer method is compared with two steps of half its size."""
+CONVERGED = 1e-4
+"""Defects relative to the change of momenta in a step, d, below which the finer method resolves it.
+
+Errors of orders r and R of one motion are d and about d^(R/r): a tenth of the defect where d is 10^(-r / (R - r)), and
+R - r is a quarter of r or more (``finer_method``).
+"""
 AT_EVENT = 64.0
 """Distance of a time from that of an event, in roundings of the largest time, within which a state is that of it."""
 
@@ -183,8 +188,8 @@ class WithErrors:
     def error(self: Any) -> RunError:
         """Global errors of states since :attr:`initial`, with their signs (:class:`RunError`), made at first access.
 
-        One step of a finer method and products with the Jacobian of the step for each step, about four to seven times
-        the cost of the run and 0.2 ms, more where Newton's method solves it; a finer method is compiled once.
+        One step of a finer method and products with the Jacobian of the step for each step, about seven times the cost
+        of the run and 0.4 ms, more where Newton's method solves it; a finer method is compiled once.
         docs/steps.md lists which runs have signs, which are compared with a finer run, and which are refused.
 
         Raises:
@@ -233,7 +238,10 @@ def error_of(run: Any) -> RunError:
     result = _described(run, errors, rounding, reason=reason)
     if result.relative[-1] <= math.sqrt(roundoff(1)) or not replay.is_smooth:
         return result
-    result = replace(result, proportional=replay.rows_proportional(vectors[0]))
+    rows = replay.rows_proportional(vectors[0], result.relative)
+    if rows == len(run):
+        return result
+    result = replace(result, proportional=rows)
     return replace(result, relative=relative_until(result, len(run))[1])
 
 
@@ -258,6 +266,18 @@ def _is_compared(stepper: Any, finer: Any) -> bool:
     interface = stepper.interface
     unlocated = len(interface.kinks) > len(interface.modes) or finer.interface.mode_names != interface.mode_names
     return bool(stepper.in_tau or interface.words > 1 or stepper.origin is not None or unlocated)
+
+
+def _is_transported_by(finer: Any, stepper: Any) -> bool:
+    """Return whether the derivatives of the finer method's steps are better, of those of a method and of the finer one.
+
+    Newton's method factorises the equations of each step, which takes more time than iterations of four vectors.
+    """
+    if stepper.interface.time_transformation is not None or stepper._lacks(Derivatives()):
+        return True
+    if stepper.constraints or stepper.interface.rotations or finer._lacks(Derivatives()):
+        return False  # Newton's method solves both
+    return not stepper.tangent.constant("VECTORS_ITERATED") and bool(finer.tangent.constant("VECTORS_ITERATED"))
 
 
 def _described(run: Any, errors: list[Array], rounding: list[Array], **others: Any) -> RunError:
@@ -325,8 +345,9 @@ def sizes_of(run: Any, rows: int, errors: Array) -> Array:
 class _Replay:
     """Replay of a run from its saved states.
 
-    The derivatives of single steps are those of the run's own method, where it has them: they differ from those of the
-    finer method by derivatives of the local error, which times delta is below terms of the order of delta^2.
+    The derivatives of single steps are those of the run's own method, unless it has none or those of the finer method
+    are iterated and its own are not: both differ by derivatives of the local error, which times delta is below terms of
+    the order of delta^2.
 
     Args:
         run: trajectory.
@@ -335,11 +356,12 @@ class _Replay:
 
     def __init__(self, run: Any, finer: Any) -> None:
         self.run, self.finer, self.m = run, finer, run.stepper.dimension
-        own = run.stepper.interface.time_transformation is None and not run.stepper._lacks(Derivatives())
-        self.linear = run.stepper if own else finer
+        self.linear = finer if _is_transported_by(finer, run.stepper) else run.stepper
         self.u, self.calls, self.left = roundoff(1), 0, LEFT / max(1, run.steps)
         self.steps = max(1.0, run.steps / max(1, len(run) - 1))  # mean number between two states
         self.now = np.zeros((1 + SAMPLES, 2 * self.m))
+        self.size = np.concatenate([np.ptp(np.ascontiguousarray(np.asarray(x).T), axis=1) for x in (run.q, run.p)])
+        self.resolved = np.zeros(len(run), bool)  # whether a state is the end of a step that the finer method resolves
 
     def of_run(self) -> tuple[Array, str]:
         """Return (1 + samples, 2m, n) errors and rounding errors, NaN where unknown, and the reason for that."""
@@ -351,6 +373,7 @@ class _Replay:
             for piece in self.run._runs:
                 for row, vectors in self._along(piece):
                     result[..., first:][..., row] = vectors
+                    self.resolved[first:][row] = isinstance(row, slice)
                 first += len(piece) - 1
         except (ScviCodegenError, FloatingPointError) as failure:
             known = int(np.count_nonzero(np.isfinite(result[0, 0])))
@@ -365,37 +388,45 @@ class _Replay:
         changes = stepper.changes_states or stepper.interface.kinks or stepper.interface.modes
         return not (changes or stepper.constraints or stepper.interface.rotations or len(self.run._runs) > 1)
 
-    def rows_proportional(self, errors: Array) -> int:
+    def rows_proportional(self, errors: Array, so_far: Array) -> int:
         """Return the number of first rows whose errors (2m, n) follow from those before also without linearisation.
 
-        delta' = x' - Phi(x - delta) for the flow Phi, a run at round-off: at the last row, and those of the largest
-        errors. The first row at which that differs by more than a tenth is found by bisection, as errors grow.
+        delta' = x' - Phi(x - delta) for the flow Phi. A step that the finer method resolves is shorter than the scale
+        of the forces, so that terms of the order of delta^2 are small beside delta where delta is small beside the
+        motion in the step. Of other rows, until errors so far are ``LOST``, the first one at which the formula differs
+        by more than a tenth is found by bisection, as errors grow.
         """
         states = self._state(self.run, slice(None))
-        size = np.ptp(states, axis=0)
-        parts = relative(np.nan_to_num(np.abs(errors.T)), size)
+        before = lengths(errors.T[:-1], self.size)
+        with np.errstate(all="ignore"):
+            parts = before / lengths(np.diff(states, axis=0), self.size)
+        doubtful = (math.sqrt(roundoff(1)) < so_far[1:]) & (so_far[1:] < LOST) & (before > 0.0)
+        rows = 1 + np.flatnonzero(doubtful & ~(self.resolved[1:] & (parts < LOST)))
 
-        def is_proportional(row: int) -> bool:
-            if not parts[row - 1].any() or not parts[row].any():
-                return True
-            t, end = map(float, self.run.t[row - 1 : row + 1])
-            q, p = np.split(states[row - 1] - errors[:, row - 1], 2)
-            try:
-                run = self.finer._run(q, p, plan=Adaptive(end), t=t, parameters=parameters_set_until(self.run, t))
+        def is_nonlinear(row: int) -> bool:
+            return not self._is_proportional(row, states, errors)
+
+        checked = (*rows[np.argmax(parts[rows - 1]) :][:1].tolist(), *rows[-1:].tolist()) if len(rows) else ()
+        lost = [row for row in checked if is_nonlinear(row)]
+        if not lost:
+            return len(states)
+        first = rows[: np.searchsorted(rows, min(lost))].tolist()
+        return int([*first, min(lost)][bisect_left(first, True, key=is_nonlinear)])
+
+    def _is_proportional(self, row: int, states: Array, errors: Array) -> bool:
+        """Return whether the error of a row follows from that before, up to a tenth."""
+        t, end = map(float, self.run.t[row - 1 : row + 1])
+        start, parameters = states[row - 1] - errors[:, row - 1], parameters_set_until(self.run, t)
+        try:
+            if self.resolved[row]:
+                moved = self._ends(np.array([t]), steps_after(self.run, row - 1, row), start[None], parameters)[0]
+            else:
+                run = self.finer._run(*np.split(start, 2), plan=Adaptive(end), t=t, parameters=parameters)
                 moved = self._state(run._recorded(None, ALL_STATES), -1)
-            except ScviCodegenError:
-                return False
-            apart = np.abs(states[row] - moved - errors[:, row])
-            return bool(relative(apart, size).max() <= LOST * parts[row].max())
-
-        rows = len(states)
-        largest = parts.reshape(rows, 2, self.m).max(axis=2).argmax(axis=0).tolist()
-        doubtful = [row for row in (*largest, rows - 1) if row and not is_proportional(row)]
-        first, last = 0, min(doubtful, default=rows)
-        while doubtful and last - first > 1:
-            middle = (first + last) // 2
-            first, last = (middle, last) if is_proportional(middle) else (first, middle)
-        return last
+        except ScviCodegenError:
+            return False
+        apart = np.abs(states[row] - moved - errors[:, row])
+        return bool(relative(apart, self.size).max() <= LOST * relative(np.abs(errors[:, row]), self.size).max())
 
     def _along(self, piece: Any) -> Iterator[tuple[Any, Array]]:
         """Yield indices of states, a slice or a number, and their vectors."""
@@ -431,14 +462,16 @@ class _Replay:
         parts = [starts.part(k, k + MOST_STEPS) for k in range(0, len(h), MOST_STEPS)]
         defects = self._defects(parts, parameters)
         for k, part in enumerate(parts):
-            first = begin + k * MOST_STEPS
-            last = first + len(part.h)
-            if not isinstance(defects[k], ScviCodegenError) and self._resolves(piece, first, part.h, parameters):
-                yield slice(first + 1, last + 1), self._transport(self.linear, part, defects[k], parameters)
-                continue
-            for row in range(first, last):
-                self._by_run(piece, float(piece.t[row]), piece.q[row], piece.p[row], row + 1, steps=1.0)
-                yield row + 1, self.now
+            resolved, row = self._resolved(part, defects[k], parameters), begin + k * MOST_STEPS
+            changes = (np.flatnonzero(resolved[1:] != resolved[:-1]) + 1).tolist()
+            for first, last in pairwise([0, *changes, len(resolved)]):
+                if resolved[first]:
+                    vectors = self._transport(self.linear, part.part(first, last), defects[k][first:last], parameters)
+                    yield slice(row + first + 1, row + last + 1), vectors
+                    continue
+                for start in range(row + first, row + last):
+                    self._by_run(piece, float(piece.t[start]), piece.q[start], piece.p[start], start + 1, steps=1.0)
+                    yield start + 1, self.now
 
     def _defects(self, parts: list[Starts], parameters: Array) -> list[Any]:
         """Return (n, 2m) states minus the ends of finer steps from those before, or the error of a step that fails."""
@@ -456,32 +489,35 @@ class _Replay:
             run_jobs(len(parts), find, progress=None, threads=None)
         return defects
 
-    def _resolves(self, piece: SavedStates, begin: int, h: Array, parameters: Array) -> bool:
-        """Return whether steps h of the finer method from row ``begin`` on have smaller errors than those of the run.
+    def _resolved(self, starts: Starts, defects: Any, parameters: Array) -> NDArray[np.bool_]:
+        """Return (n,) whether errors of the finer method's steps are a tenth of their defects (n, 2m), or of rounding.
 
-        Of the steps in which positions and momenta change most, and one of ``COMPARED``, the errors of the finer method
-        are those beside two steps of h/2 (E. Hairer, S. P. Norsett, G. Wanner, Solving ODEs I, II.4).
+        They are where a defect is small beside the change of momenta, the motion by forces. Of other steps the errors
+        are the differences from two steps of half the size (E. Hairer, S. P. Norsett, G. Wanner, Solving ODEs I, II.4).
         """
-        states = self._state(piece, slice(begin, begin + len(h) + 1))
-        changes, size = np.abs(np.diff(states, axis=0)), np.ptp(states, axis=0)
-        largest = relative(changes, size).reshape(len(h), 2, self.m).max(axis=2).argmax(axis=0)
-        for k in {*largest.tolist(), *range(0, len(h), COMPARED)}:
-            t, length = float(piece.t[begin + k]), float(h[k])
-            try:
-                whole = self._stepped(states[k], t, length, parameters)
-                half = self._stepped(states[k], t, length / 2.0, parameters)
-                halves = self._stepped(half, t + length / 2.0, length / 2.0, parameters)
-            except StepFailedError:
-                return False
-            rounding = RESOLVED * self.u * (np.abs(states[k]) + np.abs(changes[k]))
-            apart, defect = np.abs(whole - halves) - rounding, np.abs(states[k + 1] - halves)
-            if relative(np.maximum(apart, 0.0), size).max() > LOST * relative(defect, size).max():
-                return False
-        return True
+        if isinstance(defects, ScviCodegenError):
+            return np.zeros(len(starts.h), bool)
+        impulses = lengths(np.diff(starts.p, axis=0), self.size[self.m :])
+        resolved = np.asarray(lengths(defects, self.size) <= CONVERGED * impulses)
+        doubtful = np.flatnonzero(~resolved)
+        if not len(doubtful):
+            return resolved
+        t, h = starts.t[doubtful], starts.h[doubtful] / 2.0
+        begin, end = (np.concatenate([starts.q[k], starts.p[k]], axis=1) for k in (doubtful, doubtful + 1))
+        try:
+            halves = self._ends(t + h, h, self._ends(t, h, begin, parameters), parameters)
+        except StepFailedError:
+            return resolved
+        rounding = RESOLVED * self.u * (np.abs(begin) + np.abs(end - begin))
+        apart = np.maximum(np.abs(end - defects[doubtful] - halves) - rounding, 0.0)
+        resolved[doubtful] = lengths(apart, self.size) <= LOST * lengths(end - halves, self.size)
+        return resolved
 
-    def _stepped(self, state: Array, t: float, h: float, parameters: Array) -> Array:
-        """Return a state after a step of the finer method."""
-        return np.concatenate(self.finer._states.pair(*self.finer.step(*np.split(state, 2), h, t, parameters)))
+    def _ends(self, t: Array, h: Array, states: Array, parameters: Array) -> Array:
+        """Return the (n, 2m) ends of steps of the finer method from n states, up to rounding."""
+        rows = np.concatenate([states, states[-1:]])
+        q, p = (np.ascontiguousarray(part) for part in np.split(rows, 2, axis=1))
+        return np.asarray(rows[1:] - self.finer._defects(Starts(t, h, q, p), parameters))
 
     def _transport(
         self, linear: Any, starts: Starts, defects: Array | None, parameters: Array, steps: float = 1.0
@@ -518,6 +554,12 @@ class _Replay:
     @staticmethod
     def _state(states: Any, k: Any) -> Array:
         return np.concatenate([np.asarray(states.q)[k], np.asarray(states.p)[k]], axis=-1)
+
+
+def lengths(vectors: Array, sizes: Array) -> Array:
+    """Return (n,) lengths of (n, k) vectors, parts of the sizes (k,)."""
+    parts = relative(vectors, sizes)
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", parts, parts)))
 
 
 def _rows_between(states: Any, special: Array) -> NDArray[np.intp]:
