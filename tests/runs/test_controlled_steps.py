@@ -80,15 +80,17 @@ def test_equilibria_and_free_particles_need_few_steps():
 
 @pytest.mark.rotated
 def test_newton_solves_stiff_systems_with_steps_of_the_slow_time_scale():
+    """A last step that is short would resolve the vibrations, of which there are 30,000 in this time."""
     system = lagrange("penalty pendulum", "x y", "(x_dot**2 + y_dot**2)/2 - y - k*(x**2 + y**2 - 1)**2/8", k=1e10)
-    start, rest = [math.sin(1.0), -math.cos(1.0)], [0.0, 0.0]
     stiff = sc.compile_stepper(system, sc.SVI(6), solver="newton")
-    run = stiff.integrate(start, rest, t_end=2.0, tolerance=1e-9)
     rigid = sc.compile_stepper(sc.problem("planar-pendulum").system, sc.SVI(6))
-    angle = rigid.integrate([1.0], [0.0], t_end=2.0, parameters={"g": 1.0, "l": 1.0, "m": 1.0}).q[-1, 0]
-    assert run.steps < 300  # of the vibration there are 30,000 in this time
-    assert np.abs(run.q[-1] - [math.sin(angle), -math.cos(angle)]).max() < 1e-8
-    assert np.ptp(run.energy()) < 1e-6
+    for start, tolerance in ((1.0, 1e-9), (1.0, 1e-7), (1.1, 1e-7), (1.2, 1e-6), (1.3, 1e-6)):
+        q = [math.sin(start), -math.cos(start)]
+        run = stiff.integrate(q, [0.0, 0.0], t_end=2.0, tolerance=tolerance)
+        angle = rigid.integrate([start], [0.0], t_end=2.0, parameters={"g": 1.0, "l": 1.0, "m": 1.0}).q[-1, 0]
+        assert run.steps < 150, (start, tolerance)
+        assert np.abs(run.q[-1] - [math.sin(angle), -math.cos(angle)]).max() < 10 * tolerance
+        assert np.ptp(run.energy()) < 1e3 * tolerance
 
 
 @pytest.mark.rotated
@@ -282,7 +284,11 @@ RANDOM_SYSTEMS = {
     [
         pytest.param(
             name,
-            marks=[pytest.mark.xfail(strict=True, reason="multipliers are solved to rounding: 180 and 176 iterations")]
+            marks=[
+                pytest.mark.xfail(
+                    strict=True, reason="iterations, not errors, limit steps at both: 9 to 14, failures decide"
+                )
+            ]
             if name == "rod"
             else [],
         )
@@ -308,6 +314,23 @@ def test_looser_tolerances_take_fewer_iterations(name):
             for tolerance in (1e-3, 1e-8)
         ]
         assert counts[0] <= counts[1], (q, velocity)
+
+
+@pytest.mark.rotated
+def test_a_coordinate_that_begins_to_move_beside_another_takes_few_steps():
+    """Relative to its own motion the error of a motion from rest is the same at all step sizes."""
+    text = "(x_dot**2 + y_dot**2)/2 - g*x**2/2 - y**2/2 - a*x*y"
+    stepper, random = sc.compile_stepper(lagrange("two", "x y", text, g=1.0, a=0.3), "svi:2"), np.random.default_rng(11)
+    counts = []
+    for _ in range(40):
+        q, speed, span = 0.3 * random.normal(size=2), 10 ** random.uniform(-1, 2), 10 ** random.uniform(-1, 0.5)
+        control = {"tolerance": 10 ** random.uniform(-5, -3), "check_growth": False}
+        control["parameters"] = {"g": 10 ** random.uniform(-1, 1), "a": random.uniform(-0.5, 0.5)}
+        runs = [stepper.integrate(q, velocity=[speed, y], t_end=span, **control) for y in (0.0, speed / 2)]
+        counts.append([run.steps for run in runs])
+    from_rest, moving = np.array(counts).T
+    assert from_rest.sum() < 3 * moving.sum()  # 6.2 times where errors of pilots contain motions that begin
+    assert (from_rest < 40 * moving).all()  # up to 94 times
 
 
 @pytest.mark.rotated

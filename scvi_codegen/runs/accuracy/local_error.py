@@ -77,7 +77,9 @@ def warn_of_energy_error(trajectory: SavedStates, run: Memory) -> None:
     ends = run._end_energies(trajectory.t, trajectory.q, trajectory.p)
     if ends is None or not abs(ends[1] - ends[0]) > 0.5 * TOLERABLE_ERROR * max(abs(ends[0]), abs(ends[1])):
         return
-    if not energy_reason(stepper) and (energies := _changed_energies(trajectory)):
+    if getattr(trajectory, "modes", None) is not None or stepper.in_tau:
+        ends = None  # of the modes of the last state, or divided by rates
+    if not energy_reason(stepper) and (energies := _changed_energies(trajectory, ends)):
         if is_adaptive:
             warn_of_energies(*energies)
         else:
@@ -133,21 +135,27 @@ def relative_energy_change(first: float, last: float, size: float) -> float:
     return part if part == part else 0.0
 
 
-def _changed_energies(states: SavedStates) -> tuple[float, float, float] | None:
+def _changed_energies(
+    states: SavedStates, ends: tuple[float, float] | None = None
+) -> tuple[float, float, float] | None:
     """Return the first and the last energy and the largest |p.v| if the energy changed; ``None`` otherwise.
 
     ``None`` is also returned outside the domain of L, and at rest up to rounding, where the energy is that of rounding
-    errors. Velocities are computed only if the energies differ.
+    errors. ``ends``: the energies if they are known. Velocities are computed only if these differ.
     """
     stepper, q = states.stepper, np.asarray(states.q)
-    if (np.ptp(q, axis=0) <= RESOLVED * roundoff(stepper.interface.words) * np.abs(q).max(axis=0)).all():
-        return None
-    ends = [(states.t[[k]], states.q[[k]], states.p[[k]], parameters_on_sides(states, states.t[k])) for k in (0, -1)]
+    sides = [(k, parameters_on_sides(states, states.t[k])) for k in (0, -1)]
     try:
-        first, last = (float(stepper._energies_of(*end)[0]) for end in ends)
+        first, last = ends or (
+            float(stepper._energies_of(states.t[[k]], states.q[[k]], states.p[[k]], parameters)[0])
+            for k, parameters in sides
+        )
         if not relative_energy_change(first, last, 0.0) > TOLERABLE_ERROR:
             return None
-        sizes = [np.sum(p * stepper.velocity(q, p, t, parameters)) for t, q, p, parameters in ends]
+        if (np.ptp(q, axis=0) <= RESOLVED * roundoff(stepper.interface.words) * np.abs(q).max(axis=0)).all():
+            return None
+        states_at = [(states.t[k], q[k], states.p[k], parameters.copy()) for k, parameters in sides]
+        sizes = [abs(np.dot(at[2], stepper._transformed("velocity", *at))) for at in states_at]
     except StateError:
         return None
-    return first, last, float(np.abs(sizes).max())
+    return first, last, float(max(sizes))

@@ -70,6 +70,7 @@ static real error_of_stages(const step_data *step, const real *z, const real *v,
   for (int i = 0; i < M; i++)
     of.largest = larger(of.largest, of.size[i]);
   enlarge_to_arrays(of.size);
+  leave_out_starts(step, dq, of.curvature, of.size);
   error = error_beyond(step, z, &of, SITES > M ? farthest : fastest, share, decay, least);
   if (SITES > M && error > doubtful) {
     real lengths[M];

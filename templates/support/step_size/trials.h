@@ -20,12 +20,12 @@
 #define LEVELS_OUTSIDE MOST_UP /* by which the curve of a pilot is extrapolated */
 #define GROWTH_OF_PILOTS (GROWTH * REAL(0.84)) /* of their errors, which grow with a lower power of the step size, .. */
 #define LEAST_RISE 4 /* .. or, divided by as much, until they are rounding */
-#define SHORT_LAST REAL(0.5) /* of the step before: a last step so short is made longer, and that one shorter */
 #else
 #define LEVELS_OUTSIDE 0
 #define GROWTH_OF_PILOTS GROWTH
 #define LEAST_RISE 2
 #endif
+#define SHORT_LAST REAL(0.5) /* of the step before: a last step so short is made longer, and that one shorter */
 #define AT_START (-NEVER_FAILED) /* trial->inside of the shortest one, whose increments are the rates at its start */
 #define FAILURES_BEFORE_NEWTON 3 /* trials of a step in which the iteration of the multipliers fails */
 #define TRIED_AGAIN (-1) /* run->avoiding of the step after those by Newton's method */
@@ -111,7 +111,19 @@ typedef struct {
 #endif
 } trial;
 
+/* Error estimate of the curve of a solved trial if it exceeds `least`. */
+static inline real estimate(const run_memory *run, const trial *now, real least)
+{
 #ifdef NEWTON_ALONE
+  return stage_error(&now->step, run->memory, now->dq, EACH, now->limits.decay, least, now->limits.most);
+#else
+  return curve_error(
+      &now->step, &now->data, STORED(run, &now->step), now->dq, EACH, now->limits.decay, least, now->limits.most);
+#endif
+}
+
+#ifdef NEWTON_ALONE
+#define EVENED LEVELS_PER_BINADE /* by which the step before the last one may be shorter */
 #define HOT static
 #define AMPLIFIED 1e-14 /* last update beyond which unknowns do not resolve errors in two words */
 #define SHORT_STEPS_FAIL 0
@@ -136,13 +148,18 @@ static real attempt(run_memory *run, trial *now, real least, const solver_option
   }
 #endif
   now->guess = 1;
-  return stage_error(step, run->memory, now->dq, EACH, now->limits.decay, least, now->limits.most);
+  return estimate(run, now, least);
 }
 #else
 #ifdef ARRAYS
 #define LEVELS_INSIDE 0 /* the stored curves are those of accepted steps */
 #else
 #define LEVELS_INSIDE INSIDE
+#endif
+#ifdef COSTLY_POINTS
+#define EVENED REACH
+#else
+#define EVENED 0
 #endif
 #define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */
 
@@ -239,7 +256,7 @@ static inline __attribute__((always_inline)) double attempt_at(run_memory *run, 
   find_displacements(step, data, STORED(run, step), now->dq);
 #endif
   step->noise = report->noise;
-  return curve_error(step, data, STORED(run, step), now->dq, EACH, now->limits.decay, least, now->limits.most);
+  return estimate(run, now, least);
 }
 
 /* Out of line, one copy compiles faster than two. Steps without low words have one of their own, so that others take no
@@ -515,6 +532,8 @@ static int shorten(run_memory *run, trial *now, int most)
   while (down < most && !(error_at(now->error, -down) <= now->limits.most))
     down++;
   now->inside = down_from_stored(now, solved, down);
+  if (now->last && now->length > 0) /* shorter than its level */
+    run->grid_level = level_below(MATH(fabs)(now->step.h));
   run->grid_level -= down;
   run->error_before = error_at(run->error_before, -down);
   run->guess = 0;
@@ -621,10 +640,15 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
 #ifdef CONSTRAINED
   now->pilots_above = run->error_before > 0 ? (real)INFINITY : 0;
 #endif
+  now->step.is_pilot = !(run->error_before > 0);
   if (run->error_before > 0)
     try_step(run, now, least, options, report);
-  else
+  else {
     try_first_step(run, now, options, report);
+    now->step.is_pilot = 0;
+    if (now->error < INFINITY && !by_newton(now))
+      now->error = estimate(run, now, 0);
+  }
 #ifdef CONSTRAINED
   if (now->pilots_above == 0)
     end_pilots(run, now);
@@ -900,19 +924,18 @@ static inline int limit_by_iterations(run_memory *run, const trial *now)
   return most;
 }
 
-#ifdef COSTLY_POINTS
 /* Change of level, as far as it has a predictor, that divides what is left of a run evenly where its last step would be
- * short: both steps then need as few iterations as possible. */
+ * short: both steps then need as few iterations as possible. What a step of Newton's method leaves of stiff vibrations,
+ * however small beside its motion, is large beside that of a short step, which would resolve them. */
 static inline int even_out(const run_memory *run, const trial *now, int change)
 {
   const real left = MATH(fabs)((now->t_end - now->at.t) - now->at.t_low);
   const real size = size_of_level(run->grid_level + change);
   if (size * (1 + LAST_STEP) < left && left < size * (1 + SHORT_LAST))
-    while (change > -REACH && 2 * size_of_level(run->grid_level + change - 1) >= left)
+    while (change > -EVENED && 2 * size_of_level(run->grid_level + change - 1) >= left)
       change--;
   return change;
 }
-#endif
 
 /* Lets Newton's method solve the next steps where the iteration, not the error, limits their size, if the error admits
  * steps so much larger that they take less time, and no longer than that. Asked after numbers of steps that are powers
@@ -956,9 +979,7 @@ static inline void choose_size(run_memory *run, const trial *now)
     is_limited = 1;
   }
   change = levels_within(run, now, change);
-#ifdef COSTLY_POINTS
-  change = even_out(run, now, change);
-#endif
+  change = EVENED ? even_out(run, now, change) : change;
   run->guess = now->guess;
   run->change_before = run->change;
   run->change = change;
