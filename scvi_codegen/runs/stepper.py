@@ -26,7 +26,6 @@ from scvi_codegen.codegen.variants import Variant
 from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.common.once import Once
 from scvi_codegen.common.validation import checked_count, checks_arguments, of
-from scvi_codegen.methods import LOOSE
 from scvi_codegen.runs.accuracy.global_error import Runs, checked_error, warn_of_unconfirmed, warn_of_unconfirmed_run
 from scvi_codegen.runs.accuracy.growth import measures_growth, warn_of_error_growth
 from scvi_codegen.runs.accuracy.local_error import warn_of_energy_errors, warn_of_inaccuracy
@@ -315,7 +314,11 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
 
     def _at_tolerance(self, tolerance: float | None) -> Self:
         """Return the stepper of adaptive runs of a tolerance, whose degree follows it unless the method was named."""
-        if self._looser is None or tolerance is None or tolerance < LOOSE:
+        if self._looser is None or tolerance is None:
+            return self
+        from scvi_codegen.methods import LOOSE  # here, because it imports mpmath, which packages do without
+
+        if tolerance < LOOSE:
             return self
         stepper = self._looser()
         if self.events:

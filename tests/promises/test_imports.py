@@ -238,7 +238,7 @@ def test_importing_the_package_loads_no_heavy_library(tmp_path):
     assert loaded.isdisjoint([*HEAVY, "numpy", "cffi"])
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("use", [STEPPING, RECORDING], ids=["stepping", "recording"])
 def test_a_generated_package_loads_no_heavy_library(tmp_path, use):
     folder = generate_package(Model.from_problem(problem("planar-pendulum")), tmp_path / "pendulum_svi")
