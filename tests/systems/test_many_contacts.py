@@ -370,6 +370,20 @@ def test_simultaneous_impacts_of_separate_bodies_are_those_of_each() -> None:
     assert (rows @ run.velocity[0, 4:])[0] == pytest.approx(1)
 
 
+@pytest.mark.second
+def test_simultaneous_impacts_of_balls_that_touch_permute_their_velocities() -> None:
+    """Equal masses, e = 1: whether the pairs touch at the start or meet, of which some separate and some approach."""
+    between = [sc.contact(f"x{i + 1} - x{i} - 1", restitution=1, impacts="simultaneous") for i in range(3)]
+    names = [f"x{i}" for i in range(4)]
+    energy = " + ".join(f"{x}_dot**2/2" for x in names)
+    stepper = sc.compile_stepper(sc.LagrangianSystem.from_text("row", names, energy, contacts=between), "svi:2")
+    for before in np.random.default_rng(1).permuted(np.tile([1.0, 0.6, 0.2, -0.5], (12, 1)), axis=1):
+        run = stepper.integrate([0.0, 1.0, 2.0, 3.0], velocity=before, h=0.1, t_end=0.1)
+        if np.sum(np.diff(before) < 0.0) < 2 or before[1] < before[2]:  # no ball is met from both sides
+            assert run.velocity[-1] == pytest.approx(sorted(before), abs=1e-12)
+        assert np.sum(run.velocity[-1] ** 2) == pytest.approx(np.sum(before**2))
+
+
 DISTANCES = np.array([-0.5, 0.1, 0.5])
 
 

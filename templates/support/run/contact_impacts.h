@@ -90,15 +90,15 @@ static int restitute(const event_step *step, const contact_terms *of, const int 
   return 1;
 }
 
-/* Adds to impulses those of the rows of contacts that approach, one after another, until none does, each with those to
- * which W connects it: simultaneous ones that touch and do not separate, and closed ones with e = 0. Without friction
- * Newton's law creates no energy: T+ - T- = sum of (1 - e) Lambda v_n- / 2. */
+/* Adds to impulses those of the rows of contacts that approach, one after another, until none does: simultaneous ones
+ * with those that touch and do not separate, all with closed ones and with those of e = 0, in blocks that W connects.
+ * Without friction Newton's law creates no energy: T+ - T- = sum of (1 - e) Lambda v_n- / 2. */
 static int find_impulses(const event_step *step, const contact_terms *of, const int *approaches, const int *closed,
     real *total)
 {
   for (int round = 0; round < CONTACT_IMPACTS * EVENT_CONTACTS; round++) {
-    real rate[CONTACT_ROWS], impulse[CONTACT_ROWS] = {0.0};
-    int meets[EVENT_CONTACTS], may_act[EVENT_CONTACTS], takes_part[EVENT_CONTACTS] = {0}, first = -1;
+    real rate[CONTACT_ROWS];
+    int meets[EVENT_CONTACTS], may_act[EVENT_CONTACTS], acted[EVENT_CONTACTS] = {0}, first = -1;
     for (int r = 0; r < CONTACT_ROWS; r++)
       rate[r] = rate_after(of, of->rate, total, r);
     for (int k = EVENT_CONTACTS - 1; k >= 0; k--)
@@ -112,11 +112,19 @@ static int find_impulses(const event_step *step, const contact_terms *of, const 
       meets[k] = k == first || (together && rate[normal] <= CONTACT_ROUNDING * of->speed[normal]);
       may_act[k] = meets[k] || closed[k] || (approaches[k] && of->coefficient[3 * k + 2] == 0.0);
     }
-    cone_connect(of->W, may_act, first, takes_part);
-    if (!restitute(step, of, takes_part, meets, rate, impulse))
-      return refuse(step, CONTACT_WITHOUT_IMPULSE, first, 0.0);
-    for (int r = 0; r < CONTACT_ROWS; r++)
-      total[r] += impulse[r];
+    for (int k = first; k < EVENT_CONTACTS; k++) {
+      real impulse[CONTACT_ROWS] = {0.0};
+      int takes_part[EVENT_CONTACTS] = {0};
+      if (!meets[k] || acted[k])
+        continue;
+      cone_connect(of->W, may_act, k, takes_part);
+      if (!restitute(step, of, takes_part, meets, rate, impulse))
+        return refuse(step, CONTACT_WITHOUT_IMPULSE, k, 0.0);
+      for (int r = 0; r < CONTACT_ROWS; r++)
+        total[r] += impulse[r];
+      for (int i = 0; i < EVENT_CONTACTS; i++)
+        acted[i] |= takes_part[i];
+    }
   }
   return refuse(step, CONTACT_IN_CORNER, -1, 0.0);
 }
