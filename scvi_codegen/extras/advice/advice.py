@@ -385,7 +385,7 @@ def _warnings(trial: _Trial, tolerance: float, span: float) -> Iterator[str]:
         yield f"the tolerance cannot be met: {chaos}, so round-off alone exceeds it"
         yield f"the recommended step meets it until t = {trial.until:.4g}"
     elif trial.error > tolerance and SAFETY * trial.rounding > trial.error:
-        yield f"round-off alone causes an error of about {trial.rounding:.1g} at the end, for any step size"
+        yield f"round-off alone causes an error of about {trial.rounding:.1g}, which smaller steps do not reduce"
     elif trial.tenfold < math.inf and trial.covered < 0.9 * abs(span):
         yield f"{chaos}, at an uncertain rate later"
 

@@ -97,7 +97,8 @@ class PeriodicOrbit:
         error: largest of three relative errors, with those of rounding: of the positions and of the momenta at the
             start, relative to the largest range of a position and the largest momentum of a velocity over the orbit,
             and of the period; infinite where they are unknown.
-        errors: errors of the start and of the period, by those of a run from it (``run.error``).
+        errors: errors of the start and of the period, by those of a run from it (``run.error``). They are linear in it:
+            near a separatrix, where multipliers times ``error`` are above 1, those of few steps are larger.
         autonomous: whether motions that are shifted in time are motions, too, so that a multiplier is 1.
         iterations: number of Newton iterations.
         parameters: (k,) in the order of ``stepper.parameters``.
@@ -178,7 +179,10 @@ class PeriodicOrbit:
 
     @cached_property
     def multiplier_errors(self) -> NDArray[np.complex128]:
-        """(2m,) errors of the multipliers, each minus the nearest one of the monodromy matrix without its error."""
+        """(2m,) errors of the multipliers, each minus the nearest one of the monodromy matrix without its error.
+
+        Rounding is no part of them; k equal multipliers, as of Kepler's orbits, change by the k-th root of it.
+        """
         exact = list(np.linalg.eigvals(self.monodromy - self.monodromy_error))
         nearest = (exact.pop(int(np.argmin(np.abs(np.array(exact) - value)))) for value in self.multipliers)
         return np.asarray(self.multipliers - np.fromiter(nearest, complex))
