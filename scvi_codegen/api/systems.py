@@ -2,11 +2,12 @@
 
 ``MechanicalSystem``
     Coordinates, time, parameters with defaults, constraints, forces, events of named coordinates; its subclasses are
-    the public ``LagrangianSystem``, ``HamiltonianSystem``, ``FirstOrderSystem``. SystemDefinitionError.
+    the public ``LagrangianSystem``, ``HamiltonianSystem``, ``FirstOrderSystem``. SystemDefinitionError. ``KIND`` and
+    ``OR_ARRAYS`` are kinds of an argument that is one of these, with arrays of sizes known at run time or without.
 ``ArraySystem``
     The same in index notation, with sizes that are known at run time.
-``SYSTEM_OR_ARRAYS``
-    Kind of an argument that is one of these.
+``system_from_sympy(make, function, formula, *, name, coordinates, ..)``
+    System that ``make`` returns for its fields, of a SymPy ``"Lagrangian"`` or ``"Hamiltonian"``, as of ``from_sympy``.
 ``forms_of(system)``
     Derived expressions, each computed once: mass matrix, equations of motion, energy, conditions and
     forces of constraints.
@@ -14,6 +15,7 @@
 
 from scvi_codegen.systems.arrays.system import ArraySystem
 from scvi_codegen.systems.derived_expressions import forms_of
-from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS, MechanicalSystem
+from scvi_codegen.systems.reading import system_from_sympy
+from scvi_codegen.systems.system import MechanicalSystem
 
-__all__ = ["SYSTEM_OR_ARRAYS", "ArraySystem", "MechanicalSystem", "forms_of"]
+__all__ = ["ArraySystem", "MechanicalSystem", "forms_of", "system_from_sympy"]

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.codegen.variants import Derivatives
 from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError, StepFailedError
+from scvi_codegen.common.representation import with_uncertainty
 from scvi_codegen.common.thread_pool import run_jobs
 from scvi_codegen.runs.accuracy.size import (
     RESOLVED,
@@ -42,7 +43,7 @@ from scvi_codegen.runs.results.dense_output import parameters_set_until
 from scvi_codegen.runs.results.joining import concatenated
 from scvi_codegen.runs.results.output import ALL_STATES
 from scvi_codegen.runs.results.recomputation import motion_by_reactions, steps_after
-from scvi_codegen.runs.results.saved_states import Array, SavedStates, parameters_on_sides, times_of_changes
+from scvi_codegen.runs.results.saved_states import Array, SavedStates, times_of_changes
 from scvi_codegen.runs.states.rotations import members_of
 from scvi_codegen.runs.states.words import low_words, with_low
 from scvi_codegen.runs.stepping.features import refusal, require
@@ -107,6 +108,15 @@ class RunError:
     proportional: int = sys.maxsize
     _run: Any = field(repr=False)
 
+    def relative_until(self, rows: int) -> tuple[Array, Array]:
+        """Return (2, m) sizes of the first ``rows`` states and (rows,) running maxima of relative errors."""
+        return relative_until(self, rows)
+
+    def roundings(self, sizes: Array) -> Array:
+        """Return the (n,) largest bounds of rounding errors relative to (2, m) sizes, 0 where they are unknown."""
+        deviations = DEVIATIONS * np.stack([self.rounding_q, self.rounding_p], axis=1)
+        return np.asarray(np.nan_to_num(relative(deviations, sizes).max(axis=(1, 2))))
+
     @property
     def lost(self) -> float | None:
         """First time at which ``relative`` is 0.1 or more, an order of magnitude only; ``None`` if there is none."""
@@ -139,28 +149,6 @@ class RunError:
         if self.lost is not None:
             lines.append(f"no meaningful digits from t = {self.lost:g}")
         return "\n".join([*lines, self.reason] if self.reason else lines)
-
-
-def with_uncertainty(value: float, error: float) -> str:
-    """Return a value with the uncertain digits of its error in parentheses: ``0.512345(12)`` is 0.512345 +- 0.000012.
-
-    The error has two digits, rounded up; an error above the value is written in full, ``3(12)``.
-    """
-    if not (math.isfinite(value) and math.isfinite(error)):
-        return f"{value:.3g}(lost)"
-    if error == 0.0:
-        return repr(float(value))
-    decimals = 1 - math.floor(math.log10(error))
-    digits = math.ceil(error * 10.0**decimals - 1e-9) if abs(decimals) < 300 else 0
-    if digits >= 100:
-        digits, decimals = 10, decimals - 1
-    exponent = math.floor(math.log10(abs(value))) if value else -decimals
-    if -5 < exponent < 16 and decimals >= 0:
-        return f"{value:.{decimals}f}({digits})"
-    shown = max(0, decimals + exponent)
-    if decimals + exponent < 0:
-        digits = math.ceil(error / 10.0**exponent)
-    return f"{value / 10.0**exponent:.{shown}f}({digits})e{exponent:+03d}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -325,7 +313,7 @@ def leave_out_rounding(run: Any, bounds: Array, entries: Array) -> None:
     for k in np.flatnonzero((np.where(tiny, entries, 0.0) > largest).any(axis=(0, 1))).tolist():
         determined = np.zeros(tiny.shape[0], bool)
         q, t = np.asarray(run.q[k]), float(run.t[k])
-        determined[determined_coordinates(run.stepper, q, t, parameters_on_sides(run, t))] = True
+        determined[determined_coordinates(run.stepper, q, t, run.parameters_on_sides(t))] = True
         entries[:, tiny[:, k] & determined, k] = 0.0
 
 
@@ -458,7 +446,7 @@ class _Replay:
         """Transport the errors over single steps between two rows; yield slices of rows and their vectors."""
         t, h = np.ascontiguousarray(piece.t[begin:end]), np.ascontiguousarray(steps_after(piece, begin, end))
         q, p = (np.ascontiguousarray(np.asarray(column)[begin : end + 1]) for column in (piece.q, piece.p))
-        starts, parameters = Starts(t, h, q, p), parameters_on_sides(piece, float(piece.t[begin]))
+        starts, parameters = Starts(t, h, q, p), piece.parameters_on_sides(float(piece.t[begin]))
         parts = [starts.part(k, k + MOST_STEPS) for k in range(0, len(h), MOST_STEPS)]
         defects = self._defects(parts, parameters)
         for k, part in enumerate(parts):
@@ -546,7 +534,7 @@ class _Replay:
             self.now[1:] += math.sqrt(steps) * self.u * normal * np.abs(self._state(piece, end))
         else:
             times, h, x, y = (np.ascontiguousarray(of) for of in (fine.t, np.diff(fine.t), fine.q, fine.p))
-            starts, sides = Starts(times, h, x, y), parameters_on_sides(fine, t)
+            starts, sides = Starts(times, h, x, y), fine.parameters_on_sides(t)
             for k in range(0, len(h), MOST_STEPS):
                 self._transport(self.finer, starts.part(k, k + MOST_STEPS), None, sides, steps / len(h))
         self.now[0] += self._state(piece, end) - self._state(fine, -1)
@@ -620,7 +608,7 @@ def corrected_states(run: Any, error: RunError) -> CorrectedStates:
             q[:, member.columns], p[:, member.columns] = unit, p[:, member.columns] - along * unit
     velocity = np.full_like(q, np.nan)
     for k in np.flatnonzero(np.isfinite(q).all(axis=1)).tolist():
-        parameters = parameters_on_sides(run, float(run.t[k]))
+        parameters = run.parameters_on_sides(float(run.t[k]))
         if stepper.interface.constraints:
             q[k], p[k], _ = projected(stepper, q[k], p[k], float(run.t[k]), parameters)
         velocity[k] = stepper.velocity(q[k], p[k], float(run.t[k]), parameters)
