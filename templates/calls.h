@@ -176,16 +176,26 @@ int NAME(call_pieces)(NAME(call) *c, long long count, const double *t, const dou
 }
 
 #ifdef HAS_DEFECTS
+/* Length of a vector in units of sizes; infinite where a component other than 0 has the size 0. */
+static double NAME(relative_length)(int count, const double *x, const double *size)
+{
+  double sum = 0.0;
+  for (int i = 0; i < count; i++)
+    sum += x[i] == 0.0 ? 0.0 : x[i] / size[i] * (x[i] / size[i]);
+  return sqrt(sum);
+}
+
 /* Defects x[k + 1] - phi(x[k]) of `count` + 1 states x = (q, p) of another run at times t, by one step phi of size h
  * from each, which begins at the curve of the last one. Increments of phi have low words, so that no rounding of
- * states remains. */
+ * states remains. Relative to sizes of (q, p), those of at most `part` of the change of momenta are `small`. */
 int NAME(call_defects)(NAME(call) *c, long long count, const double *t, const double *h, const double *q,
-    const double *p, double *defects)
+    const double *p, const double *size, double part, double *defects, int *small)
 {
   __typeof__(NAME(advance)) *volatile fixed = NAME(advance);
   NAME(run) *run = c->run;
   int status = 0;
   for (long long k = 0; k < count && !status; k++, q += M, p += M, defects += 2 * M) {
+    double impulse[M];
     if (k == 0)
       NAME(start)(run, t[0], h[0], q, p);
     run->t = t[k], run->t_low = 0.0, run->h = h[k];
@@ -197,7 +207,9 @@ int NAME(call_defects)(NAME(call) *c, long long count, const double *t, const do
     for (int i = 0; i < M; i++) {
       defects[i] = (q[M + i] - run->q[i]) - run->carry_q[i];
       defects[M + i] = (p[M + i] - run->p[i]) - run->carry_p[i];
+      impulse[i] = p[M + i] - p[i];
     }
+    small[k] = NAME(relative_length)(2 * M, defects, size) <= part * NAME(relative_length)(M, impulse, size + M);
   }
   return status;
 }

@@ -37,7 +37,7 @@ CONSISTENT = (
 """Declaration of the function of ``calls.h`` that only constraints of named coordinates have."""
 DEFECTS = (
     "int NAME(call_defects)(NAME(call) *call, long long count, const double *t, const double *h, const double *q, "
-    "const double *p, double *defects);\n"
+    "const double *p, const double *size, double part, double *defects, int *small);\n"
 )
 """Declaration of that which only named coordinates in double have."""
 OPTIONAL_FUNCTIONS = frozenset(("advance_to", "set_fallback", "project"))

@@ -7,6 +7,7 @@ are composed of these. In transformed time the energy is one of the parameters, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -292,14 +293,22 @@ class LinearisedMethod(StateFunctions):
             raise step_failure(status, report, step=failed, h=float(starts.h[failed]))
         return q1, p1
 
-    def _defects(self, starts: Starts, parameters: Array) -> Array:
-        """Return (n, 2m) states minus the ends of the steps from those before them, along a run of another method."""
-        defects = np.empty((len(starts.h), 2 * self.dimension))
-        arrays = map(self.binding.pointer, (starts.t, starts.h, starts.q, starts.p, defects))
-        status, report = self._call_steps("defects", parameters, None, len(starts.h), *arrays)
+    def _defects(
+        self, starts: Starts, parameters: Array, sizes: Array, part: float
+    ) -> tuple[Array, NDArray[np.int32]]:
+        """Return (n, 2m) states minus the ends of the steps from those before them, along a run of another method.
+
+        The second result are (n,) flags, 1 where, relative to (2m,) sizes, that is at most a part of the change of
+        momenta in the step.
+        """
+        count = len(starts.h)
+        defects, small = np.empty((count, 2 * self.dimension)), np.empty(count, np.int32)
+        given = map(self.binding.pointer, (starts.t, starts.h, starts.q, starts.p, sizes))
+        results = map(self.binding.pointer, (defects, small))
+        status, report = self._call_steps("defects", parameters, None, count, *given, part, *results)
         if status:
             raise step_failure(status, report, step=0, h=float(starts.h[0]))
-        return defects
+        return defects, small
 
     def _call_steps(self, name: str, parameters: Array, options: SolverOptions | None, *arguments: Any) -> Any:
         """Call a function of C that takes steps from states of its own; return its status and report."""
@@ -316,41 +325,48 @@ class LinearisedMethod(StateFunctions):
         starts: Starts,
         defects: Array | None,
         vectors: Array,
+        results: Sequence[Array],
         parameters: Array,
         left: float,
         rounding: float,
         seed: int,
     ) -> None:
-        """Transport global errors, and further tangent vectors, along saved states, in place.
+        """Transport global errors, and further tangent vectors, along saved states.
 
         Args:
             starts: n steps and their (n + 1, m) states.
             defects: (n, 2m) states minus the ends of the steps of a finer method from those before.
-            vectors: (n + 1, count, 2m + k + 2) as of :meth:`_propagate`; the first one of each row is the error, to
-                which the defect of the state is added.
+            vectors: (count, 2m) at the first state, replaced by those at the last one that is reached; the first one is
+                the error, to which the defect of each state is added.
+            results: two (2m, n) arrays, views of rows of contiguous numbers, which receive the errors and the root mean
+                squares of the other vectors after each step.
             parameters: as of :meth:`_propagate`.
             left: relative change of the step and of vectors that the iterations of a step leave.
             rounding: rounding errors relative to the states, which further vectors receive with random signs.
             seed: of the signs.
         """
-        binding = self.tangent
-        report = binding.new("report *")
+        binding, size = self.tangent, 2 * self.dimension
+        report, ends = binding.new("report *"), np.zeros((2, len(vectors), self._input_size))
+        ends[0, :, :size] = vectors
         status = binding.function("transport_errors")(
             len(starts.h),
             *map(binding.pointer, (starts.t, starts.h, starts.q, starts.p, parameters)),
             binding.options(SolverOptions(tolerance=left)),
-            vectors.shape[1],
+            len(vectors),
             left,
             rounding,
             seed,
             binding.null if defects is None else binding.pointer(defects),
-            binding.pointer(vectors),
+            binding.pointer(ends),
+            results[0].strides[0] // results[0].itemsize,
+            *(binding.pointer(of[0]) for of in results),  # the first row; others are a stride apart
             report,
             binding.workspace(),
         )
+        steps = int(report.steps)
+        vectors[:] = ends[steps % 2, :, :size]
         if status:
-            failed = int(report.steps)
-            raise step_failure(status, report, step=failed, h=float(starts.h[failed]))
+            raise step_failure(status, report, step=steps, h=float(starts.h[steps]))
 
     def _second_order_adjoint(
         self, starts: Starts, changes: Array, vectors: Array, parameters: Array, options: SolverOptions | None

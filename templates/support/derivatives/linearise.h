@@ -4,13 +4,15 @@
 
 #define LEFT_TO_COME (DBL_EPSILON * DBL_EPSILON / 16.0) /* squared: relative change still to come that is accepted */
 
-/* Steps and the vectors propagated over them, of shape (steps + 1, count, STEP_INPUTS). */
+/* Steps and the vectors propagated over them, of shape (steps + 1, count, STEP_INPUTS); of global errors only those at
+ * both ends of the present step, (2, count, STEP_INPUTS). */
 typedef struct {
   const real *t, *h, *q, *p, *parameters;
   const solver_options *options;
   int back, count;
   const real *defects; /* of the saved states, (steps, 2M), which the first vectors receive; NULL: none */
-  int together; /* whether VECTORS_AT_ONCE vectors are iterated together */
+  real *errors, *deviations; /* the first vectors, and root mean squares of the others, after each step; NULL: none */
+  long long stride; /* of the components of both */
   real *vectors, *q1, *p1, *workspace;
   solver_report *report;
   real accepted; /* squared: relative change of vectors still to come that is accepted */
@@ -34,7 +36,7 @@ static step_data step_of(const propagation *over, long long k, const real *nothi
 /* Vectors at the start of step k; step k propagates them from there to k + 1, or back. */
 static real *vectors_at(const propagation *over, long long k)
 {
-  return over->vectors + k * over->count * STEP_INPUTS;
+  return over->vectors + (over->errors ? k % 2 : k) * over->count * STEP_INPUTS;
 }
 
 /* Adds the defect of state k + 1 to the first vector at the end of step k. */
@@ -59,6 +61,21 @@ static void add_rounding(propagation *over, long long k)
     real *to = vectors_at(over, k + 1) + j * STEP_INPUTS;
     for (int i = 0; i < 2 * M; i++)
       to[i] += (next_random(&over->random) >> 63 ? over->rounding : -over->rounding) * x[i / M][i % M];
+  }
+}
+
+/* Stores the first vector at the end of step k, and the root mean square of the others, whose squares may overflow. */
+static void store_errors(const propagation *over, long long k)
+{
+  const real *at = vectors_at(over, k + 1);
+  for (int i = 0; i < 2 * M; i++) {
+    real largest = REAL_MIN, sum = 0;
+    for (int j = 1; j < over->count; j++)
+      largest = larger(largest, MATH(fabs)(at[j * STEP_INPUTS + i]));
+    for (int j = 1; j < over->count; j++)
+      sum += at[j * STEP_INPUTS + i] / largest * (at[j * STEP_INPUTS + i] / largest);
+    over->errors[i * over->stride + k] = at[i];
+    over->deviations[i * over->stride + k] = largest * MATH(sqrt)(sum / (over->count - 1));
   }
 }
 
@@ -144,7 +161,7 @@ static int propagate_by_iteration(propagation *over, long long k, const double *
   at.accepted = over->accepted;
   for (int j = 0, own; j < over->count; j += own) {
     double v[VECTORS_AT_ONCE * STEP_INPUTS];
-    own = over->together && over->count - j >= VECTORS_AT_ONCE ? VECTORS_AT_ONCE : 1;
+    own = over->errors && over->count - j >= VECTORS_AT_ONCE ? VECTORS_AT_ONCE : 1;
     memcpy(v, from + j * STEP_INPUTS, sizeof(double) * (size_t)(own * STEP_INPUTS));
     if ((over->back ? vjp_by_iteration : own > 1 ? jvps_by_iteration
                                                  : jvp_by_iteration)(&at, v, &over->look) != OK)
@@ -170,14 +187,17 @@ static int propagate_steps(propagation *over, long long first, long long end)
   iterated = solve_steps(over, first, end);
   for (long long done = 0; status == OK && done < end - first; done++) {
     const long long k = over->back ? end - 1 - done : first + done;
+    if (over->errors)
+      memset(vectors_at(over, k + 1), 0, sizeof(real) * (size_t)(over->count * STEP_INPUTS));
     const int carried = iterated ? propagate_by_iteration(over, k, stored_of(over, k - first)) : 0;
     if (!iterated || carried < over->count)
       status = vectors_by_newton(over, k, carried);
     else if (!all_finite(vectors_at(over, k + !over->back), over->count * STEP_INPUTS))
       status = NOT_FINITE;
-    if (status == OK) {
+    if (status == OK && over->errors) {
       add_defect(over, k);
       add_rounding(over, k);
+      store_errors(over, k);
     }
     over->report->steps += status == OK;
   }
@@ -210,12 +230,14 @@ int NAME(linearise)(long long steps, const real *t, const real *h, const real *q
 
 /* Global errors delta[k + 1] = D psi(x[k]) delta[k] + defect[k] of a run by the step psi from its saved states, with
  * their defects, x[k + 1] - phi(x[k]) by a finer method (Hairer, Norsett & Wanner, Solving ODEs I, II.3 and II.4);
- * further vectors receive rounding errors. What is `left` of the change of a vector compounds over the steps. */
+ * further vectors receive rounding errors. The vectors after the last of k steps are those of row k % 2. What is `left` of the change of a vector compounds over the steps. */
 int NAME(transport_errors)(long long steps, const real *t, const real *h, const real *q, const real *p,
     const real *parameters, const solver_options *options, int count, double left, double rounding,
-    unsigned long long seed, const real *defects, real *vectors, solver_report *report, real *workspace)
+    unsigned long long seed, const real *defects, real *vectors, long long stride, real *errors, real *deviations,
+    solver_report *report, real *workspace)
 {
-  propagation over = {PROPAGATION_OF_ARGUMENTS, .together = 1, .accepted = left * left, .count = count,
-      .rounding = rounding, .random = seed, .defects = defects, .vectors = vectors};
+  propagation over = {PROPAGATION_OF_ARGUMENTS, .accepted = left * left, .count = count, .rounding = rounding,
+      .random = seed, .defects = defects, .vectors = vectors, .stride = stride, .errors = errors,
+      .deviations = deviations};
   return propagate_blocks(&over, steps);
 }
