@@ -47,7 +47,7 @@ from scvi_codegen.runs.states.rotations import members_of
 from scvi_codegen.runs.states.words import low_words, with_low
 from scvi_codegen.runs.stepping.features import refusal, require
 from scvi_codegen.runs.stepping.projection import determined_coordinates, projected
-from scvi_codegen.runs.stepping.step_derivatives import Starts
+from scvi_codegen.runs.stepping.step_derivatives import Defects, Starts
 from scvi_codegen.runs.stepping.step_plan import Adaptive, absolute_tolerances, ending_at
 
 LOST = 0.1
@@ -256,16 +256,15 @@ def _is_compared(stepper: Any, finer: Any) -> bool:
     return bool(stepper.in_tau or interface.words > 1 or stepper.origin is not None or unlocated)
 
 
-def _is_transported_by(finer: Any, stepper: Any) -> bool:
-    """Return whether the derivatives of the finer method's steps are better, of those of a method and of the finer one.
+def _iterating(stepper: Any, finer: Any) -> Any:
+    """Return which of the steppers of a method and of the finer one finds derivatives of steps by iterations, or None.
 
-    Newton's method factorises the equations of each step, which takes more time than iterations of four vectors.
+    Newton's method, which solves constraints and rotations, factorises the equations of each step for them.
     """
-    if stepper.interface.time_transformation is not None or stepper._lacks(Derivatives()):
-        return True
-    if stepper.constraints or stepper.interface.rotations or finer._lacks(Derivatives()):
-        return False  # Newton's method solves both
-    return not stepper.tangent.constant("VECTORS_ITERATED") and bool(finer.tangent.constant("VECTORS_ITERATED"))
+    if stepper.constraints or stepper.interface.rotations:
+        return None
+    own = [] if stepper.interface.time_transformation is not None or stepper._lacks(Derivatives()) else [stepper]
+    return next((of for of in (*own, finer) if of.tangent.constant("VECTORS_ITERATED")), None)
 
 
 def _described(run: Any, errors: Array, rounding: Array, **others: Any) -> RunError:
@@ -317,12 +316,14 @@ def leave_out_rounding(run: Any, bounds: Array, entries: Array) -> None:
         return
     epsilon = roundoff(run.stepper.interface.words)
     tiny = bounds[0] <= ROUNDINGS * epsilon * np.abs(np.asarray(run.q)[: bounds.shape[2]].T)
-    largest = np.where(tiny, 0.0, entries).max(initial=0.0)
-    for k in np.flatnonzero((np.where(tiny, entries, 0.0) > largest).any(axis=(0, 1))).tolist():
-        determined = np.zeros(tiny.shape[0], bool)
-        q, t = np.asarray(run.q[k]), float(run.t[k])
-        determined[determined_coordinates(run.stepper, q, t, parameters_on_sides(run, t))] = True
-        entries[:, tiny[:, k] & determined, k] = 0.0
+    parts, so_far = np.where(tiny, entries, 0.0).max(axis=(0, 1)), np.where(tiny, 0.0, entries).max(initial=0.0)
+    for k in np.flatnonzero(parts > so_far).tolist():
+        if parts[k] > so_far:  # a new maximum
+            determined = np.zeros(tiny.shape[0], bool)
+            q, t = np.asarray(run.q[k]), float(run.t[k])
+            determined[determined_coordinates(run.stepper, q, t, parameters_on_sides(run, t))] = True
+            entries[:, tiny[:, k] & determined, k] = 0.0
+            so_far = max(so_far, entries[:, :, k].max())
 
 
 def sizes_of(run: Any, rows: int, errors: Array) -> Array:
@@ -341,9 +342,9 @@ def sizes_of(run: Any, rows: int, errors: Array) -> Array:
 class _Replay:
     """Replay of a run from its saved states.
 
-    The derivatives of single steps are those of the run's own method, unless it has none or those of the finer method
-    are iterated and its own are not: both differ by derivatives of the local error, which times delta is below terms of
-    the order of delta^2.
+    The derivatives of single steps are those of the run's own method or of the finer one, found by iterations: both
+    differ by derivatives of the local error, which times delta is below terms of the order of delta^2. Where iterations
+    do not converge they are differences of steps of the finer method from neighbouring states.
 
     Args:
         run: trajectory.
@@ -352,7 +353,7 @@ class _Replay:
 
     def __init__(self, run: Any, finer: Any) -> None:
         self.run, self.finer, self.m = run, finer, run.stepper.dimension
-        self.linear = finer if _is_transported_by(finer, run.stepper) else run.stepper
+        self.linear = _iterating(run.stepper, finer)
         self.u, self.calls, self.left = roundoff(1), 0, LEFT / max(1, run.steps)
         self.steps = max(1.0, run.steps / max(1, len(run) - 1))  # mean number between two states
         self.now = np.zeros((1 + SAMPLES, 2 * self.m))
@@ -475,17 +476,14 @@ class _Replay:
                     rows = slice(first + row + start + 1, first + row + stop + 1)
                     self.resolved[rows] = True
                     results = self.results[:, :, rows]
-                    self._transport(self.linear, part.part(start, stop), defects[0][start:stop], results, parameters)
+                    self._transport(part.part(start, stop), defects.part(start, stop), results, parameters)
                     continue
                 for j in range(row + start, row + stop):
                     self._by_run(piece, float(piece.t[j]), piece.q[j], piece.p[j], j + 1, steps=1.0)
                     self._store(first + j + 1)
 
     def _defects(self, parts: list[Starts], parameters: Array) -> list[Any]:
-        """Return (n, 2m) states minus the ends of finer steps from those before, or the error of a step that fails.
-
-        With them are flags of those that are small, :data:`CONVERGED`.
-        """
+        """Return the defects of steps, or the error of one that fails; small are those of :data:`CONVERGED`."""
         defects = list[Any]([None] * len(parts))
 
         def find(k: int, _: object = None) -> None:
@@ -508,7 +506,7 @@ class _Replay:
         """
         if isinstance(defects, ScviCodegenError):
             return np.zeros(len(starts.h), bool)
-        misfits, resolved = defects[0], defects[1] != 0
+        resolved = defects.small != 0
         if resolved.all():
             return np.asarray(resolved)
         doubtful = np.flatnonzero(~resolved)
@@ -519,7 +517,7 @@ class _Replay:
         except StepFailedError:
             return np.asarray(resolved)
         rounding = RESOLVED * self.u * (np.abs(begin) + np.abs(end - begin))
-        apart = np.maximum(np.abs(end - misfits[doubtful] - halves) - rounding, 0.0)
+        apart = np.maximum(np.abs(end - defects.misfits[doubtful] - halves) - rounding, 0.0)
         resolved[doubtful] = lengths(apart, self.size) <= LOST * lengths(end - halves, self.size)
         return np.asarray(resolved)
 
@@ -527,21 +525,25 @@ class _Replay:
         """Return the (n, 2m) ends of steps of the finer method from n states, up to rounding."""
         rows = np.concatenate([states, states[-1:]])
         q, p = (np.ascontiguousarray(part) for part in np.split(rows, 2, axis=1))
-        return np.asarray(rows[1:] - self.finer._defects(Starts(t, h, q, p), parameters, self.size, CONVERGED)[0])
+        return np.asarray(rows[1:] - self.finer._defects(Starts(t, h, q, p), parameters, self.size, CONVERGED).misfits)
 
     def _transport(
-        self,
-        linear: Any,
-        starts: Starts,
-        defects: Array | None,
-        results: Array,
-        parameters: Array,
-        steps: float = 1.0,
+        self, starts: Starts, defects: Defects, results: Array, parameters: Array, steps: float = 1.0
     ) -> None:
         """Transport the errors over n steps of a method, each of so many steps of the run, into (2, 2m, n) results."""
-        self.calls += 1
-        settings = self.left / steps, math.sqrt(steps) * self.u, self.calls
-        linear._transport_errors(starts, defects, self.now, results, parameters, *settings)
+        rounding, first, length = math.sqrt(steps) * self.u, 0, len(starts.h) if self.linear is None else 1
+        while first < len(starts.h):
+            if self.linear is not None:
+                self.calls += 1
+                rest = [of.part(first, len(starts.h)) for of in (starts, defects)]
+                into = self.now, results[:, :, first:], parameters
+                first += self.linear._transport_errors(*rest, *into, self.left / steps, rounding, self.calls)
+            if first < len(starts.h):
+                self.calls += 1
+                part = [of.part(first, first + length) for of in (starts, defects)]
+                into = self.now, results[:, :, first:], parameters
+                self.finer._transport_by_differences(*part, *into, self.size, rounding, self.calls)
+                first, length = first + length, 2 * length  # so that calls are few where iterations fail again
 
     def _by_run(self, piece: Any, t: float, q: Array, p: Array, end: int, *, steps: float) -> None:
         """Transport the errors to a row by a run of the finer method at round-off, over the events in between."""
@@ -560,7 +562,8 @@ class _Replay:
             times, h, x, y = (np.ascontiguousarray(of) for of in (fine.t, np.diff(fine.t), fine.q, fine.p))
             starts, sides = Starts(times, h, x, y), parameters_on_sides(fine, t)
             results = np.empty((2, 2 * self.m, len(h)))  # of the states in between
-            self._transport(self.finer, starts, None, results, sides, steps / len(h))
+            defects = self.finer._defects(starts, sides, self.size, CONVERGED)  # as states have no low words
+            self._transport(starts, defects, results, sides, steps / len(h))
         self.now[0] += self._state(piece, end) - self._state(fine, -1)
 
     @staticmethod

@@ -79,8 +79,9 @@ def sizes_of_motion(
     displacements, impulses = map(of_groups, by_reactions)
     resolution = RESOLVED * epsilon
     unmoved = resolution * max(2.0 * largest.max(), NOISE_OF_MOMENTA * displacements.max())
-    if not np.any(absolute) and ranges.min() > unmoved and momenta.min() > NOISE_OF_MOMENTA * resolution * momenta.max():
-        return np.array([ranges, momenta])  # nothing rests, or is noise
+    moves = ranges.min() > unmoved and momenta.min() > NOISE_OF_MOMENTA * resolution * momenta.max()
+    if moves and not np.any(absolute):  # nothing rests, or is noise
+        return np.array([ranges, momenta])
     rest = ranges <= resolution * np.maximum(largest, displacements)
     rest |= _is_noise(ranges, errors[0], NOISE_OF_MOMENTA * resolution * displacements)
     noise = _is_noise(ranges, errors[0], resolution * ranges.max(initial=0.0))

@@ -1,3 +1,4 @@
+#include "error_vectors.h"
 #include "jvp_and_vjp.h"
 
 /* Tangent and adjoint vectors over steps solved by Newton's method. */
@@ -10,14 +11,10 @@ typedef struct {
   const real *t, *h, *q, *p, *parameters;
   const solver_options *options;
   int back, count;
-  const real *defects; /* of the saved states, (steps, 2M), which the first vectors receive; NULL: none */
-  real *errors, *deviations; /* the first vectors, and root mean squares of the others, after each step; NULL: none */
-  long long stride; /* of the components of both */
+  error_vectors *errors; /* of a run; NULL: others */
   real *vectors, *q1, *p1, *workspace;
   solver_report *report;
   real accepted; /* squared: relative change of vectors still to come that is accepted */
-  real rounding; /* relative error of the saved states that the vectors after the first receive; 0: none */
-  unsigned long long random;
   long long guess; /* number of previous steps that the predictor uses (fixed-point iteration only) */
   int look; /* first iteration of the linearised equations whose convergence is tested */
 } propagation;
@@ -37,46 +34,6 @@ static step_data step_of(const propagation *over, long long k, const real *nothi
 static real *vectors_at(const propagation *over, long long k)
 {
   return over->vectors + (over->errors ? k % 2 : k) * over->count * STEP_INPUTS;
-}
-
-/* Adds the defect of state k + 1 to the first vector at the end of step k. */
-static void add_defect(propagation *over, long long k)
-{
-  real *to = vectors_at(over, k + 1);
-  for (int j = 0; over->defects && j < 2 * M; j++)
-    to[j] += over->defects[k * 2 * M + j];
-}
-
-/* The next number of a linear congruential generator (D. E. Knuth, The Art of Computer Programming 2, 3.3.4). */
-static inline unsigned long long next_random(unsigned long long *x)
-{
-  return *x = 6364136223846793005ULL * *x + 1442695040888963407ULL;
-}
-
-/* Adds rounding errors of x[k + 1] with random signs to all vectors but the first at the end of step k. */
-static void add_rounding(propagation *over, long long k)
-{
-  const real *x[2] = {over->q + (k + 1) * M, over->p + (k + 1) * M};
-  for (int j = 1; over->rounding > 0 && j < over->count; j++) {
-    real *to = vectors_at(over, k + 1) + j * STEP_INPUTS;
-    for (int i = 0; i < 2 * M; i++)
-      to[i] += (next_random(&over->random) >> 63 ? over->rounding : -over->rounding) * x[i / M][i % M];
-  }
-}
-
-/* Stores the first vector at the end of step k, and the root mean square of the others, whose squares may overflow. */
-static void store_errors(const propagation *over, long long k)
-{
-  const real *at = vectors_at(over, k + 1);
-  for (int i = 0; i < 2 * M; i++) {
-    real largest = REAL_MIN, sum = 0;
-    for (int j = 1; j < over->count; j++)
-      largest = larger(largest, MATH(fabs)(at[j * STEP_INPUTS + i]));
-    for (int j = 1; j < over->count; j++)
-      sum += at[j * STEP_INPUTS + i] / largest * (at[j * STEP_INPUTS + i] / largest);
-    over->errors[i * over->stride + k] = at[i];
-    over->deviations[i * over->stride + k] = largest * MATH(sqrt)(sum / (over->count - 1));
-  }
 }
 
 /* Propagates the vectors from index `first` on over step k. */
@@ -190,15 +147,12 @@ static int propagate_steps(propagation *over, long long first, long long end)
     if (over->errors)
       memset(vectors_at(over, k + 1), 0, sizeof(real) * (size_t)(over->count * STEP_INPUTS));
     const int carried = iterated ? propagate_by_iteration(over, k, stored_of(over, k - first)) : 0;
-    if (!iterated || carried < over->count)
-      status = vectors_by_newton(over, k, carried);
+    if (carried < over->count)
+      status = over->errors ? NOT_CONVERGED : vectors_by_newton(over, k, carried);
     else if (!all_finite(vectors_at(over, k + !over->back), over->count * STEP_INPUTS))
       status = NOT_FINITE;
-    if (status == OK && over->errors) {
-      add_defect(over, k);
-      add_rounding(over, k);
-      store_errors(over, k);
-    }
+    if (status == OK && over->errors)
+      receive_errors(over->errors, k, over->q + (k + 1) * M, over->p + (k + 1) * M, vectors_at(over, k + 1));
     over->report->steps += status == OK;
   }
   return status;
@@ -228,16 +182,18 @@ int NAME(linearise)(long long steps, const real *t, const real *h, const real *q
   return propagate_blocks(&over, steps);
 }
 
-/* Global errors delta[k + 1] = D psi(x[k]) delta[k] + defect[k] of a run by the step psi from its saved states, with
- * their defects, x[k + 1] - phi(x[k]) by a finer method (Hairer, Norsett & Wanner, Solving ODEs I, II.3 and II.4);
- * further vectors receive rounding errors. The vectors after the last of k steps are those of row k % 2. What is `left` of the change of a vector compounds over the steps. */
+#ifdef VECTORS_BY_ITERATION
+/* Global errors delta[k + 1] = D psi(x[k]) delta[k] + defect[k] of a run by the step psi from its saved states, and
+ * samples of rounding errors, until an iteration fails. The vectors after the last of k steps are those of row k % 2.
+ * What is `left` of the change of a vector compounds over the steps. */
 int NAME(transport_errors)(long long steps, const real *t, const real *h, const real *q, const real *p,
     const real *parameters, const solver_options *options, int count, double left, double rounding,
     unsigned long long seed, const real *defects, real *vectors, long long stride, real *errors, real *deviations,
     solver_report *report, real *workspace)
 {
-  propagation over = {PROPAGATION_OF_ARGUMENTS, .accepted = left * left, .count = count, .rounding = rounding,
-      .random = seed, .defects = defects, .vectors = vectors, .stride = stride, .errors = errors,
-      .deviations = deviations};
+  error_vectors all = {count, STEP_INPUTS, rounding, seed, defects, stride, errors, deviations};
+  propagation over = {PROPAGATION_OF_ARGUMENTS, .accepted = left * left, .count = count, .errors = &all,
+      .vectors = vectors};
   return propagate_blocks(&over, steps);
 }
+#endif
