@@ -415,7 +415,8 @@ def test_numbers_without_a_right_digit_are_not_printed():
 
 
 def test_positions_and_momenta_are_printed_with_their_correct_digits():
-    known = SimpleNamespace(bounds=(np.array([[1e-3, 1e-9]]), np.array([[1e-9, 1e-3]])), lost=None)
+    errors = np.array([[1e-3, 1e-9]]), np.array([[1e-9, 1e-3]])
+    known = SimpleNamespace(bounds=errors, lost=None, sizes=np.ones((2, 2)))
     interface = Interface(
         prefix="two", title="", system="", method="", coordinates=("x", "y"), parameters=(), defaults=()
     )

@@ -231,8 +231,10 @@ def final_state(
         return
     yield f"final state ({_how_known(final_error)})"
     for i, (name, other, q, p) in enumerate(zip(shown, columns, positions, momenta, strict=False)):
-        error_q, error_p = (of[-1, i] for of in final_error.bounds) if final_error else (0.0, 0.0)
-        yield f"  {name:{width}} = {in_known_digits(q, error_q):24} {other:{column}} = {in_known_digits(p, error_p)}"
+        errors = [of[-1, i] for of in final_error.bounds] if final_error else [0.0, 0.0]
+        sizes = final_error.sizes[:, i] if final_error else [0.0, 0.0]
+        known_q, known_p = map(in_known_digits, (q, p), errors, sizes)
+        yield f"  {name:{width}} = {known_q:24} {other:{column}} = {known_p}"
     if len(names) > SHOWN_COORDINATES:
         yield f"  and {len(names) - SHOWN_COORDINATES} more coordinates"
 
