@@ -174,7 +174,7 @@ class TestChoices:
             ),
             ("kepler --printed", "--variational/--printed is for the method scvi, not for svi: omit it"),
             ("kepler --method gauss:2 --printed", "--method gauss:2 takes no --variational/--printed; it takes"),
-            ("kepler --controller predictive --first-step 0.1", "first_step = 0.1 is for adaptive steps, but the step"),
+            ("kepler --controller predictive --first-step 0.1", "--first-step 0.1 is for adaptive steps, but the step"),
             ("kepler --quadrature gauss-legendre", "lacks its number of points"),
             ("kepler --degree x", "'x' is not a valid integer"),
             ("kepler --q 1,a", "could not convert string to float: 'a'"),
