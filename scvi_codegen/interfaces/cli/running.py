@@ -145,9 +145,12 @@ def event_counts(events: Iterable[Crossings]) -> Iterator[str]:
 
 
 def _geometry(model: Model, run: Run) -> str:
-    """Return whether the map is symplectic; adaptive steps destroy this property."""
-    if not is_symplectic(model.method_of_runs, model.system):
+    """Return whether the map is symplectic: not with noise, contacts, changes at events and adaptive steps."""
+    system = model.array_system or model.system
+    if system.bath or model.system.contacts or not is_symplectic(model.method_of_runs, model.system):
         return "not symplectic"
+    if any(event.then or event.restitution not in (None, 1) for event in model.events):
+        return "symplectic only between events"
     return "symplectic" if isinstance(run.plan, FixedSteps) else "symplectic only at fixed step size"
 
 
