@@ -2,8 +2,8 @@
 
 ``summary(*names)``
     A ``__repr__`` that shows attributes, ``Family(parameter='mu', orbits=<12>)``, in at most 100 characters.
-``counted(count, noun)``, ``with_uncertainty(value, error)``
-    ``"3 orbits"``, ``"1 orbit"``; ``"0.512345(12)"`` for 0.512345 +- 0.000012.
+``counted(count, noun)``
+    ``"3 orbits"``, ``"1 orbit"``.
 ``Html``
     HTML, for ``_repr_html_``: ``Html.plain(text)``, ``Html.listed(names)``; ``Html.card(title, facts, *parts)``, facts
     by name; ``Html.grid(rows, *, head)``, a table.
@@ -30,7 +30,7 @@ from scvi_codegen.common.cache import cached_source, template_folder
 from scvi_codegen.common.display.cards import Html
 from scvi_codegen.common.display.mathml import Typeset
 from scvi_codegen.common.display.tables import TableBlock
-from scvi_codegen.common.representation import counted, summary, with_uncertainty
+from scvi_codegen.common.representation import counted, summary
 
 __all__ = [
     "Html",
@@ -42,7 +42,6 @@ __all__ = [
     "is_inside",
     "summary",
     "template_folder",
-    "with_uncertainty",
     "write_atomically",
     "write_text",
 ]

@@ -80,9 +80,9 @@ class Derivation:
         return program_of(self.in_all_modes, self.method, prefix=c_identifier(self.system.name))
 
     @cached_property
-    def c(self) -> str:
-        """The C of a step with all that it includes."""
-        return render(self.program).amalgamated().code
+    def functions(self) -> Mapping[str, Any]:
+        """Functions of the C of a step by name, with all that it includes."""
+        return render(self.program).functions
 
     @staticmethod
     def argument_name(system: MechanicalSystem, gather: Any) -> str:

@@ -15,6 +15,7 @@ from scvi_codegen.codegen.native.binding import Binding
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.codegen.variants import TangentVectors
+from scvi_codegen.common.representation import with_uncertainty
 from scvi_codegen.common.thread_pool import run_jobs
 from scvi_codegen.runs.accuracy.global_error import warn_of_unconfirmed
 from scvi_codegen.runs.accuracy.local_error import warn_of_energy_errors
@@ -74,6 +75,11 @@ class ForProducts(Integrator):
     def check_given(self, parameters: Parameters, *, step: bool = False) -> None:
         """Raise StateError if an input has no value; of a single ``step`` ContactError for unknown modes, too."""
         (check_step_given if step else check_inputs_given)(self.interface, parameters)
+
+    @staticmethod
+    def with_uncertainty(value: float, error: float) -> str:
+        """Return a value with the uncertain digits of its error, ``0.512345(12)`` for 0.512345 +- 0.000012."""
+        return with_uncertainty(value, error)
 
     @property
     def reduction(self) -> Reduction:

@@ -32,7 +32,7 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.api.checks import checked_count, checks_arguments
 from scvi_codegen.api.runs import warnings_wanted, without_accuracy_warnings
 from scvi_codegen.api.states import Array, Fixed, Parameters, Reduction, checked_number
-from scvi_codegen.api.text import summary, with_uncertainty
+from scvi_codegen.api.text import summary
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import (
     AccuracyWarning,
@@ -111,7 +111,7 @@ class PeriodicOrbit:
         """Return start and period, with the uncertain digits in parentheses."""
         names, values = [*state_names(self.stepper), "period"], [*self.q, *self.p, self.period]
         rows = zip(names, values, self.errors.bounds, strict=True)
-        lines = [f"{name} = {with_uncertainty(value, bound)}" for name, value, bound in rows]
+        lines = [f"{name} = {Stepper.with_uncertainty(value, bound)}" for name, value, bound in rows]
         return "\n".join([*lines, f"relative error {self.error:.1e}", *filter(None, [self.errors.reason])])
 
     def run(self, *, save_every: int = 1) -> Trajectory:

@@ -14,6 +14,7 @@ from sympy.core.function import AppliedUndef
 from sympy.utilities.iterables import connected_components
 
 from scvi_codegen.api.formulas import Rotation, Tape, jacobian, parse_expression
+from scvi_codegen.api.systems import tangent_space
 from scvi_codegen.common.errors import SystemDefinitionError
 
 MOST_COUPLED = 6
@@ -158,16 +159,10 @@ def independent_of(earlier: Sequence[Expr], asked: Sequence[Expr], rates: Sequen
     basis, independent = rows[: len(earlier)], []
     for k, row in enumerate(rows[len(earlier) :]):
         more = np.vstack([basis, row])
-        if rank_of_rows(more) > rank_of_rows(basis):
+        if tangent_space(more).rank > tangent_space(basis).rank:
             independent.append(k)
             basis = more
     return tuple(independent)
-
-
-def rank_of_rows(rows: NDArray[np.float64]) -> int:
-    """Return the rank of exact rows (n, m), up to the rounding of their entries."""
-    sizes = np.linalg.norm(rows, axis=1, keepdims=True)
-    return int(np.linalg.matrix_rank(rows / np.where(sizes > 0.0, sizes, 1.0))) if rows.size else 0
 
 
 def matrix_of(entries: Mapping[tuple[int, int], Any], values: Sequence[Any], shape: tuple[int, int]) -> Any:

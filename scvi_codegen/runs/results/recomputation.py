@@ -19,7 +19,7 @@ from scvi_codegen.runs.stepping.projection import linearised, multipliers
 from scvi_codegen.runs.stepping.step_plan import FixedSteps
 from scvi_codegen.systems.event import Crossings, Transition
 
-REACTIONS = 16
+REACTIONS = 4
 """Number of states of a run whose constraint forces are computed."""
 SAME_TIME = 4 * float(np.finfo(float).eps)
 """Largest difference of times that are equal, relative to the largest one."""

@@ -16,7 +16,6 @@ from scvi_codegen.api.systems import MechanicalSystem, forms_of
 from scvi_codegen.api.text import TableBlock, counted
 from scvi_codegen.extras.derivation.equations import StepEquations, derive
 from scvi_codegen.extras.derivation.notation import contact_lines, events_text, table_entries
-from scvi_codegen.extras.derivation.outline import Function, functions_of, reached
 from scvi_codegen.extras.derivation.page.drawings import curve_section, jacobian_section, tables_section
 from scvi_codegen.extras.derivation.page.sums import end_formulas, gather_formulas, meaning, row_formulas
 from scvi_codegen.extras.derivation.writing import (
@@ -248,7 +247,7 @@ def derivation_html(system: MechanicalSystem, method: Method, *, events: Sequenc
 
 def _sections(system: MechanicalSystem, method: Method) -> Iterator[Section]:
     derivation = Derivation(system, method)
-    program, functions = derivation.program, functions_of(derivation.c)
+    program, functions = derivation.program, derivation.functions
     stages = Discretisation(system, method).paper
     derived = component_equations(system, method, stages)
     yield system_section(system)
@@ -319,7 +318,7 @@ def operations_section(program: Any) -> Section:
     return Section(name="operations", title="Operation counts", contents=contents)
 
 
-def kernels_section(system: MechanicalSystem, program: Any, functions: Mapping[str, Function]) -> Section:
+def kernels_section(system: MechanicalSystem, program: Any, functions: Mapping[str, Any]) -> Section:
     """Return the section with one pair per kernel: formulas at the left, C at the right."""
     names = _names(system)
     pairs = tuple(_pair(program, kernel, functions, names) for kernel in kernels_of(program))
@@ -340,13 +339,13 @@ def _names(system: MechanicalSystem) -> dict[Symbol, Symbol]:
     }
 
 
-def kernel_text(functions: Mapping[str, Function], name: str) -> str:
+def kernel_text(functions: Mapping[str, Any], name: str) -> str:
     """Return the C of a kernel; a large one is divided into parts, which it calls in order."""
     parts = takewhile(functions.__contains__, (f"{name}_{k}" for k in count(1)))
     return "\n".join(functions[part].text for part in (*parts, name))
 
 
-def _pair(program: Any, kernel: Any, functions: Mapping[str, Function], names: Mapping[Symbol, Symbol]) -> SideBySide:
+def _pair(program: Any, kernel: Any, functions: Mapping[str, Any], names: Mapping[Symbol, Symbol]) -> SideBySide:
     function = functions[kernel.name]
     values, partials = (
         [
@@ -376,9 +375,7 @@ h, q, p, v0, g = (Symbol(name) for name in ("h", "q_k", "p_k", "v_0", "g"))
 inverse_mass = Symbol("M__-1")
 
 
-def functions_section(
-    system: MechanicalSystem, method: Method, program: Any, functions: Mapping[str, Function]
-) -> Section:
+def functions_section(system: MechanicalSystem, method: Method, program: Any, functions: Mapping[str, Any]) -> Section:
     """Return the section on functions, from the loop over the steps down: formulas or words left, C right."""
     stages = Discretisation(system, method).equations
     kernels = {kernel.name for kernel in kernels_of(program)}
@@ -396,7 +393,17 @@ def functions_section(
     return Section(name="functions", title="The step: what the C does", contents=(Paragraph(text), *pairs))
 
 
-def _function_pair(function: Function, start: str, all_formulas: Iterator[Content]) -> SideBySide:
+def reached(functions: Mapping[str, Any], start: str) -> Iterator[Any]:
+    """Yield ``start`` and the functions that it calls, directly or not, each once, callers first."""
+    done, pending = set[str](), [start]
+    while pending:
+        if (name := pending.pop()) not in done:
+            done.add(name)
+            pending.extend(reversed(functions[name].calls))
+            yield functions[name]
+
+
+def _function_pair(function: Any, start: str, all_formulas: Iterator[Content]) -> SideBySide:
     words = function.comment or "The loop over the steps, with compensated sums."
     return SideBySide(
         title=f"{function.name}({', '.join(function.arguments)})",
