@@ -12,7 +12,6 @@ from commands import invoke, json_of
 from scipy.special import ellipk
 
 import scvi_codegen as sc
-from scvi_codegen.extras import verification
 from scvi_codegen.interfaces.cli import command_group, main
 from scvi_codegen.interfaces.models.model_files.model_file import dump_model, parse_model
 
@@ -170,7 +169,7 @@ def test_adaptive_steps_are_verified_at_the_tolerance_of_the_model(run, toleranc
         seen.append(arguments["tolerance"])
         raise sc.StateError("seen")
 
-    monkeypatch.setattr(verification, "verify", verify)
+    monkeypatch.setattr("scvi_codegen.extras.verification.command.measured", verify)
     Path("model.toml").write_text(f"[system]\ncatalogue = 'kepler'\n[method]\nmethod = 'svi:4'\n[run]\n{run}\n")
     invoke("verify", "model.toml", status=2)
     assert seen == [tolerance]

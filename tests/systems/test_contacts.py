@@ -17,7 +17,6 @@ from scipy.optimize import brentq
 import scvi_codegen as sc
 from scvi_codegen.extras.derivation.page.document import derivation_html
 from scvi_codegen.methods.discretise import discretise
-from scvi_codegen.methods.stage_system import straight
 from scvi_codegen.systems.constraints.kind import Reaction
 from scvi_codegen.systems.contacts.modes import in_all_modes
 from scvi_codegen.systems.formulas.symbols import symbol
@@ -343,7 +342,7 @@ def test_guesses_of_more_constraints_than_coordinates() -> None:
     contacts = [sc.contact("y", where=where, **cast("Any", slides)) for where in floors]
     system = in_all_modes(sc.LagrangianSystem.from_text("s", ["x", "y"], "(x_dot**2 + y_dot**2)/2", contacts=contacts))
     stages = discretise(system, sc.SVI(2, "gauss-lobatto:3"))
-    assert [len(part) for part in straight(stages, *np.ones((3, 2)), 0.1)] == [*stages.block_sizes(2)]
+    assert [len(part) for part in stages.straight(*np.ones((3, 2)), 0.1)] == [*stages.block_sizes(2)]
 
 
 SHAKEN = "0.2*t*cos(5*t)", "0.3*t*sin(5*t)"

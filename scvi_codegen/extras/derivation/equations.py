@@ -43,7 +43,6 @@ from scvi_codegen.extras.derivation.notation import (
     text_lines,
 )
 from scvi_codegen.methods import as_method
-from scvi_codegen.methods.stage_system import Table
 from scvi_codegen.systems.first_order import FirstOrderSystem
 from scvi_codegen.systems.symmetry.symmetry import Symmetry, symmetries
 
@@ -335,7 +334,7 @@ class _Writer:
             replaced |= dict(zip(gather.arguments, values, strict=True))
         return replaced
 
-    def _gathered(self, table: Table, n: int, *, power: int, scale: sympy.Rational) -> tuple[sympy.Expr, ...]:
+    def _gathered(self, table: Any, n: int, *, power: int, scale: sympy.Rational) -> tuple[sympy.Expr, ...]:
         columns: list[tuple[Any, tuple[sympy.Symbol, ...]]] = [(None, self.q)]
         columns += list(zip(self.stages.blocks, self.unknowns, strict=True))
         sums: list[list[sympy.Expr]] = []
@@ -349,7 +348,7 @@ class _Writer:
                 sums[i].append(factor * symbol)
         return tuple(sympy.Add(*terms) for terms in sums)
 
-    def _entry(self, table: Table, n: int, b: int) -> sympy.Expr:
+    def _entry(self, table: Any, n: int, b: int) -> sympy.Expr:
         name, value = table.names[n][b], table.entries[n][b]
         if name is None:
             return self._named(None, value)

@@ -26,7 +26,6 @@ from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.extras.fields.axes import Axis, Cells, fixed_place, rational, same, span
 from scvi_codegen.extras.fields.density import Density, place_text
 from scvi_codegen.extras.fields.mesh import Mesh, MeshSystem
-from scvi_codegen.systems.arrays.system import friction
 
 Slot: TypeAlias = Any
 """Number of a point within a cell, or in the general term of a sum its index as text."""
@@ -75,7 +74,7 @@ class Assembly:
         if system.dissipation != 0:
             damped = self.over_points(system.dissipation, lambda part: [self.at_points(part, system.rates)])
             velocities = {Array(coordinate.name + DOT, coordinate.axes): coordinate for coordinate in coordinates}
-            forces += friction(self.terms([damped]), velocities)
+            forces += ArraySystem.rayleigh(self.terms([damped]), velocities)
             texts["dissipation"] = text_of(damped)
         terms = self.terms(summed)
         tables = self.tables()

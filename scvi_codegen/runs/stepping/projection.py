@@ -337,7 +337,7 @@ def rank_deficiency(names: Sequence[str], q: Array, at: Jacobian, *, nearest: bo
     rows = np.flatnonzero(np.abs(free.conditions).max(axis=1, initial=0.0) > NAMED_SHARE)
     if not len(rows):
         return None
-    listed = " and ".join(f"'{names[k]}'" for k in rows) if len(rows) < 5 else f"{len(rows)} of them"
+    listed = " and ".join(f"'{names[int(k)]}'" for k in rows) if len(rows) < 5 else f"{len(rows)} of them"
     rests = ", ".join(f"{g[k]:.3g}" for k in rows[:4])
     if nearest and np.abs(g).max() > CONTRADICTED * max(float(np.abs(q).max()), 1e-300):
         return (

@@ -675,6 +675,11 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
         return term_of(loops, formula, accesses)
 
     @staticmethod
+    def rayleigh(terms: Sequence[ArrayTerm], coordinates: Mapping[Array, Array]) -> tuple[ArrayForce, ...]:
+        """Return the forces -dD/dv of Rayleigh's dissipation function; ``coordinates``: by the arrays of velocities."""
+        return friction(terms, coordinates)
+
+    @staticmethod
     def elements(loops: Sequence[Loop], sizes: Mapping[str, int], tables: Mapping[str, Any]) -> Elements:
         """Return all index values of loops, and the values of formulas there, in NumPy."""
         return Elements(loops, sizes, tables)

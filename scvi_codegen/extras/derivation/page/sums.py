@@ -21,7 +21,6 @@ from scvi_codegen.api.methods import StageSystem
 from scvi_codegen.api.program import Derivation
 from scvi_codegen.api.systems import MechanicalSystem, forms_of
 from scvi_codegen.extras.derivation.writing import Formula
-from scvi_codegen.methods.stage_system import Table
 
 ARGUMENTS = {"v": "q_dot", "a": "q_ddot", "j": "q_d3", "s": "q_d4"}
 """Time derivatives of the curve as they are typeset."""
@@ -128,7 +127,7 @@ class Column:
         return self.factor * Symbol("_".join([self.of, *indices]))
 
 
-def column_of(table: Table, number: int) -> Column:
+def column_of(table: Any, number: int) -> Column:
     """Return one column of a table."""
     names = [line[number] for line in table.names]
     values = [line[number] for line in table.entries]
@@ -193,7 +192,7 @@ def end_formulas(system: MechanicalSystem, stages: StageSystem) -> tuple[Formula
     )
 
 
-def gathered(table: Table, blocks: Sequence[Any]) -> sympy.Expr:
+def gathered(table: Any, blocks: Sequence[Any]) -> sympy.Expr:
     """Return one line of a table times q_k and the unknowns, as sums over unknowns of one kind."""
     columns = [column_of(table, c) for c in range(len(blocks) + 1)]
     first = columns[0]
