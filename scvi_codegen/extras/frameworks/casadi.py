@@ -28,7 +28,6 @@ from scvi_codegen.common.errors import ArgumentError, MethodError, StateError, i
 from scvi_codegen.extras.frameworks.flow import Flow
 from scvi_codegen.extras.frameworks.sources import casadi_name, with_casadi_flow
 from scvi_codegen.methods import as_method
-from scvi_codegen.methods.stage_system import Table
 from scvi_codegen.runs.stepper import Stepper
 
 FLOW_ARGUMENTS = ("q", "p", "parameters", "t", "h")
@@ -311,7 +310,7 @@ class _StageExpressions:
         parts = [self._gathered(g.table, n, power=g.power, scale=float(g.scale)) for g in group.gathers]
         return list(self.ca.vertsplit(self.ca.vertcat(*parts)))
 
-    def _gathered(self, table: Table, n: int, *, power: int, scale: float) -> Any:
+    def _gathered(self, table: Any, n: int, *, power: int, scale: float) -> Any:
         """Return the product of a row of a table with q and the stages."""
         terms = [
             scale * float(entry) * self.h ** (power + shift) * values
