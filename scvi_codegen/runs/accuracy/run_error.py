@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.codegen.variants import Derivatives
-from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError, StepFailedError
+from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError
 from scvi_codegen.common.thread_pool import run_jobs
 from scvi_codegen.runs.accuracy.size import (
     RESOLVED,
@@ -428,11 +428,8 @@ class _Replay:
         t, end = map(float, self.run.t[row - 1 : row + 1])
         start, parameters = states[row - 1] - errors[:, row - 1], parameters_set_until(self.run, t)
         try:
-            if self.resolved[row]:
-                moved = self._ends(np.array([t]), steps_after(self.run, row - 1, row), start[None], parameters)[0]
-            else:
-                run = self.finer._run(*np.split(start, 2), plan=Adaptive(end), t=t, parameters=parameters)
-                moved = self._state(run._recorded(None, ALL_STATES), -1)
+            run = self.finer._run(*np.split(start, 2), plan=Adaptive(end), t=t, parameters=parameters)
+            moved = self._state(run._recorded(None, ALL_STATES), -1)
         except ScviCodegenError:
             return False
         apart = np.abs(states[row] - moved - errors[:, row])
@@ -468,9 +465,8 @@ class _Replay:
         t, h = np.ascontiguousarray(piece.t[begin:end]), np.ascontiguousarray(steps_after(piece, begin, end))
         q, p = (np.ascontiguousarray(np.asarray(column)[begin : end + 1]) for column in (piece.q, piece.p))
         starts, parameters = Starts(t, h, q, p), parameters_on_sides(piece, float(piece.t[begin]))
-        parts = [starts.part(k, k + MOST_STEPS) for k in range(0, len(h), MOST_STEPS)]
-        for k, (part, defects) in enumerate(zip(parts, self._defects(parts, parameters), strict=True)):
-            resolved, row = self._resolved(part, defects, parameters), begin + k * MOST_STEPS
+        for k, (part, defects) in enumerate(self._defects(starts, parameters)):
+            resolved, row = defects.parts > 0, begin + k * MOST_STEPS
             for start, stop in _alike(resolved):
                 if resolved[start]:
                     rows = slice(first + row + start + 1, first + row + stop + 1)
@@ -482,50 +478,22 @@ class _Replay:
                     self._by_run(piece, float(piece.t[j]), piece.q[j], piece.p[j], j + 1, steps=1.0)
                     self._store(first + j + 1)
 
-    def _defects(self, parts: list[Starts], parameters: Array) -> list[Any]:
-        """Return the defects of steps, or the error of one that fails; small are those of :data:`CONVERGED`."""
-        defects = list[Any]([None] * len(parts))
+    def _defects(self, starts: Starts, parameters: Array) -> list[tuple[Starts, Defects]]:
+        """Return parts of the steps and their defects, which threads share.
+
+        Steps are resolved where the error of the finer method's step is a tenth of the defect, or of rounding.
+        """
+        parts = [starts.part(k, k + MOST_STEPS) for k in range(0, len(starts.h), MOST_STEPS)]
+        limits, defects = np.array([CONVERGED, LOST, RESOLVED * self.u]), dict[int, Defects]()
 
         def find(k: int, _: object = None) -> None:
-            try:
-                defects[k] = self.finer._defects(parts[k], parameters, self.size, CONVERGED)
-            except ScviCodegenError as failure:
-                defects[k] = failure
+            defects[k] = self.finer._defects(parts[k], parameters, self.size, limits)
 
         if len(parts) == 1:
             find(0)
         else:
             run_jobs(len(parts), find, progress=None, threads=None)
-        return defects
-
-    def _resolved(self, starts: Starts, defects: Any, parameters: Array) -> NDArray[np.bool_]:
-        """Return (n,) whether errors of the finer method's steps are a tenth of their defects, or of rounding.
-
-        They are where a defect is small beside the change of momenta, the motion by forces. Of other steps the errors
-        are the differences from two steps of half the size (E. Hairer, S. P. Norsett, G. Wanner, Solving ODEs I, II.4).
-        """
-        if isinstance(defects, ScviCodegenError):
-            return np.zeros(len(starts.h), bool)
-        resolved = defects.small != 0
-        if resolved.all():
-            return np.asarray(resolved)
-        doubtful = np.flatnonzero(~resolved)
-        t, h = starts.t[doubtful], starts.h[doubtful] / 2.0
-        begin, end = (np.concatenate([starts.q[k], starts.p[k]], axis=1) for k in (doubtful, doubtful + 1))
-        try:
-            halves = self._ends(t + h, h, self._ends(t, h, begin, parameters), parameters)
-        except StepFailedError:
-            return np.asarray(resolved)
-        rounding = RESOLVED * self.u * (np.abs(begin) + np.abs(end - begin))
-        apart = np.maximum(np.abs(end - defects.misfits[doubtful] - halves) - rounding, 0.0)
-        resolved[doubtful] = lengths(apart, self.size) <= LOST * lengths(end - halves, self.size)
-        return np.asarray(resolved)
-
-    def _ends(self, t: Array, h: Array, states: Array, parameters: Array) -> Array:
-        """Return the (n, 2m) ends of steps of the finer method from n states, up to rounding."""
-        rows = np.concatenate([states, states[-1:]])
-        q, p = (np.ascontiguousarray(part) for part in np.split(rows, 2, axis=1))
-        return np.asarray(rows[1:] - self.finer._defects(Starts(t, h, q, p), parameters, self.size, CONVERGED).misfits)
+        return [(part, defects[k]) for k, part in enumerate(parts)]
 
     def _transport(
         self, starts: Starts, defects: Defects, results: Array, parameters: Array, steps: float = 1.0
@@ -553,17 +521,20 @@ class _Replay:
         plan, parameters = ending_at(Adaptive(stop), stop), parameters_set_until(piece, t)
         run = self.finer._run(np.asarray(q), np.asarray(p), plan=plan, t=t, parameters=parameters)
         fine = run._recorded(None, ALL_STATES)
-        if len(times_of_changes(fine)) or (fine.modes is not None and len(fine.modes.t)):
+        parts = list[tuple[Starts, Defects]]()
+        if not (len(times_of_changes(fine)) or (fine.modes is not None and len(fine.modes.t))):
+            h, sides = steps_after(fine, 0, len(fine) - 1), parameters_on_sides(fine, t)
+            times, h, x, y = (np.ascontiguousarray(of) for of in (fine.t, h, fine.q, fine.p))
+            parts = self._defects(Starts(times, h, x, y), sides)  # of rounding, as states have no low words
+        if parts and all(defects.parts.all() for _, defects in parts):
+            for part, defects in parts:
+                results = np.empty((2, 2 * self.m, len(part.h)))  # of the states in between
+                self._transport(part, defects, results, sides, steps / len(h))
+        else:
             self.now = np.ascontiguousarray(fine.tangent(self.now.T)[-1].T)
             self.calls += 1
             normal = np.random.default_rng(self.calls).standard_normal((SAMPLES, 2 * self.m))
             self.now[1:] += math.sqrt(steps) * self.u * normal * np.abs(self._state(piece, end))
-        else:
-            times, h, x, y = (np.ascontiguousarray(of) for of in (fine.t, np.diff(fine.t), fine.q, fine.p))
-            starts, sides = Starts(times, h, x, y), parameters_on_sides(fine, t)
-            results = np.empty((2, 2 * self.m, len(h)))  # of the states in between
-            defects = self.finer._defects(starts, sides, self.size, CONVERGED)  # as states have no low words
-            self._transport(starts, defects, results, sides, steps / len(h))
         self.now[0] += self._state(piece, end) - self._state(fine, -1)
 
     @staticmethod
