@@ -305,6 +305,9 @@ def _symplectic_error(monodromy: Array) -> float:
     return float(np.abs(defect).max() / max(1.0, np.linalg.norm(monodromy, 2) ** 2))
 
 
+CONTRACTION = 0.25
+"""Largest ratio of successive residuals of the simplified Newton iteration that converges (P. Deuflhard, Newton Methods
+for Nonlinear Problems, 2004, 2.1.2)."""
 CIRCLE = 32
 """Number of points of a circle at which singular values are computed: they change slowly along it."""
 MOST_ITERATIONS, MOST_HALVINGS = 50, 12
@@ -1039,7 +1042,7 @@ class OrbitSearch:
                 moved = self.moved(z, -errors)
                 remainder = closing(self._exact_end(moved)[1], moved)
                 left = float(np.linalg.norm(remainder / size))
-                if not left <= LOST * length + rounding:
+                if not left <= CONTRACTION * length + rounding:
                     raise StateError(
                         f"the closing error is not linear in the errors of the orbit: without them {left:.1e} of "
                         f"{length:.1e} is left. Take more steps, or adaptive steps (omit steps and h)"

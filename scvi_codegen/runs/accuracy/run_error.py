@@ -59,7 +59,7 @@ Along the direction that grows all are multiples of one vector by normal numbers
 mean square of k is Student's t with k degrees of freedom, above 6 in 0.9 % for k = 3, above 4 in 16 % for k = 1.
 """
 ROUNDINGS = 1024.0
-"""Errors of coordinates that constraints determine below so many roundings are those of rounding."""
+"""Errors of coordinates that constraints determine, and differences, below so many roundings are those of rounding."""
 MOST_STEPS = 8192
 """Number of steps of one call of C, several times as long as the start of the threads that share such calls."""
 LEFT = 1e-6
@@ -73,8 +73,6 @@ CONVERGED = 1e-4
 Errors of orders r and R of one motion are d and about d^(R/r): a tenth of the defect where d is 10^(-r / (R - r)), and
 R - r is a quarter of r or more (``finer_method``).
 """
-AT_EVENT = 64.0
-"""Distance of a time from that of an event, in roundings of the largest time, within which a state is that of it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -188,8 +186,8 @@ class WithErrors:
     def error(self: Any) -> RunError:
         """Global errors of states since :attr:`initial`, with their signs (:class:`RunError`), made at first access.
 
-        One step of a finer method and products with the Jacobian of the step for each step, about seven times the cost
-        of the run and 0.4 ms, more where Newton's method solves it; a finer method is compiled once.
+        One step of a finer method and products with the Jacobian of the step for each step, about six times the cost
+        of the run and 0.3 ms, more with constraints; a finer method is compiled once.
         docs/steps.md lists which runs have signs, which are compared with a finer run, and which are refused.
 
         Raises:
@@ -558,7 +556,7 @@ def _rows_between(states: Any, special: Array) -> NDArray[np.intp]:
     """Return the rows of the first state and of those at none of the times ``special``."""
     t, kept = np.asarray(states.t), np.ones(len(states), bool)
     if len(special):
-        near = AT_EVENT * np.finfo(float).eps * max(np.abs(t).max(), np.abs(special).max())
+        near = 2.0 * RESOLVED * roundoff(1) * max(np.abs(t).max(), np.abs(special).max())
         order = np.sort(special)
         after = np.minimum(np.searchsorted(order, t), len(order) - 1)
         apart = np.minimum(np.abs(order[after] - t), np.abs(order[np.maximum(after - 1, 0)] - t))
