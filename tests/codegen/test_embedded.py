@@ -220,9 +220,9 @@ def test_literals_read_back_as_the_nearest_double(value):
 
 def test_residual_zeros_in_tables_become_zero_and_model_numbers_are_rejected():
     assert SINGLE.number(1.7e-63) == "0.0f"
-    for value in (1e-39, 1e39, -1e300):
-        with pytest.raises(sc.MethodError, match="outside the range of single precision"):
-            SINGLE.check([1.0, value])
+    for value, remedy in ((1e-39, "units, write 0 for it"), (1e39, "units, or 'double'"), (-1e300, "")):
+        with pytest.raises(sc.MethodError, match=f"the initial q = .*outside the range of single precision.*{remedy}"):
+            SINGLE.check([1.0, value], ["t =", "the initial q ="])
 
 
 @pytest.mark.parametrize("number", ["1e-45", "1e40"])

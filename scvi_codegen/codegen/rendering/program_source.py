@@ -619,7 +619,9 @@ def render_events(search: EventSearch) -> Source:
 def render_example(interface: Interface, start: ExampleRun, precision: Embedded = "double") -> dict[str, str]:
     """Return ``main.c`` and ``Makefile`` that run the integrator with nothing but a C compiler."""
     target = TARGETS[precision]
-    target.check((*start.q, *start.p, *start.parameters, start.t, start.h or start.span))
+    names = (*interface.coordinates, *interface.momenta)
+    target.check((*start.q, *start.p), [f"the initial {name} =" for name in names])
+    target.check((*start.parameters, start.t, start.h or start.span))
     for of_input in start.inputs:
         target.check((*of_input.breakpoints, *chain(*of_input.coefficients)))
     context = {

@@ -565,9 +565,9 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
   forces(&w);
   measure_points(&w, options);
   for (int k = 0; needs_iteration(&now); k++) {
-    const number measured = number_of(w.former != NULL) * measures_stiffness(&now, k);
+    const number measured = measures_stiffness(&now, k);
     number change;
-    measures = any_positive(measured);
+    measures = w.former && any_positive(measured);
     if (measures)
       keep_iterate(&w);
     change = implicit ? correct_points(&w) : improve(&w);

@@ -300,7 +300,7 @@ static void cone_gather(cone_problem *in, const int *member, cone_block *of, rea
 /* Modes of the contacts of a block by the rates with its solution, whose friction has the direction -z_t. */
 static void cone_modes(cone_problem *in, const cone_block *of, const real *x)
 {
-  real z[CONTACT_ROWS];
+  real z[CONTACT_ROWS] = {0.0};
   const real small = CONTACT_ROUNDING * fmax(1.0, largest_magnitude(x, of->count));
   cone_unprojected(of, x, z);
   for (int k = 0; k < of->parts; k++) {

@@ -33,7 +33,7 @@ static int impulses_of(const contact_terms *of, const int *takes_part, const int
   memcpy(in.f, impulse, sizeof in.f);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     in.takes_part[k] = takes_part[k];
-    if (elastic && elastic[k])
+    if (elastic && elastic[k] && CONTACTS[k].normal >= 0)
       in.b[CONTACTS[k].normal] *= 1.0 + of->coefficient[3 * k + 2];
   }
   const int solved = solve_cone(&in);
@@ -101,9 +101,11 @@ static int find_impulses(const event_step *step, const contact_terms *of, const 
     int meets[EVENT_CONTACTS], may_act[EVENT_CONTACTS], acted[EVENT_CONTACTS] = {0}, first = -1;
     for (int r = 0; r < CONTACT_ROWS; r++)
       rate[r] = rate_after(of, of->rate, total, r);
-    for (int k = EVENT_CONTACTS - 1; k >= 0; k--)
-      if (approaches[k] && rate[CONTACTS[k].normal] < -CONTACT_ROUNDING * of->speed[CONTACTS[k].normal])
+    for (int k = EVENT_CONTACTS - 1; k >= 0; k--) {
+      const int normal = CONTACTS[k].normal;
+      if (approaches[k] && normal >= 0 && rate[normal] < -CONTACT_ROUNDING * of->speed[normal])
         first = k;
+    }
     if (first < 0)
       return OK;
     for (int k = 0; k < EVENT_CONTACTS; k++) {
@@ -135,6 +137,8 @@ static int find_impulses(const event_step *step, const contact_terms *of, const 
 static int is_low(const event_step *step, const contact_terms *of, const real *force, real residual, int k)
 {
   const int row = CONTACTS[k].normal;
+  if (row < 0)
+    return 0; /* friction alone has no gap */
   const real second = fmin(of->second[row], rate_after(of, of->second, force, row));
   real lowest = CONTACT_LOWEST * of->rounding[row] + CONTACT_RESIDUALS * residual;
   for (int i = 0; i < TRANSITIONS && of->drift[row] > CONTACT_ROUNDING * of->speed[row]; i++)
@@ -241,11 +245,13 @@ static int jump(const event_step *step, event_sample *at, contact_terms *of, con
   if (!solve_cone(&in) || !impulses_of(of, closed, NULL, of->rate, in.f) ||
       energy_of(of, of->rate, in.f, &size) > CONTACT_GAIN * size)
     return 0;
-  for (int k = 0; k < EVENT_CONTACTS; k++)
-    if (closed[k] && CONTACTS[k].slips > 0 && in.f[CONTACTS[k].normal] > largest) {
-      largest = in.f[CONTACTS[k].normal];
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int normal = CONTACTS[k].normal;
+    if (closed[k] && normal >= 0 && CONTACTS[k].slips > 0 && in.f[normal] > largest) {
+      largest = in.f[normal];
       first = k;
     }
+  }
   if (first < 0 || collide(step, at, of, closed, in.f, now) != OK)
     return 0;
   if (!step->watch->jumps) {

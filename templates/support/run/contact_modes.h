@@ -331,8 +331,8 @@ static int choose_modes(const event_step *step, const contact_terms *of, const c
     int sticks = 0;
     for (int i = 0; i < CONTACTS[k].slips && best[k].sticks; i++)
       sticks |= imposed[slip + i] << i;
-    if (!best[k].closed && second[normal] > rounding_at_row(of, second, normal)) /* leaves, as straight legs bend */
-      best[k].held = 0;
+    if (!best[k].closed && normal >= 0 && second[normal] > rounding_at_row(of, second, normal))
+      best[k].held = 0; /* leaves, as straight legs bend */
     if (best[k].closed && normal >= 0 && !imposed[normal])
       best[k].held |= CONTACT_LOADED;
     if (best[k].sticks && sticks != (1 << CONTACTS[k].slips) - 1)

@@ -80,12 +80,27 @@ static contact_mode mode_of(const real *mode, int k)
   return now;
 }
 
-/* Sets the parameters of a mode. In the plane the direction of slip is one, d. In space it is that of (ahead.w) w +
- * start: smooth where w vanishes and slip stops, beyond which ahead.w < 0, with the direction `ahead` at an earlier
- * step; the second term keeps the direction of slow slips. */
-static void put_mode(const contact_places *at, contact_mode mode, const real *w, real speed, real *modes)
+#ifdef CONTACTS_IN_SPACE
+/* The direction of slip in space is that of (ahead.w) w + start: smooth where w vanishes and slip stops, beyond which
+ * ahead.w < 0, with the direction `ahead` at an earlier step; the second term keeps the direction of slow slips. */
+static void put_ahead(contact_mode mode, const real *w, real speed, real *slides)
 {
   const int held = mode.held & CONTACT_HELD, slips = mode.closed && !mode.sticks && !(mode.held & CONTACT_STUCK);
+  const real size = length_of(mode.direction, 2), fast = pow(CONTACT_FAST * speed, 2.0);
+  const real slow = length_of(w, 2) > CONTACT_SLOW * speed ? 0.0 : fast;
+  slides[0] = held ? size : slips;
+  for (int i = 0; i < 2; i++) {
+    slides[1 + i] = (held && size > 0.0 ? fast / size : slow) * mode.direction[i];
+    slides[3 + i] = held ? 0.0 : mode.direction[i];
+  }
+}
+#else
+#define put_ahead(mode, w, speed, slides) (void)(w), (void)(speed)
+#endif
+
+/* Sets the parameters of a mode with rates of slip w; in the plane the direction of slip is one, d. */
+static void put_mode(const contact_places *at, contact_mode mode, const real *w, real speed, real *modes)
+{
   real *const slides = modes + at->direction;
   if (at->closed >= 0)
     modes[at->closed] = mode.closed && !(mode.held & CONTACT_LOADED);
@@ -94,13 +109,8 @@ static void put_mode(const contact_places *at, contact_mode mode, const real *w,
     modes[at->sticks + i] = mode.sticks >> i & 1;
   if (at->slips == 1)
     slides[0] = mode.direction[0];
-  for (int i = 0; at->slips == 2 && i < 2; i++) {
-    const real size = length_of(mode.direction, 2), fast = pow(CONTACT_FAST * speed, 2.0);
-    const real slow = length_of(w, 2) > CONTACT_SLOW * speed ? 0.0 : fast;
-    slides[0] = held ? size : slips;
-    slides[1 + i] = (held && size > 0.0 ? fast / size : slow) * mode.direction[i];
-    slides[3 + i] = held ? 0.0 : mode.direction[i];
-  }
+  else if (at->slips == 2)
+    put_ahead(mode, w, speed, slides);
 }
 
 /* Size of the terms of a row by positions. Of a rotation or a direction, on whose length it does not depend, that is

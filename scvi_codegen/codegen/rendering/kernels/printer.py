@@ -6,6 +6,7 @@ take them. The support headers use the header of its name.
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import repeat
 from typing import TypeAlias
 
 from scvi_codegen.codegen.ir.equations import FixedPointIteration
@@ -73,13 +74,14 @@ class Target:
         text = f"{nearest:.{self.digits}g}"
         return f"{text}{self.suffix}" if "." in text or "e" in text else f"{text}.0{self.suffix}"
 
-    def check(self, values: Iterable[Number]) -> None:
+    def check(self, values: Iterable[Number], names: Iterable[str] = repeat("the number")) -> None:
         """Raise :class:`MethodError` for numbers of a model outside the range of the target."""
-        for value in values:
+        for value, name in zip(values, names, strict=False):
             if value != 0.0 and not self.smallest <= abs(value) <= self.largest:
+                zero = ", write 0 for it if it is negligible" if abs(value) < self.smallest else ""
                 raise MethodError(
-                    f"the number {float(value)!r} is outside the range of {self.name} precision: choose "
-                    "other units, or 'double'"
+                    f"{name} {float(value)!r} is outside the range of {self.name} precision: choose "
+                    f"other units{zero}, or 'double'"
                 )
 
 
