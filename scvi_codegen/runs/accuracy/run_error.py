@@ -554,7 +554,7 @@ class _Replay:
         run = self.finer._run(np.asarray(q), np.asarray(p), plan=plan, t=t, parameters=parameters)
         fine = run._recorded(None, ALL_STATES)
         if len(times_of_changes(fine)) or (fine.modes is not None and len(fine.modes.t)):
-            self.now = fine.tangent(self.now.T)[-1].T
+            self.now = np.ascontiguousarray(fine.tangent(self.now.T)[-1].T)
             self.calls += 1
             normal = np.random.default_rng(self.calls).standard_normal((SAMPLES, 2 * self.m))
             self.now[1:] += math.sqrt(steps) * self.u * normal * np.abs(self._state(piece, end))
