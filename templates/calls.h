@@ -159,23 +159,53 @@ int NAME(call_integrate)(NAME(call) *c, long long steps, long long every)
   return 0;
 }
 
+#ifdef HAS_DEFECTS
+/* Takes `parts` equal steps h from the state after a vector v times a factor, whose low words are in compensation
+ * terms. */
+static int NAME(call_step)(NAME(call) *c, double t, double h, long long parts, const double *q, const double *p,
+    const double *v, double factor)
+{
+  __typeof__(NAME(advance)) *volatile fixed = NAME(advance);
+  NAME(run) *run = c->run;
+  run->t = t, run->t_low = 0.0, run->h = h;
+  for (int i = 0; i < M; i++) {
+    const double dq = v ? factor * v[i] : 0.0, dp = v ? factor * v[M + i] : 0.0;
+    run->q[i] = q[i] + dq, run->carry_q[i] = fabs(dq) > fabs(q[i]) ? (dq - run->q[i]) + q[i] : (q[i] - run->q[i]) + dq;
+    run->p[i] = p[i] + dp, run->carry_p[i] = fabs(dp) > fabs(p[i]) ? (dp - run->p[i]) + p[i] : (p[i] - run->p[i]) + dp;
+  }
+  return fixed(run, parts, parts, c->parameters, c->options, NULL, NULL, NULL, NULL, c->report, c->workspace);
+}
+
+#endif
+
 /* Takes `pieces` equal steps h from each of `count` states q, p at times t; their ends are q1, p1. */
 int NAME(call_pieces)(NAME(call) *c, long long count, const double *t, const double *h, const long long *pieces,
     const double *q, const double *p, double *q1, double *p1)
 {
-  __typeof__(NAME(advance)) *volatile fixed = NAME(advance);
-  double end[2];
-  int status = 0, iterations;
+  int status = 0;
   for (long long k = 0; k < count && !status; k++) {
     const long long row = k * c->coordinates;
+#ifdef HAS_DEFECTS
+    if (k == 0)
+      NAME(start)(c->run, t[0], h[0], q, p);
+    status = NAME(call_step)(c, t[k], h[k], pieces[k], q + row, p + row, NULL, 0.0);
+    for (int i = 0; i < M; i++)
+      q1[row + i] = c->run->q[i], p1[row + i] = c->run->p[i];
+#else
+    __typeof__(NAME(advance)) *volatile fixed = NAME(advance);
+    double end[2];
+    int iterations;
     NAME(start)(c->run, t[k], h[k], q + row, p + row);
     status = fixed(c->run, pieces[k], pieces[k], c->parameters, c->options, end, q1 + row, p1 + row, &iterations,
         c->report, c->workspace);
+#endif
   }
   return status;
 }
 
 #ifdef HAS_DEFECTS
+#define MOST_PARTS 16 /* of a step, which take as long as its solution by Newton's method */
+
 /* Length of a vector in units of sizes; infinite where a component other than 0 has the size 0. */
 static double NAME(relative_length)(int count, const double *x, const double *size)
 {
@@ -183,24 +213,6 @@ static double NAME(relative_length)(int count, const double *x, const double *si
   for (int i = 0; i < count; i++)
     sum += x[i] == 0.0 ? 0.0 : x[i] / size[i] * (x[i] / size[i]);
   return sqrt(sum);
-}
-
-#define MOST_PARTS 16 /* of a step, which take as long as its solution by Newton's method */
-
-/* Takes a step in `parts` equal ones from the state after a vector v times a factor, whose low words are in compensation
- * terms. */
-static int NAME(call_step)(NAME(call) *c, double t, double h, int parts, const double *q, const double *p,
-    const double *v, double factor)
-{
-  __typeof__(NAME(advance)) *volatile fixed = NAME(advance);
-  NAME(run) *run = c->run;
-  run->t = t, run->t_low = 0.0, run->h = h / parts;
-  for (int i = 0; i < M; i++) {
-    const double dq = v ? factor * v[i] : 0.0, dp = v ? factor * v[M + i] : 0.0;
-    run->q[i] = q[i] + dq, run->carry_q[i] = fabs(dq) > fabs(q[i]) ? (dq - run->q[i]) + q[i] : (q[i] - run->q[i]) + dq;
-    run->p[i] = p[i] + dp, run->carry_p[i] = fabs(dp) > fabs(p[i]) ? (dp - run->p[i]) + p[i] : (p[i] - run->p[i]) + dp;
-  }
-  return fixed(run, parts, parts, c->parameters, c->options, NULL, NULL, NULL, NULL, c->report, c->workspace);
 }
 
 /* Defects x[k + 1] - phi(x[k]) of `count` + 1 states x = (q, p) of another run at times t, by one step phi of size h
@@ -215,7 +227,7 @@ int NAME(call_defects)(NAME(call) *c, long long count, const double *t, const do
   for (long long k = 0; k < count && !status; k++, q += M, p += M, defects += 2 * M) {
     double impulse[M];
     last = *run;
-    while ((status = NAME(call_step)(c, t[k], h[k], present, q, p, NULL, 0.0)), present < MOST_PARTS &&
+    while ((status = NAME(call_step)(c, t[k], h[k] / present, present, q, p, NULL, 0.0)), present < MOST_PARTS &&
         (status || c->report->fallback_steps))
       present *= 2, *run = last;
     parts[k] = present;
@@ -252,7 +264,7 @@ int NAME(call_differences)(NAME(call) *c, long long count, const double *t, cons
         continue;
       const double factor = sqrt(DBL_EPSILON) / largest;
       *run = last;
-      status = NAME(call_step)(c, t[k], h[k], parts[k], q, p, v, factor);
+      status = NAME(call_step)(c, t[k], h[k] / parts[k], parts[k], q, p, v, factor);
       for (int i = 0; i < M; i++) {
         v[i] = (((run->q[i] - q[M + i]) + run->carry_q[i]) + defect[i]) / factor;
         v[M + i] = (((run->p[i] - p[M + i]) + run->carry_p[i]) + defect[M + i]) / factor;

@@ -15,7 +15,7 @@ from strict_c import STRICT, run
 from scvi_codegen import SVI, LagrangianSystem, compile_stepper, generate_source
 from scvi_codegen.codegen.native.compilers import find_compiler
 from scvi_codegen.codegen.pipeline import ArraySources, c_identifier
-from scvi_codegen.codegen.rendering.c_text import names_of_file
+from scvi_codegen.codegen.rendering.c_text import macros_of, names_of
 from scvi_codegen.codegen.rendering.own_names import with_exported_names, with_own_names
 from scvi_codegen.codegen.rendering.reachable import readable
 from scvi_codegen.codegen.rendering.source import Source
@@ -142,7 +142,8 @@ def test_names_are_those_of_the_compiler(tmp_path):
         listed, empty = (run(["gcc", "-std=gnu99", "-E", "-dM", name], tmp_path) for name in ("r_0.c", "heads.c"))
         macros = {line.split()[1].split("(")[0] for line in {*listed.splitlines()} - {*empty.splitlines()}}
         names = {
-            name.replace("NAME(", "r_0_").replace("STATUS(", "R_0_").rstrip(")") for name in names_of_file(source.code)
+            name.replace("NAME(", "r_0_").replace("STATUS(", "R_0_").rstrip(")")
+            for name in names_of(source.code, macros_of(source.code))
         }
         assert objects <= names
         assert macros <= names

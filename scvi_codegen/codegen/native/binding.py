@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from scvi_codegen.codegen.native.building import Library
 from scvi_codegen.codegen.native.options import FAILURES, FALLBACK_REQUIRED, SolverOptions, checked_options
 from scvi_codegen.codegen.rendering.source import Source
-from scvi_codegen.codegen.rendering.text import DEPENDENT, INPUT_PRECISION, ROUNDING_UNITS
+from scvi_codegen.codegen.rendering.text import INPUT_PRECISION, ROUNDING_UNITS
 from scvi_codegen.common.cache import template_folder
 from scvi_codegen.common.errors import MethodError
+from scvi_codegen.common.tangent_space import DEPENDENT
 
 RESULTS, FIRST_RESULT = Struct("=4d4q"), "error"
 """Format of the last fields of the struct (``calls_declarations.h``), and the first of them."""

@@ -2,7 +2,8 @@
 
 This is the one place that reads C: assembling a source for readers, removing what nothing uses, and giving names a
 prefix all go by what it returns. It is no parser of C. It splits text into tokens, and relies on a declaration at file
-scope that begins in the first column and ends at the end of a line. Macros that make functions are expanded.
+scope that begins in the first column and ends at the end of a line. A macro that makes a function there has the
+parameter ``name`` first.
 """
 
 from __future__ import annotations
@@ -26,6 +27,9 @@ class Macro(NamedTuple):
 
     parameters: tuple[str, ...] | None
     body: tuple[str, ...]
+
+
+NO_MACRO = Macro(None, ())
 
 
 def tokens(code: str) -> Iterator[str]:
@@ -83,13 +87,8 @@ def pieces(code: str) -> Iterator[tuple[str, str]]:
 
 
 def macros_of(code: str) -> dict[str, Macro]:
-    """Return the macros of a text by name; of several definitions that which makes functions, else the last one."""
-    macros: dict[str, Macro] = {}
-    for _, line in definitions(code):
-        name, macro = _macro(line)
-        if "static" in macro.body or name not in macros or "static" not in macros[name].body:
-            macros[name] = macro
-    return macros
+    """Return the macros of a text by name, of several definitions the last one."""
+    return dict(_macro(line) for _, line in definitions(code))
 
 
 def definitions(code: str) -> Iterator[tuple[str, str]]:
@@ -110,16 +109,7 @@ def _macro(line: str) -> tuple[str, Macro]:
     return name, Macro(tuple(token for token in body[1:end] if token != ","), tuple(body[end + 1 :]))
 
 
-def names_of_file(code: str) -> Iterator[str]:
-    """Yield the names at file scope of a text, and those parts of the names of functions that macros contain."""
-    macros = macros_of(code)
-    yield from names_made(code, macros)
-    for macro in macros.values():
-        if _makes(macro, macros):
-            yield from (first for first, after in pairwise(macro.body) if after[:2] == "##" and is_name(first))
-
-
-def names_made(code: str, macros: Mapping[str, Macro]) -> Iterator[str]:
+def names_of(code: str, macros: Mapping[str, Macro]) -> Iterator[str]:
     """Yield the names at file scope that a text makes: of macros, then types, enumerators, variables and functions."""
     yield from (name for name, _ in definitions(code))
     for kind, text in pieces(code):
@@ -128,14 +118,12 @@ def names_made(code: str, macros: Mapping[str, Macro]) -> Iterator[str]:
 
 
 def _declared(text: Sequence[str], macros: Mapping[str, Macro]) -> Iterator[str]:
-    """Yield the names that the tokens of a declaration, or of several that a macro makes, declare."""
-    macro = macros.get(text[0])
-    if macro and "static" in (body := [*_expanded(text, macros)]):
-        parts = _several(body) if macro.parameters is not None else [body]
-        for part in parts:
-            yield from _declared(part, {} if part[0] == text[0] else macros)
+    """Yield the names that a declaration makes; a macro at its beginning may be ``static``, or make a function."""
+    macro = macros.get(text[0], NO_MACRO)
+    if macro.parameters is not None:
+        yield from text[2:3] if macro.parameters[:1] == ("name",) else ()
         return
-    text = [*_without_attributes(text)]
+    text = [*_without_attributes([*macro.body, *text])]
     end = min((text.index(token) for token in "{=" if token in text), default=len(text))
     head = text[:end]
     if head[0] == "enum":
@@ -186,68 +174,3 @@ def _without_attributes(text: Iterable[str]) -> Iterator[str]:
             depth += (inner == "(") - (inner == ")")
             if depth == 0:
                 break
-
-
-def _several(text: Sequence[str]) -> Iterator[list[str]]:
-    """Yield the declarations among tokens."""
-    part, depth = list[str](), 0
-    for token in text:
-        part.append(token)
-        depth += (token == "{") - (token == "}")
-        if depth == 0 and token in (";", "}"):
-            if part != [";"]:
-                yield part
-            part = []
-    if part:
-        yield part
-
-
-def _expanded(text: Sequence[str], macros: Mapping[str, Macro]) -> Iterator[str]:
-    """Yield tokens with macros that make functions, or that begin their heads, replaced by their text."""
-    rest, position = [*text], 0
-    while position < len(rest):
-        token = rest[position]
-        macro = macros.get(token)
-        if macro is None or (macro.parameters is None and position) or not _makes(macro, macros):
-            yield token
-            position += 1
-        elif macro.parameters is None:
-            rest, position = [*macro.body, *rest[position + 1 :]], 0
-            macros = {name: other for name, other in macros.items() if name != token}
-        else:
-            arguments, position = _arguments(rest, position + 1)
-            yield from _expanded(_replaced(macro, arguments), macros)
-
-
-def _makes(macro: Macro, macros: Mapping[str, Macro]) -> bool:
-    """Return whether functions are in the text of a macro, or in that of those it calls."""
-    return "static" in macro.body or (
-        macro.parameters is not None and any(_makes(macros[token], macros) for token in macro.body if token in macros)
-    )
-
-
-def _arguments(text: Sequence[str], start: int) -> tuple[list[list[str]], int]:
-    """Return the arguments of a call of a macro, of which the bracket is at ``start``, and where it ends."""
-    arguments, depth = [list[str]()], 0
-    for position in range(start, len(text)):
-        token = text[position]
-        depth -= token == ")"
-        if depth == 0 and position > start:
-            return arguments, position + 1
-        if token == "," and depth == 1:
-            arguments.append([])
-        elif depth > 0:
-            arguments[-1].append(token)
-        depth += token == "("
-    return arguments, len(text)
-
-
-def _replaced(macro: Macro, arguments: Sequence[Sequence[str]]) -> Sequence[str]:
-    """Return the tokens of a macro with these arguments, pasted ones joined."""
-    values, text = dict(zip(macro.parameters or (), arguments, strict=False)), list[str]()
-    for token in macro.body:
-        if token.startswith("##"):
-            text[-1] += "".join(values.get(token[2:], [token[2:]]))
-        else:
-            text += values.get(token, [token])
-    return text

@@ -10,15 +10,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 
-from scvi_codegen.codegen.rendering.c_text import (
-    definitions,
-    macros_of,
-    names_of_file,
-    pieces,
-    renamed,
-    squeezed,
-    words,
-)
+from scvi_codegen.codegen.rendering.c_text import definitions, macros_of, names_of, pieces, renamed, squeezed, words
 from scvi_codegen.codegen.rendering.text import CONTINUATION, WIDTH, wrapped_prototype
 
 BREAK = re.compile(r'(?:[^" ]|"(?:\\.|[^"\\])*")+ ')
@@ -77,7 +69,7 @@ def with_own_names(code: str, prefix: str, header: str) -> str:
     """
     taken = words(header) | words(code)
     names = {}
-    for name in names_of_file(code):
+    for name in names_of(code, macros_of(code)):
         if not name.lower().startswith(f"{prefix.lower()}_"):
             upper, local = (prefix.upper(), "LOCAL") if name.isupper() else (prefix, "local")
             names[name] = f"{upper}_{name}" if f"{upper}_{name}" not in taken else f"{upper}_{local}_{name}"

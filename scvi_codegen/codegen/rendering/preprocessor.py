@@ -33,7 +33,8 @@ def _support_name(line: str, folder: str) -> str | None:
     if not line.startswith('#include "'):
         return None
     name = line.split('"')[1]
-    return posixpath.normpath(posixpath.join(folder, name)) if folder or name.startswith(SUPPORT) else None
+    is_beside = folder and (name.startswith("../") or "/" not in name)  # others are those of libraries
+    return posixpath.normpath(posixpath.join(folder, name)) if is_beside or name.startswith(SUPPORT) else None
 
 
 def included(code: str, read: Read) -> tuple[tuple[str, str], ...]:

@@ -17,7 +17,7 @@ from scvi_codegen.codegen.rendering.c_text import (
     Macro,
     definitions,
     macros_of,
-    names_made,
+    names_of,
     pieces,
     renamed,
     squeezed,
@@ -174,7 +174,7 @@ def _parts(code: str, macros: Mapping[str, Macro], conditions: tuple[str, ...] =
         elif text.startswith("#undef "):
             names = frozenset(text.split()[1:2])
         else:
-            names = frozenset(names_made(text, macros)) - PREFIXED
+            names = frozenset(names_of(text, macros)) - PREFIXED
         comment = tuple(_for_readers("\n".join(comment)).split("\n")) if comment else ()
         yield Part(comment, (*text.split("\n"),), names, conditions, section, joined and not comment, branches)
         comment, joined, opened = (), True, False
