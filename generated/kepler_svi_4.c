@@ -221,7 +221,8 @@ static const double STAGE_OTHER_CURVATURE[4] = {-1.0, 0.0, 1.0, 0.0};
 #include "support/core/vectors.h"
 #include "support/core/points.h"
 
-LANES_INVERSE_ROOT(3, (square * y), (inverse * inverse));
+LANES_INVERSE_ROOT(lanes_inverse_root_3_times, 3, (square * y), (inverse * inverse));
+INVERSE_ROOT_ALONE(lanes_inverse_root_3, lanes_inverse_root_3_times);
 
 static const lanes ABSCISSA[GROUPS] = {
     0.06943184420297371, 0.33000947820757187, 0.6699905217924281, 0.9305681557970263};

@@ -150,7 +150,7 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
 #include "support/core/vectors.h"
 #include "support/core/points.h"
 
-LANES_LIBRARY_FUNCTION(sin);
+LANES_LIBRARY_FUNCTION(lanes_sin, sin);
 
 static const lanes ABSCISSA[GROUPS] = {0.2113248654051871, 0.7886751345948129};
 static const lanes DRIFT[GROUPS] = {0.2113248654051871, 0.7886751345948129};

@@ -159,45 +159,119 @@ int NAME(call_integrate)(NAME(call) *c, long long steps, long long every)
   return 0;
 }
 
+#ifdef HAS_DEFECTS
+/* Takes `parts` equal steps h from the state after a vector v times a factor, whose low words are in compensation
+ * terms. */
+static int NAME(call_step)(NAME(call) *c, double t, double h, long long parts, const double *q, const double *p,
+    const double *v, double factor)
+{
+  __typeof__(NAME(advance)) *volatile fixed = NAME(advance);
+  NAME(run) *run = c->run;
+  run->t = t, run->t_low = 0.0, run->h = h;
+  for (int i = 0; i < M; i++) {
+    const double dq = v ? factor * v[i] : 0.0, dp = v ? factor * v[M + i] : 0.0;
+    run->q[i] = q[i] + dq, run->carry_q[i] = fabs(dq) > fabs(q[i]) ? (dq - run->q[i]) + q[i] : (q[i] - run->q[i]) + dq;
+    run->p[i] = p[i] + dp, run->carry_p[i] = fabs(dp) > fabs(p[i]) ? (dp - run->p[i]) + p[i] : (p[i] - run->p[i]) + dp;
+  }
+  return fixed(run, parts, parts, c->parameters, c->options, NULL, NULL, NULL, NULL, c->report, c->workspace);
+}
+
+#endif
+
 /* Takes `pieces` equal steps h from each of `count` states q, p at times t; their ends are q1, p1. */
 int NAME(call_pieces)(NAME(call) *c, long long count, const double *t, const double *h, const long long *pieces,
     const double *q, const double *p, double *q1, double *p1)
 {
-  __typeof__(NAME(advance)) *volatile fixed = NAME(advance);
-  double end[2];
-  int status = 0, iterations;
+  int status = 0;
   for (long long k = 0; k < count && !status; k++) {
     const long long row = k * c->coordinates;
+#ifdef HAS_DEFECTS
+    if (k == 0)
+      NAME(start)(c->run, t[0], h[0], q, p);
+    status = NAME(call_step)(c, t[k], h[k], pieces[k], q + row, p + row, NULL, 0.0);
+    for (int i = 0; i < M; i++)
+      q1[row + i] = c->run->q[i], p1[row + i] = c->run->p[i];
+#else
+    __typeof__(NAME(advance)) *volatile fixed = NAME(advance);
+    double end[2];
+    int iterations;
     NAME(start)(c->run, t[k], h[k], q + row, p + row);
     status = fixed(c->run, pieces[k], pieces[k], c->parameters, c->options, end, q1 + row, p1 + row, &iterations,
         c->report, c->workspace);
+#endif
   }
   return status;
 }
 
 #ifdef HAS_DEFECTS
-/* Defects x[k + 1] - phi(x[k]) of `count` + 1 states x = (q, p) of another run at times t, by one step phi of size h
- * from each, which begins at the curve of the last one. Increments of phi have low words, so that no rounding of
- * states remains. */
-int NAME(call_defects)(NAME(call) *c, long long count, const double *t, const double *h, const double *q,
-    const double *p, double *defects)
+#define MOST_PARTS 16 /* of a step, which take as long as its solution by Newton's method */
+
+/* Length of a vector in units of sizes; infinite where a component other than 0 has the size 0. */
+static double NAME(relative_length)(int count, const double *x, const double *size)
 {
-  __typeof__(NAME(advance)) *volatile fixed = NAME(advance);
-  NAME(run) *run = c->run;
-  int status = 0;
+  double sum = 0.0;
+  for (int i = 0; i < count; i++)
+    sum += x[i] == 0.0 ? 0.0 : x[i] / size[i] * (x[i] / size[i]);
+  return sqrt(sum);
+}
+
+/* Defects x[k + 1] - phi(x[k]) of `count` + 1 states x = (q, p) of another run at times t, by one step phi of size h
+ * from each, which begins at the curve of the last one; it is taken in twice as many `parts` as long as the iteration
+ * fails, and Newton's method would solve it. Increments of phi have low words, so that no rounding of states remains. Relative to sizes of (q, p), those of at most `part` of the change of momenta are `small`. */
+int NAME(call_defects)(NAME(call) *c, long long count, const double *t, const double *h, const double *q,
+    const double *p, const double *size, double part, double *defects, int *small, int *parts)
+{
+  NAME(run) *run = c->run, last;
+  int status = 0, present = 1;
+  NAME(start)(run, t[0], h[0], q, p);
   for (long long k = 0; k < count && !status; k++, q += M, p += M, defects += 2 * M) {
-    if (k == 0)
-      NAME(start)(run, t[0], h[0], q, p);
-    run->t = t[k], run->t_low = 0.0, run->h = h[k];
-    memcpy(run->q, q, sizeof run->q);
-    memcpy(run->p, p, sizeof run->p);
-    memset(run->carry_q, 0, sizeof run->carry_q);
-    memset(run->carry_p, 0, sizeof run->carry_p);
-    status = fixed(run, 1, 1, c->parameters, c->options, NULL, NULL, NULL, NULL, c->report, c->workspace);
+    double impulse[M];
+    last = *run;
+    while ((status = NAME(call_step)(c, t[k], h[k] / present, present, q, p, NULL, 0.0)), present < MOST_PARTS &&
+        (status || c->report->fallback_steps))
+      present *= 2, *run = last;
+    parts[k] = present;
     for (int i = 0; i < M; i++) {
       defects[i] = (q[M + i] - run->q[i]) - run->carry_q[i];
       defects[M + i] = (p[M + i] - run->p[i]) - run->carry_p[i];
+      impulse[i] = p[M + i] - p[i];
     }
+    small[k] = NAME(relative_length)(2 * M, defects, size) <= part * NAME(relative_length)(M, impulse, size + M);
+  }
+  return status;
+}
+
+/* Transports vectors of global errors, from `before` to `now`, over the steps phi of call_defects by differences: phi(x
+ * + s v) - phi(x) = s D phi v + O(s^2), with s v of a size of the root of rounding errors (W. H. Press et al.,
+ * Numerical Recipes, 5.7). */
+int NAME(call_differences)(NAME(call) *c, long long count, const double *t, const double *h, const double *q,
+    const double *p, const double *size, const double *defects, const int *parts, int vectors, double rounding,
+    unsigned long long seed, const double *before, double *now, long long stride, double *errors, double *deviations)
+{
+  error_vectors all = {vectors, 2 * M, rounding, seed, defects, stride, errors, deviations};
+  NAME(run) *run = c->run, last;
+  int status = 0;
+  memcpy(now, before, sizeof(double) * (size_t)(vectors * 2 * M));
+  NAME(start)(run, t[0], h[0], q, p);
+  for (long long k = 0; k < count && !status; k++, q += M, p += M) {
+    const double *defect = defects + k * 2 * M;
+    last = *run;
+    for (int j = 0; j < vectors && !status; j++) {
+      double *v = now + j * 2 * M, largest = 0.0;
+      for (int i = 0; i < 2 * M; i++)
+        largest = fmax(largest, fabs(v[i]) / size[i]);
+      if (largest == 0.0)
+        continue;
+      const double factor = sqrt(DBL_EPSILON) / largest;
+      *run = last;
+      status = NAME(call_step)(c, t[k], h[k] / parts[k], parts[k], q, p, v, factor);
+      for (int i = 0; i < M; i++) {
+        v[i] = (((run->q[i] - q[M + i]) + run->carry_q[i]) + defect[i]) / factor;
+        v[M + i] = (((run->p[i] - p[M + i]) + run->carry_p[i]) + defect[M + i]) / factor;
+      }
+    }
+    if (!status)
+      receive_errors(&all, k, q + M, p + M, now);
   }
   return status;
 }

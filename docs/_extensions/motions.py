@@ -176,7 +176,13 @@ def _skip(writer: Any, node: nodes.Node) -> None:
 
 def _build_pages(app: Sphinx, failure: Exception | None) -> None:
     """Write the pages that are new; compiled code comes from the cache of the package."""
-    if failure or app.builder.format != "html" or not CAN_COMPILE:
+    if failure or app.builder.format != "html":
+        return
+    if not CAN_COMPILE:
+        LOGGER.info(
+            "pages that move are shown as pictures, without the extra compiler: "
+            "pip install -e '.[docs,compiler]'"
+        )
         return
     folder = Path(app.outdir, FOLDER)
     folder.mkdir(exist_ok=True)

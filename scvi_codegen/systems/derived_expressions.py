@@ -353,24 +353,9 @@ def forms_of(system: MechanicalSystem) -> Forms:
     return Forms(system)
 
 
-DEPENDENT = 1e-10
-"""Rank tolerance, relative to the largest singular value of the normalised rows."""
 LARGEST_NULL_SPACE = 8
 SAME_MOMENTUM = 1e-12
 """Largest difference of momenta of order 1/10 that may be due to rounded constants."""
-
-
-def row_rank(matrix: NDArray[np.float64]) -> int:
-    """Return the rank of a matrix of shape (n, m) after its rows are scaled to unit length."""
-    if not matrix.size:
-        return 0
-    return int(np.linalg.matrix_rank(unit_rows(matrix), tol=DEPENDENT))
-
-
-def unit_rows(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a matrix with its rows scaled to length 1, unless they are 0."""
-    sizes = np.linalg.norm(matrix, axis=1, keepdims=True)
-    return np.asarray(matrix / np.where(sizes > 0.0, sizes, 1.0))
 
 
 def dense(places: Iterable[tuple[int, int]], values: Iterable[Any], shape: tuple[int, int]) -> NDArray[np.float64]:

@@ -28,6 +28,7 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.representation import counted, summary
+from scvi_codegen.common.tangent_space import tangent_space
 from scvi_codegen.systems.checks.continuity import irregularity
 from scvi_codegen.systems.formulas.expressions import SAMPLES, dot, gradient, samples, sums_to_zero
 from scvi_codegen.systems.formulas.intermediates import written_out
@@ -39,7 +40,6 @@ MOST_SHEARED = 6
 """Largest number of coordinates of which shears are tried."""
 MOST_SHOWN = 12
 """Largest number of operations of an entry of the two-form in a message."""
-RANK_TOLERANCE = 1e-10
 MOST_CHOICES = 8
 """Largest number of choices of y whose gauge is integrated; the shortest result is used."""
 
@@ -179,8 +179,8 @@ class OneForm:
         """Return the largest rank of omega at the points."""
         n = len(self.coordinates)
         entries = [self.omega(i, j) for i in range(n) for j in range(n)]
-        matrices = [np.array(values, dtype=float).reshape(n, n) for values in islice(samples(entries), SAMPLES)]
-        return max((int(np.linalg.matrix_rank(m, tol=RANK_TOLERANCE * np.abs(m).max())) for m in matrices), default=0)
+        matrices = (np.array(values, dtype=float).reshape(n, n) for values in islice(samples(entries), SAMPLES))
+        return max((tangent_space(matrix).rank for matrix in matrices), default=0)
 
     def choices(self, auxiliary: tuple[int, ...] = (), first: int = 0) -> Iterator[tuple[int, ...]]:
         """Yield the choices of half of the coordinates between which omega vanishes."""

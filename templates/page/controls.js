@@ -16,12 +16,13 @@ function restart() {
   start();
   if (!fault && !shape.mesh && m <= 400) {
     const states = [pointsOf(memory_q, memory_p, code.time())], span = family ? family.orbits[present].period : 10 * settings.speed;
-    scheduled.begin(frames && !family ? 4 : 40); // longer when the page begins, and its code is compiled
+    const orbit = trails.map(() => []); // all of it: trails forget
+    scheduled.begin(family ? Infinity : frames ? 4 : 40); // an orbit to its end; longer when the page begins, and its code is compiled
     scheduled.perform(() => (fault || Math.abs(code.time() - about.t) >= span || states.length >= 4000 ? 0 : family ? 1 : 64), (now) => {
-      if (family) single(); else fault = code.advance(now, 4);
+      if (family) { single(); trails.forEach((points, k) => orbit[k].push(...points.splice(0, points.length - 1))); } else fault = code.advance(now, 4);
       for (let k = 0; k < code.stored() && !fault; k++) states.push(pointsOf(stored_q.subarray(k * m, (k + 1) * m), stored_p.subarray(k * m, (k + 1) * m), stored_t[k]));
     });
-    if (family) { picture.curves = trails; states.push(...family.orbits.map(({ q, p }) => pointsOf(q, p, about.t))); } // one frame for all
+    if (family) { picture.curves = orbit.map((points, k) => [...points, ...trails[k]]); states.push(...family.orbits.map(({ q, p }) => pointsOf(q, p, about.t))); } // one frame for all
     const shown = states.filter((points) => points.flat().every(Number.isFinite));
     start();
     picture.ahead(shown);
@@ -41,22 +42,23 @@ function group(title) {
   by("controls").append(box);
   return (groups[title] = box);
 }
-function addSlider(title, label, name, { low, high, step = 0.001, log = false, hard = true, get, set: put }) {
+function addSlider(title, label, name, { low, high, step = 0.001, log = false, hard = true, whole = false, get, set: put }) {
   const row = document.createElement("div"), id = "c" + sliders.length, text = document.createElement("label"), range = document.createElement("input"), number = document.createElement("input");
   row.className = "row"; text.htmlFor = range.id = id; text.append(label); text.title = name;
-  Object.assign(range, { type: "range", min: 0, max: 1, step }); range.setAttribute("aria-label", name);
+  const length = whole ? high - low : 1; // of the range, in steps of 1 if values are whole
+  Object.assign(range, { type: "range", min: 0, max: length, step: whole ? 1 : step }); range.setAttribute("aria-label", name);
   Object.assign(number, { type: "number", step: "any" }); number.setAttribute("aria-label", `${name}, value`);
   row.append(text, range, number);
   const share = (x) => clamped(log ? Math.log(x / low) / Math.log(high / low) : (x - low) / (high - low), 0, 1);
   const show = () => {
     const x = get(), at = share(x);
-    if (document.activeElement !== range) range.value = at;
+    if (document.activeElement !== range) range.value = length * at;
     range.style.setProperty("--at", `${100 * at}%`);
     range.setAttribute("aria-valuetext", short(x));
     if (document.activeElement !== number) number.value = Math.abs(x) < 1e-15 * Math.max(Math.abs(low), Math.abs(high)) ? 0 : [4, 3].map((digits) => compact(x, digits)).find((shown, k) => k || shown.length <= 8);
   };
   const changed = (x) => { put(x); showSliders(); writeAddress(); };
-  range.addEventListener("input", () => { const s = +range.value; changed(clamped(+(log ? low * (high / low) ** s : low + (high - low) * s).toPrecision(4), low, high)); });
+  range.addEventListener("input", () => { const s = +range.value; changed(whole ? low + s : clamped(+(log ? low * (high / low) ** s : low + (high - low) * s).toPrecision(4), low, high)); });
   number.addEventListener("change", () => {
     const x = number.valueAsNumber;
     if (!Number.isFinite(x)) tell(`${name} must be a number.`);
@@ -69,7 +71,7 @@ function addSlider(title, label, name, { low, high, step = 0.001, log = false, h
 }
 const showSliders = () => sliders.forEach((show) => show());
 const moveTo = ({ q, v, parameters }) => { Object.assign(settings, { q, v }); Object.assign(settings.parameters, parameters); restart(); };
-if (family) addSlider("Family", "Orbit", "Orbit", { low: 0, high: family.orbits.length - 1, step: 1 / (family.orbits.length - 1), get: () => present, set: (k) => moveTo(family.orbits[Math.round(k)]) });
+if (family) addSlider("Family", "Orbit", "Orbit", { low: 0, high: family.orbits.length - 1, whole: true, get: () => present, set: (k) => moveTo(family.orbits[Math.round(k)]) });
 addSlider("Time", "Speed", "Speed", { ...about.speed, log: true, get: () => settings.speed, set: (x) => { settings.speed = x; } });
 const { adaptive } = about.step; // of unknown durations
 addSlider("Time", about.step.label.replace(" in tau", ""), about.step.label, { ...about.step, log: true, get: () => settings.step, set: (x) => { settings.step = x; restart(); } });

@@ -188,8 +188,9 @@ class TestKnownDigits:
             (-123.456, 8.0, "-1e+02"),
             (0.3, 7.0, " no digit (error 7)"),
             (0.0, 1e-9, " 0 within 1e-09"),
+            (1e-84, 2e-83, " 0"),
             (0.1, 0.0, " 0.10000000000000001"),
         ],
     )
     def test_correct_digits_are_printed(self, x, error, text):
-        assert in_known_digits(x, error) == text
+        assert in_known_digits(x, error, size=1.0) == text

@@ -15,6 +15,7 @@ from strict_c import STRICT, run
 from scvi_codegen import SVI, LagrangianSystem, compile_stepper, generate_source
 from scvi_codegen.codegen.native.compilers import find_compiler
 from scvi_codegen.codegen.pipeline import ArraySources, c_identifier
+from scvi_codegen.codegen.rendering.c_text import macros_of, names_of
 from scvi_codegen.codegen.rendering.own_names import with_exported_names, with_own_names
 from scvi_codegen.codegen.rendering.reachable import readable
 from scvi_codegen.codegen.rendering.source import Source
@@ -119,6 +120,37 @@ def test_names_that_occur_in_the_templates_are_names_of_integrators(tmp_path):
     run([*find_compiler(), *STRICT, "-Wno-psabi", "-fsyntax-only", *tmp_path.glob("*.c")], tmp_path)
 
 
+KEPT = "-O0 -w -std=gnu99 -fkeep-static-functions -fkeep-inline-functions -fkeep-static-consts".split()  # noqa: SIM905
+
+
+@pytest.mark.second
+def test_names_are_those_of_the_compiler(tmp_path):
+    """Functions and tables by the symbols of the object, macros by the preprocessor's list; fast paths and loops."""
+    rod = LagrangianSystem.from_text("rod", ["x", "y"], "x_dot**2/2 + y_dot**2/2 - y", constraints=["x**2 + y**2 = 1"])
+    for system, method in ((catalogue("kepler")(), "svi:4"), (rod, "svi:2")):
+        source = generate_source(system, method, prefix="r_0")[0].amalgamated()
+        (tmp_path / "r_0.h").write_text(source.header)
+        (tmp_path / "r_0.c").write_text(source.code)
+        (tmp_path / "heads.c").write_text(
+            '#include "r_0.h"\n' + "".join(f"#include <{name}.h>\n" for name in ("float", "limits", "math", "string"))
+        )
+        run([needs("gcc"), *KEPT, "-c", "r_0.c"], tmp_path)
+        listing = run([needs("nm"), "r_0.o"], tmp_path)
+        lines = [line for line in listing.splitlines() if "." not in line]  # variables of functions have a dot
+        symbols = [line.split()[-2:] for line in lines]
+        objects = {name for kind, name in symbols if kind in "TtRrDdBb"}
+        listed, empty = (run(["gcc", "-std=gnu99", "-E", "-dM", name], tmp_path) for name in ("r_0.c", "heads.c"))
+        macros = {line.split()[1].split("(")[0] for line in {*listed.splitlines()} - {*empty.splitlines()}}
+        names = {
+            name.replace("NAME(", "r_0_").replace("STATUS(", "R_0_").rstrip(")")
+            for name in names_of(source.code, macros_of(source.code))
+        }
+        assert objects <= names
+        assert macros <= names
+        functions = {name for kind, name in symbols if kind in "Tt"}
+        assert functions <= {*source.functions} | {name for name in names if name.startswith("lanes_")}  # by macros
+
+
 OF_C = "pendulum max status int double run step dbl solver"
 """Legal names that occur in the templates, in C or in its headers."""
 
@@ -141,7 +173,8 @@ def test_a_single_file_of_any_name_is_the_same_program(monkeypatch, tmp_path):
     def single_file(name: str) -> str:
         code, header = texts.replace("r_0", name).replace("R_0", name.upper()).rsplit("\f", 1)
         (tmp_path / f"{name}.h").write_text(header)
-        return with_own_names(with_exported_names(code).replace("\f", "\n"), name, header)
+        files = with_exported_names(dict(enumerate(code.split("\f"))))
+        return with_own_names("\n".join(files.values()), name, header)
 
     choose = random.Random(20)
     letters, further = string.ascii_lowercase, string.ascii_lowercase + string.digits + "_"

@@ -37,7 +37,7 @@ PACKAGE = (
 """Folders of which Python is drawn; the others draw pictures, measure, or need programs that CI may not have."""
 DERIVING = ("systems", "methods", "codegen/ir", "codegen/lowering", "codegen/rendering")
 """What all cases come from; of the others one shows as much."""
-NOT_TRIED = ("errors.py", "text.py", "outline.py", "waiting.py")
+NOT_TRIED = ("errors.py", "text.py", "waiting.py")
 """Words for people; their tests are of words."""
 OF_C = ("support/*/*.h", "*.c.jinja", "parts/*.c.jinja", "parts/newton/*.c.jinja")
 CERTIFIED = (

@@ -25,7 +25,6 @@ from scvi_codegen.codegen.pipeline import program_of
 from scvi_codegen.codegen.rendering.program_source import render
 from scvi_codegen.extras.derivation.equations import derive
 from scvi_codegen.extras.derivation.notation import table_entries
-from scvi_codegen.extras.derivation.outline import functions_of
 from scvi_codegen.extras.derivation.page.document import ITERATIONS, derivation_html, kernels_of
 from scvi_codegen.extras.derivation.page.drawings import curve_section, jacobian_pattern
 from scvi_codegen.extras.derivation.writing import MOST_LINES, Formula, Paragraph, formulas
@@ -138,7 +137,7 @@ class TestPage:
     @pytest.mark.second
     def test_operations_are_counted(self):
         program = program_of(sc.problem("kepler").system, sc.SVI(2), prefix="kepler_problem")
-        functions = functions_of(render(program).amalgamated().code)
+        functions = render(program).functions
         page = kepler_page(sc.SVI(2))
         for kernel in kernels_of(program):
             row = re.search(
@@ -165,7 +164,7 @@ class TestPage:
         assert re.search(r"The first \d of 18 equations\.", page)
         assert "144 rows and columns" in page
         assert "they are omitted here" in page
-        functions = functions_of(sc.generate_source(system, sc.SVI(8))[0].amalgamated().code)
+        functions = sc.generate_source(system, sc.SVI(8))[0].functions
         count = sum(len(functions[f"quadrature_derivatives{end}"].text.splitlines()) for end in ("_1", "_2", ""))
         assert count > 1000
         assert f"/* .. {count - MOST_LINES} more lines */" in page

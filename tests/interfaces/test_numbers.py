@@ -19,7 +19,9 @@ from commands import json_of, output_of
 import scvi_codegen as sc
 from scvi_codegen.codegen.rendering.source import Interface
 from scvi_codegen.interfaces.cli.reports import in_known_digits
-from scvi_codegen.interfaces.cli.running import final_state
+from scvi_codegen.interfaces.cli.running import _geometry, final_state
+from scvi_codegen.interfaces.models.model_files.model_file import parse_model
+from scvi_codegen.runs.stepping.step_plan import FixedSteps
 
 M, K, C, G = 1.75, 0.625, 0.375, 1.25
 T = 2.5
@@ -415,10 +417,42 @@ def test_numbers_without_a_right_digit_are_not_printed():
 
 
 def test_positions_and_momenta_are_printed_with_their_correct_digits():
-    known = SimpleNamespace(bounds=(np.array([[1e-3, 1e-9]]), np.array([[1e-9, 1e-3]])), lost=None)
+    errors = np.array([[1e-3, 1e-9]]), np.array([[1e-9, 1e-3]])
+    known = SimpleNamespace(bounds=errors, lost=None, sizes=np.ones((2, 2)))
     interface = Interface(
         prefix="two", title="", system="", method="", coordinates=("x", "y"), parameters=(), defaults=()
     )
     lines = list(final_state(interface, np.array([1 / 3, 2 / 3]), np.array([1 / 7, 1 / 9]), known))
     digits = [[len(text) for text in re.findall(r"0\.(\d*[1-9])", line)] for line in lines[1:]]
     assert digits[0][0] == digits[1][1] < digits[0][1] == digits[1][0]
+
+
+FALLING = """
+[system]
+name = "falling"
+coordinates = ["y"]
+lagrangian = "y_dot**2/2 - y"
+{acting}
+[initial]
+q = [1.0]
+q_dot = [0.0]
+[run]
+step = 0.1
+span = 1.0
+{event}"""
+
+
+@pytest.mark.parametrize(
+    ("acting", "restitution", "printed"),
+    [
+        ("", None, "symplectic"),
+        ("", 1, "symplectic"),
+        ("", 0.8, "symplectic only between events"),
+        ("damping = 0.1", None, "not symplectic"),
+        ("damping = 0.1\ntemperature = 1.0", None, "not symplectic"),
+    ],
+)
+def test_what_acts_decides_whether_a_run_is_symplectic(acting, restitution, printed):
+    event = "" if restitution is None else f'[[events]]\nfunction = "y"\nrestitution = {restitution}\n'
+    model = parse_model(FALLING.format(acting=acting, event=event))
+    assert _geometry(model, SimpleNamespace(plan=FixedSteps(0.1))) == printed

@@ -57,6 +57,17 @@ def test_code_blocks_have_known_languages_and_links_have_targets(name):
     assert [target for target in targets if not ((DOCS / name).parent / target).exists()] == []
 
 
+def paragraphs(page: str) -> list[str]:
+    """Return the paragraphs and list items of a page, without code, tables and headings."""
+    prose = re.sub(r"^\s*```.*?^\s*```$|^[|#].*$", "\n", page, flags=re.MULTILINE | re.DOTALL)
+    return re.split(r"\n\s*\n|\n(?=\s*(?:[-*] |\d+\. ))", prose)
+
+
+def test_no_paragraph_of_the_guide_exceeds_80_words():
+    guide = {name: paragraphs(page) for name, page in PAGES.items() if "/" not in name}
+    assert [(name, text) for name, texts in guide.items() for text in texts if len(text.split()) > 80] == []
+
+
 def test_the_reference_contains_every_public_name_once():
     pages = "".join(page for name, page in PAGES.items() if name.startswith("reference/"))
     assert sorted(re.findall(r"^\.\. auto\w+:: (\w+)", pages, re.MULTILINE)) == sorted(scvi_codegen.__all__)
@@ -146,7 +157,7 @@ def test_the_reproduction_of_the_paper_runs(here):
 
 
 QUERIES: dict[str, set[str]] = {}
-"""What users search for, and the pages of which one must be the first or second result."""
+"""What users search for, and the pages of which one must be found."""
 for _page, _queries in tomllib.loads((ROOT / "tests/corpus/queries.toml").read_text(encoding="utf-8")).items():
     for _query in _queries:
         QUERIES.setdefault(_query, set()).add(_page)
@@ -181,16 +192,15 @@ def site(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 
 
 @pytest.mark.parametrize("site", ["existing", pytest.param("built", marks=pytest.mark.full)], indirect=True)
-def test_the_search_finds_the_page_first_or_second(site, browser):
+def test_the_search_finds_the_page_first_in_95_percent_and_among_three_always(site, browser):
     with looked_at(browser, "desk", "light") as view:
         view.goto(f"{(site / 'search.html').as_uri()}?q=start")
         view.wait_for_function("Search.hasIndex()")
-        found = {query: view.evaluate(SEARCH, query)[:2] for query in QUERIES}
-    assert len(found) > 300
-    assert {task["query"]: task["page"] for task in TASKS}.items() <= {
-        q: pages[0] for q, pages in found.items()
-    }.items()
+        found = {query: list(dict.fromkeys(view.evaluate(SEARCH, query)))[:3] for query in QUERIES}
+    first = {query: pages[0] for query, pages in found.items() if pages}
+    assert {task["query"]: task["page"] for task in TASKS}.items() <= first.items()
     assert {query: pages for query, pages in found.items() if not QUERIES[query] & {*pages}} == {}
+    assert sum(page in QUERIES[query] for query, page in first.items()) >= 0.95 * len(QUERIES) > 500
 
 
 @pytest.mark.full

@@ -1,7 +1,7 @@
-"""Redraw the pictures of ``docs/gallery`` and update the printed output by running the code of its pages.
+"""Redraw the pictures of pages of ``docs`` and update the printed output by running the code of these pages.
 
-python tests/tools/remake_gallery.py                 all of them
-python tests/tools/remake_gallery.py figure_eight    one
+python tests/tools/remake_gallery.py                         the gallery
+python tests/tools/remake_gallery.py gallery/kdv events      two pages
 """
 
 import os
@@ -14,7 +14,7 @@ import matplotlib as mpl
 import pytest
 from pages import ROOT, run_page, runnable
 
-GALLERY = ROOT / "docs" / "gallery"
+DOCS = ROOT / "docs"
 
 
 def remake(page: Path) -> None:
@@ -25,7 +25,7 @@ def remake(page: Path) -> None:
         parts = list(runnable(text))
         run_page(page.name, parts, Path(folder), patch, lambda *both: heard.append(both))
         for picture in Path(folder).glob("*.svg"):
-            shutil.copy(picture, GALLERY)
+            shutil.copy(picture, page.parent)
             print(picture.name, picture.stat().st_size)
     for message, printed in heard:
         text = text.replace(f"```text\n{message}```", f"```text\n{printed}```", 1)
@@ -35,5 +35,6 @@ def remake(page: Path) -> None:
 if __name__ == "__main__":
     os.environ["SOURCE_DATE_EPOCH"] = "0"  # so that equal pictures are equal files
     mpl.rcParams["svg.hashsalt"] = "gallery"
-    for chosen in sys.argv[1:] or sorted(page.stem for page in GALLERY.glob("*.md") if page.stem != "index"):
-        remake(GALLERY / f"{chosen}.md")
+    gallery = sorted(f"gallery/{page.stem}" for page in DOCS.glob("gallery/*.md") if page.stem != "index")
+    for name in sys.argv[1:] or gallery:
+        remake(DOCS / f"{name}.md")

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from scvi_codegen.codegen.native.building import Library
 from scvi_codegen.codegen.native.options import FAILURES, FALLBACK_REQUIRED, SolverOptions, checked_options
 from scvi_codegen.codegen.rendering.source import Source
-from scvi_codegen.codegen.rendering.text import DEPENDENT, INPUT_PRECISION, ROUNDING_UNITS
+from scvi_codegen.codegen.rendering.text import INPUT_PRECISION, ROUNDING_UNITS
 from scvi_codegen.common.cache import template_folder
 from scvi_codegen.common.errors import MethodError
+from scvi_codegen.common.tangent_space import DEPENDENT
 
 RESULTS, FIRST_RESULT = Struct("=4d4q"), "error"
 """Format of the last fields of the struct (``calls_declarations.h``), and the first of them."""
@@ -37,9 +38,14 @@ CONSISTENT = (
 """Declaration of the function of ``calls.h`` that only constraints of named coordinates have."""
 DEFECTS = (
     "int NAME(call_defects)(NAME(call) *call, long long count, const double *t, const double *h, const double *q, "
-    "const double *p, double *defects);\n"
+    "const double *p, const double *size, double part, double *defects, int *small, "
+    "int *parts);\n"
+    "int NAME(call_differences)(NAME(call) *call, long long count, const double *t, const double *h, const double *q, "
+    "const double *p, const double *size, const double *defects, const int *parts, int vectors, "
+    "double rounding, unsigned long long seed, const double *before, double *now, long long stride, double *errors, "
+    "double *deviations);\n"
 )
-"""Declaration of that which only named coordinates in double have."""
+"""Declaration of those which only named coordinates in double have."""
 OPTIONAL_FUNCTIONS = frozenset(("advance_to", "set_fallback", "project"))
 """Functions that not all integrators have, HAS_.. in ``calls.h`` like the optional fields of a run."""
 
@@ -53,9 +59,10 @@ def with_calls(source: Source) -> Source:
         further, switches = DEFECTS, "#define HAS_DEFECTS\n"
         if sizes.constraints:
             further, switches = further + CONSISTENT, switches + LIMITS_ON_CONSTRAINTS
+    errors = _text("support/derivatives/error_vectors") if further else ""
     declarations, functions = (
         re.sub(r"NAME\((\w+)\)", rf"{source.prefix}_\1", text)
-        for text in (_text("calls_declarations") + further, _text("calls"))
+        for text in (_text("calls_declarations") + further, errors + _text("calls"))
     )
     present = [name for name in source.contents.functions if name in OPTIONAL_FUNCTIONS]
     switches += "".join(f"#define HAS_{name.upper()}\n" for name in (*present, *source.contents.run_fields))

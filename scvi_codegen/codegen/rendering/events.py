@@ -351,44 +351,54 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controll
             guarded=tuple(number for number, event in enumerate(events) for _ in event.conditions),
             uses_velocity=arrays.uses_velocity,
         )
+    return EventSearch(**common, **_formula_part(interface, events), **_change_part(interface, events))
+
+
+def _formula_part(interface: Interface, events: Sequence[SearchedEvent]) -> dict[str, Any]:
+    """Return the kernels of functions, conditions and changes of events, and what they depend on."""
     formulas = EventFormulas(interface, events)
-    sides = [event.power_sides for event in events if isinstance(event, Kink)]
-    refracts = [isinstance(event, Refraction) for event in events]
     timed = [0 if interface.in_tau else _kind_in_time(g, formulas.arguments) for g in formulas.functions]
-    turning = tuple(len(member.coordinates) for member in RotationNames.members_of(interface.rotations))
     bounds = [
         reaches(g, symbol(TIME), formulas.q[0]) if kind else (sympy.S.Zero,) * 3
         for g, kind in zip(formulas.functions, timed, strict=True)
     ]
-    formulas_of_kernel = {
+    of_kernel = {
         "event_functions": formulas.functions,
         "event_guards": [guard for _, guard in formulas.guards],
         "event_changes": [value for _, values in formulas.changes for value in values],
         "event_reaches": [bound for pair in bounds for bound in pair] if any(timed) else [],
     }
-    variables = {symbol for values in formulas_of_kernel.values() for value in values for symbol in value.free_symbols}
-    return EventSearch(
-        **common,
-        elements=tuple(formulas.elements),
-        timed=tuple(timed[first] for first in (0, *accumulate(formulas.elements[:-1]))),
-        guarded=tuple(number for number, _ in formulas.guards),
-        kernels=tuple(formulas.kernel(name, values) for name, values in formulas_of_kernel.items() if values),
-        uses_velocity=not variables.isdisjoint(formulas.v),
-        multipliers=0 if variables.isdisjoint(formulas.multipliers) else len(formulas.multipliers),
-        changed=tuple(index for indices, _ in formulas.changes for index in indices),
-        first_values=(0, *accumulate(len(values) for _, values in formulas.changes)),
-        parameters=len(interface.parameters),
-        modes=tuple(map(interface.parameters.index, formulas.modes)),
-        kinks=sum(isinstance(event, Kink) for event in events),
-        powers=tuple((int(-1 in side), int(1 in side)) for side in sides) if any(sides) else (),
-        refracts=tuple(map(int, refracts)) if any(refracts) else (),
-        contacts=tuple(_places(formulas.modes, contact) for contact in interface.contacts),
-        vectors=(1,) * (interface.dimension - sum(turning)) + turning,
-        contact_rows=interface.masked,
-        first_contact_row=len(interface.constraints) - interface.masked,
-        transitions=tuple((event.contact, event.kind) for event in events if isinstance(event, Transition)),
-        dissipates=interface.dissipates and all(isinstance(e, Transition) for e in events if e.changes_state),
-    )
+    variables = {symbol for values in of_kernel.values() for value in values for symbol in value.free_symbols}
+    return {
+        "elements": tuple(formulas.elements),
+        "timed": tuple(timed[first] for first in (0, *accumulate(formulas.elements[:-1]))),
+        "guarded": tuple(number for number, _ in formulas.guards),
+        "kernels": tuple(formulas.kernel(name, values) for name, values in of_kernel.items() if values),
+        "uses_velocity": not variables.isdisjoint(formulas.v),
+        "multipliers": 0 if variables.isdisjoint(formulas.multipliers) else len(formulas.multipliers),
+        "changed": tuple(index for indices, _ in formulas.changes for index in indices),
+        "first_values": (0, *accumulate(len(values) for _, values in formulas.changes)),
+        "parameters": len(interface.parameters),
+        "modes": tuple(map(interface.parameters.index, formulas.modes)),
+        "contacts": tuple(_places(formulas.modes, contact) for contact in interface.contacts),
+    }
+
+
+def _change_part(interface: Interface, events: Sequence[SearchedEvent]) -> dict[str, Any]:
+    """Return what events of each kind do: kinks, refractions, contacts and their transitions."""
+    sides = [event.power_sides for event in events if isinstance(event, Kink)]
+    refracts = [isinstance(event, Refraction) for event in events]
+    turning = tuple(len(member.coordinates) for member in RotationNames.members_of(interface.rotations))
+    return {
+        "kinks": sum(isinstance(event, Kink) for event in events),
+        "powers": tuple((int(-1 in side), int(1 in side)) for side in sides) if any(sides) else (),
+        "refracts": tuple(map(int, refracts)) if any(refracts) else (),
+        "vectors": (1,) * (interface.dimension - sum(turning)) + turning,
+        "contact_rows": interface.masked,
+        "first_contact_row": len(interface.constraints) - interface.masked,
+        "transitions": tuple((event.contact, event.kind) for event in events if isinstance(event, Transition)),
+        "dissipates": interface.dissipates and all(isinstance(e, Transition) for e in events if e.changes_state),
+    }
 
 
 def _places(modes: Sequence[str], contact: ContactRows) -> tuple[int, ...]:

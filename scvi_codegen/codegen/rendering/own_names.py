@@ -1,7 +1,7 @@
 """Names at file scope with the integrator's prefix, so that one translation unit can include several single files.
 
-C has no other means to hide macros, types and enumerators of an included file. This is not a C parser: it relies on the
-layout of the templates, where a declaration at file scope begins in the first column.
+C has no other means to hide macros, types and enumerators of an included file. Which names a source has is read by
+:mod:`~scvi_codegen.codegen.rendering.c_text`.
 """
 
 from __future__ import annotations
@@ -10,51 +10,53 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 
+from scvi_codegen.codegen.rendering.c_text import definitions, macros_of, names_of, pieces, renamed, squeezed, words
 from scvi_codegen.codegen.rendering.text import CONTINUATION, WIDTH, wrapped_prototype
 
-IGNORED = re.compile(r'/\*(?:[^*]|\*(?!/))*\*/|"(?:\\.|[^"\\])*"|^#(?:.*\\\n)*.*$', re.MULTILINE)
-MACRO = re.compile(r"^#define (?P<name>\w+)(?:\((?P<parameters>[^)]*)\))?(?P<body>(?:.*\\\n)*.*)$", re.MULTILINE)
-ATTRIBUTE = re.compile(r"__attribute__\(\((?:[^()]|\([^()]*\))*\)\)")
-FUNCTION = re.compile(r"[\w\s*]*?(\w+)\s*\(")
-DECLARED = re.compile(r"(\w+)\s*(?:\[[^=]*\])?\s*;?\s*$")
-EXPORTED = re.compile(r"\b(NAME|STATUS)\((\w+)\)")
-PREFIXING = re.compile(r"^#define (NAME|STATUS)\(word\) (\w+)##word.*\n", re.MULTILINE)
-SAME = re.compile(r"^typedef (\w+) \1;\n", re.MULTILINE)
-"""Type that already has its name, as ``solver_options`` of the integrator ``solver``."""
-TOKEN = re.compile(r'/\*(?:[^*]|\*(?!/))*\*/|"(?:\\.|[^"\\])*"|#include .*|##\w+|\bFMI\(\w+\)|\b[A-Za-z_]\w*')
-"""Comments, strings, words, and words pasted to the end of others, which are no names by themselves."""
-EXPORTED_OR_TOKEN = re.compile(rf"{EXPORTED.pattern}|{TOKEN.pattern}")
-DECLARATION = re.compile(r"^typedef struct (\w+) \{|^\} (\w+);|(\w+)\(", re.MULTILINE)
-"""Types and functions that a header declares; macros with the prefix are written as such in the code."""
-HEAD = re.compile(r'^(?P<head>[A-Za-z_][^;{}#/"]*\))(?=\n\{)', re.MULTILINE)
-"""Head of the definition of a function."""
-CONTINUED = re.compile(r"^#define .*\\\n(?:.*\\\n)*.*$", re.MULTILINE)
 BREAK = re.compile(r'(?:[^" ]|"(?:\\.|[^"\\])*")+ ')
+"""Text that no line break may divide, and the place behind it."""
 
 
 def with_distinct_names(texts: Mapping[str, str], header: str, prefix: str) -> dict[str, str]:
     """Return texts whose own names are none of those they export, as ``finish_step`` of an integrator ``finish``."""
-    if not any(f"{of}_" in text for of in (prefix, prefix.upper()) for text in texts.values()):
+    starts = f"{prefix}_", f"{prefix.upper()}_"
+    if not any(start in text for start in starts for text in texts.values()):
         return dict(texts)
-    exported = {
-        name for names in DECLARATION.findall(header) for name in names if name.lower().startswith(f"{prefix}_")
-    }
-    for kind, word in (export for text in texts.values() for export in EXPORTED.findall(text)):
-        exported.add(f"{prefix if kind == 'NAME' else prefix.upper()}_{word}")
-
-    def distinct(match: re.Match[str]) -> str:
-        name = match[0]
-        return f"{'LOCAL' if name.isupper() else 'local'}_{name}" if name in exported else name
-
-    return {file: EXPORTED_OR_TOKEN.sub(distinct, text) for file, text in texts.items()}
+    macros = {name for name, _ in definitions(header)}  # with the prefix in the code, too
+    exported = {name for name in words(header) - macros if name.startswith(starts[0])}
+    exported |= {_exported(name, prefix) for text in texts.values() for name in words(text) if name.endswith(")")}
+    distinct = {name: f"{'LOCAL' if name.isupper() else 'local'}_{name}" for name in exported}
+    return {file: renamed(text, distinct) for file, text in texts.items()}
 
 
-def with_exported_names(code: str) -> str:
-    """Return a source with exported names in place of the macros that make them."""
-    prefixes = dict(PREFIXING.findall(code))
-    code = EXPORTED.sub(lambda match: prefixes[match[1]] + match[2], PREFIXING.sub("", code))
-    code = SAME.sub("", code)
-    return re.sub(r"\n{3,}", "\n\n", _wrapped(code))
+def with_exported_names(texts: Mapping[str, str]) -> dict[str, str]:
+    """Return the files of a source with exported names in place of the macros that make them."""
+    exported = exported_names(texts.values())
+    heads = tuple(f"#define {name}" for name in ("NAME(word)", "STATUS(word)"))
+    files = {}
+    for file, code in texts.items():
+        plain = renamed("\n".join(line for line in code.split("\n") if not line.startswith(heads)), exported)
+        files[file] = squeezed(_wrapped("\n".join(line for line in plain.split("\n") if not _is_vain(line))))
+    return files
+
+
+def exported_names(texts: Iterable[str]) -> dict[str, str]:
+    """Return the exported name of each ``NAME(word)`` or ``STATUS(word)`` in the texts, by the macro in one of them."""
+    texts = [*texts]
+    macro = next((macros["NAME(word)"] for macros in map(macros_of, texts) if "NAME(word)" in macros), None)
+    prefix = macro.body[0].removesuffix("_") if macro else ""
+    return {name: _exported(name, prefix) for text in texts for name in words(text) if name.endswith(")")}
+
+
+def _exported(name: str, prefix: str) -> str:
+    """Return the exported name ``NAME(word)`` or ``STATUS(word)``."""
+    macro, word = name.removesuffix(")").split("(")
+    return f"{prefix if macro == 'NAME' else prefix.upper()}_{word}"
+
+
+def _is_vain(line: str) -> bool:
+    """Return whether a line gives a type the name that it has, as ``solver_options`` of the integrator ``solver``."""
+    return line.startswith("typedef ") and len(line.split()) == 3 and line.split()[1] + ";" == line.split()[2]
 
 
 def with_own_names(code: str, prefix: str, header: str) -> str:
@@ -65,27 +67,35 @@ def with_own_names(code: str, prefix: str, header: str) -> str:
         prefix: of its own names; exported ones may have another, of the integrator that it belongs to.
         header: included by the code; its names are retained.
     """
-    taken = set(TOKEN.findall(header + code))
+    taken = words(header) | words(code)
     names = {}
-    for name in FileScope(code).names(code):
+    for name in names_of(code, macros_of(code)):
         if not name.lower().startswith(f"{prefix.lower()}_"):
             upper, local = (prefix.upper(), "LOCAL") if name.isupper() else (prefix, "local")
             names[name] = f"{upper}_{name}" if f"{upper}_{name}" not in taken else f"{upper}_{local}_{name}"
-    renamed = TOKEN.sub(lambda match: names.get(match[0], match[0]), code)
-    return _wrapped(renamed)
+    return _wrapped(renamed(code, names))
 
 
 def _wrapped(code: str) -> str:
     """Return a source whose lines have changed lengths with those that are too long broken."""
-    code = HEAD.sub(lambda match: wrapped_prototype(" ".join(match["head"].split()).replace("( ", "(")), code)
-    return CONTINUED.sub(_aligned, "\n".join(_broken(code.split("\n"))))
+    broken = "\n".join(_broken([line for _, text in pieces(code) for line in _laid_out(text).split("\n")]))
+    aligned = (_aligned(text) if kind == "directive" and "\\\n" in text else text for kind, text in pieces(broken))
+    return "\n".join(aligned) + "\n"
 
 
-def _aligned(macro: re.Match[str]) -> str:
+def _laid_out(text: str) -> str:
+    """Return a declaration with the head of a function on as few lines as it needs."""
+    head, bracket, body = text.partition("\n{")
+    if not bracket or not head.endswith(")") or any(token in head for token in ';{}#/"'):
+        return text
+    return wrapped_prototype(" ".join(head.split()).replace("( ", "(")) + bracket + body
+
+
+def _aligned(macro: str) -> str:
     """Return the lines of a macro with the backslashes at their ends in one column."""
-    lines = [line.removesuffix("\\").rstrip() for line in macro[0].split("\n")]
-    width = max(map(len, lines[:-1])) + 1
-    return "\n".join([*(f"{line:{width}}\\" for line in lines[:-1]), lines[-1]])
+    lines = macro.split("\n")
+    width = max(len(line[:-1].rstrip()) for line in lines if line.endswith("\\")) + 1
+    return "\n".join(f"{line[:-1].rstrip():{width}}\\" if line.endswith("\\") else line for line in lines)
 
 
 def _broken(lines: Sequence[str]) -> Iterator[str]:
@@ -103,69 +113,3 @@ def _broken(lines: Sequence[str]) -> Iterator[str]:
             yield first + ("" if commented else end)
             line = f"{indent}{' * ' if commented else ''}{line}"
         yield line
-
-
-class FileScope:
-    """Names that declarations at file scope make, in a source with certain macros."""
-
-    def __init__(self, code: str) -> None:
-        macros = [*MACRO.finditer(code)]
-        self._makers = {
-            match["name"]: ([parameter.strip() for parameter in match["parameters"].split(",")], names)
-            for match in macros
-            if match["parameters"] and (names := re.findall(r"\bstatic\b[\w ]*?(\w+(?:##\w+)*)\(", match["body"]))
-        }
-        for match in macros:  # those that end in another one
-            call = re.search(r"(\w+)\(((?:[^()]|\([^()]*\))*)\)$", match["body"])
-            if call and (inner := self._makers.get(call[1])) and match["parameters"]:
-                arguments = dict(zip(inner[0], map(str.strip, call[2].split(",")), strict=False))
-                made = ["##".join(arguments.get(part, part) for part in name.split("##")) for name in inner[1]]
-                parameters = [parameter.strip() for parameter in match["parameters"].split(",")]
-                self._makers.setdefault(match["name"], (parameters, []))[1].extend(made)
-        self._local = {match["name"] for match in macros if not match["parameters"] and "static" in match["body"]}
-
-    def names(self, code: str) -> Iterator[str]:
-        """Yield the names of macros, of types and enumerators, and of variables and functions in order."""
-        yield from (match["name"] for match in MACRO.finditer(code))
-        for text in _declarations(ATTRIBUTE.sub("", IGNORED.sub("", code))):
-            yield from self._declared(text)
-
-    def _declared(self, text: str) -> Iterator[str]:
-        """Yield the names of one declaration, that of a function that is exported as ``NAME(word)``."""
-        head, _, rest = re.sub(r"\s=\s.*", "", text, flags=re.DOTALL).partition("{")
-        words = head.split()
-        if (maker := self._makers.get(head.partition("(")[0])) is not None:
-            yield from _made(*maker, head)
-        elif words[0] == "enum":
-            yield from re.findall(r"(?:^|,)\s*(\w+)", text[text.index("{") + 1 :])
-        elif words[0] in ("typedef", "struct"):
-            yield from re.findall(r"^(?:typedef )?(?:struct|union) (\w+)\s*$", head.strip())
-            if head.endswith(");"):
-                yield re.findall(r"(\w+)\)?\s*\(", head)[0]
-            elif words[0] == "typedef":
-                declared = (rest.rpartition("}")[2] or head).split(",")
-                yield from (name for declarator in declared for name in DECLARED.findall(declarator))
-        elif "static" in words or words[0] in self._local:
-            yield (FUNCTION.match(head) or DECLARED.search(head) or [""])[1]
-        elif exported := re.search(r"\bNAME\(\w+\)(?=\()", head):
-            yield exported[0]
-
-
-def _declarations(text: str) -> Iterator[str]:
-    """Yield the declarations and definitions at file scope."""
-    depth, lines = 0, list[str]()
-    for line in text.split("\n"):
-        if lines or line[:1].isidentifier():
-            lines.append(line.rstrip())
-            depth += line.count("{") - line.count("}")
-            if depth == 0 and lines[-1].endswith((";", "}")):
-                yield "\n".join(lines)
-                lines = []
-
-
-def _made(parameters: Iterable[str], names: Iterable[str], head: str) -> Iterator[str]:
-    """Yield the names of functions that a macro defines, and those parts of them that the macro contains."""
-    arguments = dict(zip(parameters, re.split(r"[(),]", head)[1:], strict=False))
-    for name in names:
-        yield from [part for part in name.split("##")[:1] if part not in arguments]
-        yield "".join(arguments.get(part, part).strip() for part in name.split("##"))

@@ -9,34 +9,32 @@ begin with ``_`` or ``SCVI_`` remain, as do those on macros that are defined und
 from __future__ import annotations
 
 import posixpath
-import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+
+from scvi_codegen.codegen.rendering.c_text import squeezed, words
 
 Read = Callable[[str], str]
 """Function that returns the text of a support header by its name, ``support/...``."""
 
-DIRECTIVE = re.compile(r"#(?P<word>ifdef|ifndef|if|elif|else|endif|define|undef|include|error)\b *(?P<rest>.*)$")
-DEFINED = re.compile(r"(?P<negated>!)?defined\((?P<macro>\w+)\)")
-INCLUDED = re.compile(r'^#include "(?P<name>(?:support/(?:\w+/)?|\.\./\w+/)?\w+\.h)"', re.MULTILINE)
-SWITCH = re.compile(r"#define (?P<macro>\w+)(?: /\*.*\*/)?")
-MACRO_NAME = re.compile(r"\w+")
-COMMENT = re.compile(r" *(?://.*|/\*.*)$")
-COMMENTS = re.compile(r"/\*.*?\*/", re.DOTALL)
+DIRECTIVES = {"ifdef", "ifndef", "if", "elif", "else", "endif", "define", "undef", "include", "error"}
+SUPPORT = "support/"
+"""Folder of the support headers, from which the sources include them."""
 
 
 def _directive(line: str) -> tuple[str, str]:
     """Return the word of a directive and the rest of its line without a comment; empty words for other lines."""
-    match = DIRECTIVE.match(line)
-    return (match["word"], COMMENT.sub("", match["rest"])) if match else ("", "")
+    word, _, rest = line[1:].partition(" ") if line.startswith("#") else ("", "", "")
+    return (word, rest.partition("/*")[0].strip()) if word in DIRECTIVES else ("", "")
 
 
 def _support_name(line: str, folder: str) -> str | None:
     """Return the name of the support header that a line of a file in a folder includes, or ``None``."""
-    match = INCLUDED.match(line)
-    if match is None or (not folder and not match["name"].startswith("support/")):
+    if not line.startswith('#include "'):
         return None
-    return posixpath.normpath(posixpath.join(folder, match["name"]))
+    name = line.split('"')[1]
+    is_beside = folder and (name.startswith("../") or "/" not in name)  # others are those of libraries
+    return posixpath.normpath(posixpath.join(folder, name)) if is_beside or name.startswith(SUPPORT) else None
 
 
 def included(code: str, read: Read) -> tuple[tuple[str, str], ...]:
@@ -44,8 +42,8 @@ def included(code: str, read: Read) -> tuple[tuple[str, str], ...]:
     texts: dict[str, str] = {}
 
     def visit(text: str, folder: str) -> None:
-        for match in INCLUDED.finditer(text):
-            name = _support_name(match[0], folder)
+        for line in text.split("\n"):
+            name = _support_name(line, folder)
             if name is not None and name not in texts:
                 texts[name] = read(name)
                 visit(texts[name], posixpath.dirname(name))
@@ -91,10 +89,10 @@ class _Macros:
 
     def _term(self, term: str) -> bool | None:
         """Return whether a condition on one macro holds; ``None`` if unknown."""
-        match = DEFINED.fullmatch(term)
-        if match is None or match["macro"] in self.uncertain or match["macro"].startswith(("_", "SCVI_")):
+        macro = term.removeprefix("!").removeprefix("defined(").removesuffix(")")
+        if "defined(" not in term or macro in self.uncertain or macro.startswith(("_", "SCVI_")):
             return None
-        return (match["macro"] in self.defined) != bool(match["negated"])
+        return (macro in self.defined) != term.startswith("!")
 
 
 def _joined(ends: Sequence[_Macros]) -> _Macros:
@@ -154,7 +152,7 @@ class _Preprocessor:
                 continue
             word, rest = _directive(part)
             if word in ("define", "undef"):
-                macro = MACRO_NAME.findall(rest)[0]
+                macro = rest.split("(")[0].split()[0]
                 self._macros.uncertain.discard(macro)
                 (self._macros.defined.add if word == "define" else self._macros.defined.discard)(macro)
             self._macros.failed |= word == "error"
@@ -192,7 +190,8 @@ class _Preprocessor:
 def preprocessed(code: str, read: Read) -> str:
     """Return a source with support headers inserted, without known conditions and macros that nothing uses."""
     lines = _Preprocessor(code, read).lines
-    rest = COMMENTS.sub("", "\n".join(line for line in lines if not SWITCH.fullmatch(line)))
-    used = set(re.findall(r"\w+", rest))
-    kept = [line for line in lines if not ((switch := SWITCH.fullmatch(line)) and switch["macro"] not in used)]
-    return re.sub(r"\n{3,}", "\n\n", "\n".join(kept).rstrip() + "\n")
+    directives = {line: _directive(line) for line in lines if line.startswith("#define ")}
+    switches = {line: name for line, (_, name) in directives.items() if name.isidentifier()}
+    used = words("\n".join(line for line in lines if line not in switches))
+    kept = (line for line in lines if line not in switches or switches[line] in used)
+    return squeezed("\n".join(kept).rstrip() + "\n")

@@ -1,20 +1,30 @@
 """Files of a source as a reader needs them: what exported functions reach, each declaration behind those that it needs.
 
-The first file has the step and its run, and includes the others. Like
-:mod:`~scvi_codegen.codegen.rendering.own_names` this relies on the layout of the templates, where a declaration at file
-scope begins in the first column, and is not a C parser: a name counts as used wherever it occurs other than as a
-member. The support headers serve all integrators, each of which uses a part of them, and no C compiler prints a source
-without what it does not use.
+The first file has the step and its run, and includes the others. A name counts as used wherever it occurs other than as
+a member (:mod:`~scvi_codegen.codegen.rendering.c_text`). The support headers serve all integrators, each of which uses
+a part of them, and no C compiler prints a source without what it does not use.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain, groupby, pairwise
 
-from scvi_codegen.codegen.rendering.own_names import FileScope
+from scvi_codegen.codegen.rendering.c_text import (
+    Macro,
+    definitions,
+    macros_of,
+    names_of,
+    pieces,
+    renamed,
+    squeezed,
+    tokens,
+    words,
+)
+from scvi_codegen.codegen.rendering.own_names import exported_names
 
 FIRST = "solve", "NAME(step)"
 """Functions whose source comes first."""
@@ -32,15 +42,10 @@ FILES = {
 """Files behind that of the step and its run: what they are, and their exported functions."""
 PREFIXED = {"NAME", "STATUS"}
 """Macros of the prefix, which stay."""
-WORD = re.compile(r"\b(?:NAME|STATUS)\(\w+\)|(?<![.\w])(?<!->)[A-Za-z_]\w*")
-COMMENTS = re.compile(r"/\*.*?\*/", re.DOTALL)
-REQUIRED = re.compile(r"\s+(?:\* )?Requires:.*?(?= \*/)", re.DOTALL)
-CHOICE = re.compile(r"\b[A-Z]{4,}(?:_[A-Z]+)*\b")
-"""Name of an alternative or number in a comment."""
-ALIAS = re.compile(r"^#define (\w+)(?: ([A-Za-z_][\w ]*)|\((\w+)\) \3(?: /\*.*\*/)?)$", re.MULTILINE)
-"""Macro that is another name, keywords or its argument."""
-UNDEFINED = re.compile(r"^#undef (\w+)$", re.MULTILINE)
-STANDARD = {"#include <float.h>": r"\b(DBL|FLT)_", "#include <limits.h>": r"\b(INT|U?L?LONG)_M"}
+STANDARD = {
+    "#include <float.h>": ("DBL_", "FLT_"),
+    "#include <limits.h>": ("INT_M", "LONG_M", "LLONG_M", "ULONG_M", "ULLONG_M"),
+}
 """Standard headers that not every source uses, and names that they define."""
 MEANINGS = "#define", "#undef", "typedef", "struct"
 """Beginnings of declarations on whose words those depend that mention their names."""
@@ -72,7 +77,7 @@ class Part:
     @cached_property
     def words(self) -> frozenset[str]:
         """Names that occur in it and in the conditions around it."""
-        return frozenset(WORD.findall(COMMENTS.sub("", "\n".join((*self.conditions, *self.lines)))))
+        return words("\n".join((*self.conditions, *self.lines)))
 
     @property
     def leaves(self) -> Iterator[Part]:
@@ -92,94 +97,167 @@ def readable(code: str) -> dict[str, str]:
     if "#define NAME(" not in code:
         return {"": code}
     code = _without_aliases(code.replace(CHOICES, ""))
-    scope = FileScope(code)
-    parts = tuple(_parts(code.split("\n"), scope, ()))
-    files = _by_file(_without_alternatives(_reached(parts)))
+    files = _by_file(_without_alternatives(_reached([*_parts(code, macros_of(code))])))
     texts = {
         name: "\n".join([f"/* {FILES[name][0]} */\n" if name else "", *_lines(file)]).strip("\n")
         for name, file in files.items()
     }
-    for include, names in STANDARD.items():
-        if not any(re.search(names, text) for text in texts.values()):
+    used = frozenset.union(*map(words, texts.values()))
+    for include, beginnings in STANDARD.items():
+        if not any(word.startswith(beginnings) for word in used):
             texts[""] = texts[""].replace(f"{include}\n", "")
-    return {name: re.sub(r"\n{3,}", "\n\n", text) + "\n" for name, text in texts.items()}
+    return {name: f"{squeezed(text)}\n" for name, text in texts.items()}
 
 
 def _without_aliases(code: str) -> str:
-    """Return a source with other names, or its argument, in place of each macro that is nothing else."""
-    for name, body, _ in ALIAS.findall(code):
-        mentions = rf"^#(?:define {name}\b|(?:undef|if|ifn?def|elif) .*\b{name}\b)"
-        if len(re.findall(mentions, code, re.MULTILINE)) == 1:  # no condition, and no other definition
-            used = rf"(?<!#define )\b{name}\b"
-            code = re.sub(used, body, code) if body else re.sub(rf"{used}\(([^()]*)\)", r"\1", code)
-    return code
+    """Return a source with other names in place of macros that are nothing else, and arguments of those that are it."""
+    mentions, names = Counter[str](), dict[str, str]()
+    for line in code.split("\n"):
+        if line.startswith("#"):
+            _, word, *rest = tokens(line)
+            mentions.update({*rest[:1]} if word == "define" else {*rest})
+    commented = {name for name, line in definitions(code) if line.endswith("*/")}
+    for name, macro in macros_of(code).items():
+        if (
+            mentions[name] == 1
+            and macro.parameters is None
+            and name not in commented
+            and macro.body
+            and all(map(str.isidentifier, macro.body))
+        ):
+            names[name] = " ".join(macro.body)
+        elif mentions[name] == 1 and macro.parameters == macro.body:
+            code = _without_calls(code, name)
+
+    while named := [name for name, text in names.items() if any(word in names for word in text.split())]:
+        names |= {name: " ".join(names.get(word, word) for word in names[name].split()) for name in named}
+
+    def defines(line: str) -> bool:
+        return line.startswith("#define ") and line.split()[1] in names
+
+    blocks = ((own, "\n".join(lines)) for own, lines in groupby(code.split("\n"), defines))
+    return "\n".join(text if own else renamed(text, names, comments=True) for own, text in blocks)
 
 
-def _parts(lines: Sequence[str], scope: FileScope, conditions: tuple[str, ...]) -> Iterator[Part]:
-    """Yield the parts of lines at file scope in order."""
-    rest, joined, opened = iter(lines), False, False
+def _without_calls(code: str, macro: str) -> str:
+    """Return a source with the arguments in place of calls of a macro that is its argument, except of calls in them."""
+    first, *rest = code.split(f"{macro}(")
+    texts = [first]
+    for text in rest:
+        argument, _, after = text.partition(")")
+        last = texts[-1]
+        is_other = last[-1:].isidentifier() or last[-1:].isdigit() or last.endswith("#define ")
+        texts += [f"{macro}(", text] if is_other or "(" in argument else [f"{argument}{after}"]
+    return "".join(texts)
+
+
+def _parts(code: str, macros: Mapping[str, Macro], conditions: tuple[str, ...] = ()) -> Iterator[Part]:
+    """Yield the parts of a text at file scope in order."""
+    rest, joined, opened = pieces(code), False, False
     section, comment = tuple[str, ...](), tuple[str, ...]()
-    for line in rest:
-        if not line:
+    for kind, text in rest:
+        if kind == "blank":
             if comment:
                 section, opened = ((*section, "\n".join(comment)) if opened else ("\n".join(comment),)), True
             comment, joined = (), False
             continue
-        block = (line, *_continued(line, rest))
-        if line.startswith("/*"):
-            comment += block
+        if kind == "comment":
+            comment += (text,)
             continue
-        if line.startswith("#if"):
-            branches = tuple(_branches(block, scope, conditions))
+        branches, names = tuple[tuple[str, tuple[Part, ...]], ...](), frozenset[str]()
+        if text.startswith("#if"):
+            lines = _branches(text, rest)
+            text = "\n".join((*chain.from_iterable(lines), "#endif"))
+            inside = (*conditions, text.split("\n")[0])
+            branches = tuple((first, tuple(_parts("\n".join(block), macros, inside))) for first, *block in lines)
             names = frozenset(name for _, parts in branches for part in parts for name in part.names)
+        elif text.startswith("#undef "):
+            names = frozenset(text.split()[1:2])
         else:
-            branches, names = (), _names(scope, block)
-        comment = tuple(REQUIRED.sub("", "\n".join(comment)).split("\n")) if comment else ()
-        yield Part(comment, block, names, conditions, section, joined and not comment, branches)
+            names = frozenset(names_of(text, macros)) - PREFIXED
+        comment = tuple(_for_readers("\n".join(comment)).split("\n")) if comment else ()
+        yield Part(comment, (*text.split("\n"),), names, conditions, section, joined and not comment, branches)
         comment, joined, opened = (), True, False
 
 
-def _names(scope: FileScope, block: Sequence[str]) -> frozenset[str]:
-    """Return the names that a declaration or macro makes, without parts of them that a macro contains."""
-    text = "\n".join(block)
-    names = {name for name in scope.names(text) if not name.endswith("_")}
-    return frozenset(names.union(UNDEFINED.findall(text)) - PREFIXED)
+def _branches(first: str, rest: Iterator[tuple[str, str]]) -> list[list[str]]:
+    """Return the texts in the branches of a conditional, each behind its line; takes those up to its end."""
+    branches, depth = [[first]], 1
+    for _, text in rest:
+        depth += text.startswith("#if") - text.startswith("#endif")
+        if depth == 0:
+            break
+        if depth == 1 and text.startswith(("#else", "#elif")):
+            branches.append([text])
+        else:
+            branches[-1].append(text)
+    return branches
 
 
-def _continued(line: str, rest: Iterator[str]) -> Iterator[str]:
-    """Yield the lines of a part or comment behind the first one."""
-    if line.startswith("/*"):
-        while not line.endswith("*/"):
-            line = next(rest)
-            yield line
-    elif line.startswith("#"):
-        depth, commented = int(line.startswith("#if")), False
-        while (commented := _is_open(line, commented)) or depth or line.endswith("\\"):
-            line = next(rest)
-            depth += line.startswith("#if") - line.startswith("#endif")
-            yield line
-    else:
-        code, depth = COMMENTS.sub("", line).rstrip(), 0
-        while (depth := depth + code.count("{") - code.count("}")) or not code.endswith((";", "}")):
-            line = next(rest)
-            code = COMMENTS.sub("", line).rstrip()
-            yield line
+def _for_readers(comment: str) -> str:
+    """Return a comment without what its templates require."""
+    before, required, after = comment.partition("Requires:")
+    if not required:
+        return comment
+    return before.rstrip().removesuffix("\n *").rstrip() + after[after.index(" */") :]
 
 
-def _is_open(line: str, before: bool) -> bool:
-    """Return whether a comment continues behind a line."""
-    return line.rfind("/*") > line.rfind("*/") or (before and "*/" not in line)
+def _alternatives(comment: str) -> frozenset[str]:
+    """Return the names of alternatives or numbers in a comment."""
+    found = words(comment.strip("/*"))
+    return frozenset(w for w in found if w.isupper() and w.replace("_", "").isalpha() and len(w.split("_")[0]) > 3)
 
 
-def _branches(block: Sequence[str], scope: FileScope, outer: tuple[str, ...]) -> Iterator[tuple[str, tuple[Part, ...]]]:
-    """Yield the branches of a conditional."""
-    depth, start = 0, 0
-    for i, line in enumerate(block):
-        depth -= line.startswith("#endif")
-        if i and (depth == 0 or (depth == 1 and line.startswith(("#else", "#elif")))):
-            yield block[start], tuple(_parts(block[start + 1 : i], scope, (*outer, block[0])))
-            start = i
-        depth += line.startswith("#if")
+@dataclass(frozen=True, slots=True)
+class Function:
+    """A function of a source.
+
+    Attributes:
+        name: as it is called.
+        arguments: their names in order.
+        comment: the one above it, on one line, or empty.
+        text: all of it, without the comment; of which ``body`` is between its braces.
+        calls: the functions of the same source that it calls, in order of first call.
+    """
+
+    name: str
+    arguments: tuple[str, ...]
+    comment: str
+    text: str
+    calls: tuple[str, ...]
+
+    @property
+    def body(self) -> str:
+        """Lines between its braces."""
+        return self.text.partition("\n{\n")[2].removesuffix("}")
+
+
+def functions_of(code: str) -> dict[str, Function]:
+    """Return every function with a body, by its exported or own name, in order; of alternatives the first."""
+    code, exported = _without_aliases(code), exported_names([code])
+    bodies: dict[str, Part] = {}
+    for part in _parts(code, macros_of(code)):
+        for leaf in part.leaves:
+            if "{" in leaf.lines:
+                (name,) = leaf.names
+                bodies.setdefault(exported.get(name, name), leaf)
+    functions = {}
+    for name, leaf in bodies.items():
+        text = renamed("\n".join(leaf.lines), exported)
+        above = "\n".join(leaf.comment).rpartition("/*")[2].removesuffix("*/")
+        comment = " ".join(above.replace("\n *", " ").split())
+        called = dict.fromkeys(word for word, after in pairwise(tokens(text)) if after == "(" and word in bodies)
+        calls = tuple(word for word in called if word != name)
+        functions[name] = Function(name, (*_arguments(text, name),), comment, text, calls)
+    return functions
+
+
+def _arguments(text: str, name: str) -> Iterator[str]:
+    """Yield the names of the arguments of a function."""
+    head = [*tokens(text.partition("\n{\n")[0])]
+    for argument, after in pairwise(head[head.index(name) + 1 :]):
+        if argument.isidentifier() and argument != "void" and after in (",", ")", "["):
+            yield argument
 
 
 def _is_exported(part: Part) -> bool:
@@ -293,7 +371,7 @@ def _without_alternatives(parts: Sequence[Part]) -> list[Part]:
     names = {name for part in parts for leaf in part.leaves for name in leaf.words}
     kept = []
     for part in parts:
-        comments = [REQUIRED.sub("", comment) for comment in part.section]
-        section = [comment for comment in comments if comment != "/* */" and {*CHOICE.findall(comment)} <= names]
+        comments = [_for_readers(comment) for comment in part.section]
+        section = [comment for comment in comments if comment != "/* */" and _alternatives(comment) <= names]
         kept.append(replace(part, section=tuple(section)))
     return kept

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from scvi_codegen.codegen.rendering.own_names import with_distinct_names, with_exported_names, with_own_names
 from scvi_codegen.codegen.rendering.preprocessor import preprocessed
-from scvi_codegen.codegen.rendering.reachable import readable
+from scvi_codegen.codegen.rendering.reachable import Function, functions_of, readable
 from scvi_codegen.systems.contact import Impacts
 from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.event import Event, Kink, Refraction, Transition
@@ -170,8 +170,12 @@ class Source:
     @property
     def _readable_files(self) -> dict[str, str]:
         """Files without what no exported function uses, by name; that of the step first."""
-        files = readable(self.amalgamated().code)
-        return dict(zip(files, with_exported_names("\f".join(files.values())).split("\f"), strict=True))
+        return with_exported_names(readable(self.amalgamated().code))
+
+    @property
+    def functions(self) -> dict[str, Function]:
+        """Functions of the code and its support headers with a body, by name, in order."""
+        return functions_of(self.amalgamated().code)
 
     def with_distinct_names(self, prefix: str) -> Source:
         """Return the source with names of its own beside the exported ones, which have the prefix."""

@@ -17,8 +17,6 @@ ROUNDING_UNITS, INPUT_PRECISION, LARGEST_VIOLATION = 64.0, 1e-6, 1e-2
 
 Rounding, in units of it; precision of typed numbers, corrected silently; largest violation that is accepted.
 """
-DEPENDENT = 1e-9
-"""Smallest singular value of G, with rows of length 1, below which rows count as linearly dependent."""
 
 
 WIDTH = 120

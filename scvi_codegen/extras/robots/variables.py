@@ -14,7 +14,8 @@ from sympy.core.function import AppliedUndef
 
 from scvi_codegen.api.formulas import Rotation, jacobian
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.systems.derived_expressions import coupled_blocks, dense, inverse_by_minors, row_rank
+from scvi_codegen.common.tangent_space import tangent_space
+from scvi_codegen.systems.derived_expressions import coupled_blocks, dense, inverse_by_minors
 from scvi_codegen.systems.formulas.expressions import evaluated, gradient, samples, unsupported_part
 from scvi_codegen.systems.rotations.points import torque_of
 
@@ -158,7 +159,7 @@ def independent_of(earlier: Sequence[Expr], asked: Sequence[Expr], rates: Sequen
     basis, independent = rows[: len(earlier)], []
     for k, row in enumerate(rows[len(earlier) :]):
         more = np.vstack([basis, row])
-        if row_rank(more) > row_rank(basis):
+        if tangent_space(more).rank > tangent_space(basis).rank:
             independent.append(k)
             basis = more
     return tuple(independent)

@@ -35,6 +35,15 @@ Exit status: 0 on success; 1 if a step failed, a guaranteed property is violated
 cannot be written; 2 if the command line or a model is invalid; 130 after Ctrl-C.
 """
 
+START = """scvi-codegen compiles a Lagrangian into a variational integrator in C. Begin with:
+
+  scvi-codegen run kepler --plot orbit.png     integrate a problem of the catalogue, and draw it
+  scvi-codegen systems kepler > mine.toml      write it as a model file, to change
+  scvi-codegen run mine.toml                   integrate the model file
+
+scvi-codegen --help lists all commands, scvi-codegen run --help the options of a run.
+"""
+
 ABOUT = {
     "cache": "Show or clear the cache of compiled integrators.",
     "doctor": "Check compiler and libraries of this machine.",
@@ -52,8 +61,12 @@ ABOUT = {
     folder="scvi_codegen.interfaces.cli.commands",
     about=ABOUT,
     help=OVERVIEW,
+    invoke_without_command=True,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 @click.version_option(package_name="scvi-codegen", prog_name="scvi-codegen")
-def main() -> None:
-    """Entry point of the command ``scvi-codegen``."""
+@click.pass_context
+def main(context: click.Context) -> None:
+    """Entry point of the command ``scvi-codegen``; without arguments it prints the commands to begin with."""
+    if context.invoked_subcommand is None:
+        click.echo(START, nl=False)

@@ -8,9 +8,10 @@ as numbers: by default the text is printed, with ``--json`` the numbers, with ``
 import json
 import math
 import os
+import re
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
@@ -112,15 +113,35 @@ class Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command; convert errors into messages and exit statuses, with ``--json`` also into a document."""
-        if "--json" in ctx.args:  # before arguments are read, whose errors it contains
+        arguments = [*ctx.args]
+        if "--json" in arguments:  # before arguments are read, whose errors it contains
             _begin_report(ctx, None, as_json=True)
         try:
-            with errors_as_messages():
+            with errors_as_messages(arguments):
                 return super().invoke(ctx)
         except click.ClickException as error:
             if REPORT in ctx.meta:
                 ctx.meta[REPORT]["error"] = _described(error)
             raise
+
+
+def _in_flags(message: str, arguments: Sequence[str]) -> str:
+    """Return a message that names options by the flags of the command line, where these have set them.
+
+    ``[run] save_every`` of a model file and ``save_every =`` of a call are ``--save-every``.
+    """
+    flags = {word.partition("=")[0] for word in arguments if word.startswith("--")}
+    if not flags:
+        return message
+    from scvi_codegen.interfaces.models.options import METHOD, OPTIONS
+
+    for option in OPTIONS:
+        if option.flag in flags and option.section:
+            key = "" if option.is_section or option.kind == METHOD else rf" {option.key}\b"
+            message = re.sub(rf"\[{option.section}\]{key}", option.flag, message)
+            if option.section == "run":  # others are variables of formulas, too: t, q
+                message = re.sub(rf"(?<![\w-]){option.field} ?= ?", f"{option.flag} ", message)
+    return re.sub(r"(--[\w-]+) (?=[,.;:)])", r"\1", message)
 
 
 def _described(error: click.ClickException) -> dict[str, Any]:
@@ -135,8 +156,11 @@ def _described(error: click.ClickException) -> dict[str, Any]:
 
 
 @contextmanager
-def errors_as_messages() -> Iterator[None]:
-    """Convert errors that a user can cause into one message and an exit status, and warnings into lines."""
+def errors_as_messages(arguments: Sequence[str] = ()) -> Iterator[None]:
+    """Convert errors that a user can cause into one message and an exit status, and warnings into lines.
+
+    Messages name options by the flags among the arguments of the command line.
+    """
     try:
         with _warnings_as_lines():
             yield
@@ -145,7 +169,7 @@ def errors_as_messages() -> Iterator[None]:
     except ScviCodegenError as error:
         cause = error.__cause__
         unwritten = isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError)
-        raise CommandFailure(str(error), FAILURE if unwritten else USAGE) from error
+        raise CommandFailure(_in_flags(str(error), arguments), FAILURE if unwritten else USAGE) from error
     except BrokenPipeError:
         raise
     except OSError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
@@ -25,18 +26,21 @@ def duration(seconds: float) -> str:
     return f"{seconds / 1e-9:.3g} ns"
 
 
-def in_known_digits(x: float, error: float) -> str:
+def in_known_digits(x: float, error: float, size: float = 0.0) -> str:
     """Return a number rounded to the digits that an error leaves right; 17 digits if the error is 0 or not finite.
 
-    A number of which no digit is right is not printed, only its error.
+    A number of which no digit is right is not printed, only its error; it is 0 if that is less than rounding of
+    ``size``, that of the motion of this coordinate.
     """
     if error == 0.0 or not math.isfinite(error):
         return f"{x: .17g}"
-    if x == 0.0:
-        return f" 0 within {error:.1g}"
     decimals = math.floor(-math.log10(2.0 * error))
-    digits = math.floor(math.log10(abs(x))) + 1 + decimals
-    return f"{x: .{min(digits, 17)}g}" if digits > 0 else f" no digit (error {error:.1g})"
+    digits = math.floor(math.log10(abs(x))) + 1 + decimals if x else 0
+    if digits > 0:
+        return f"{x: .{min(digits, 17)}g}"
+    if error < sys.float_info.epsilon * size:
+        return " 0"
+    return f" no digit (error {error:.1g})" if x else f" 0 within {error:.1g}"
 
 
 def table(rows: Sequence[Sequence[str]]) -> str:

@@ -145,9 +145,12 @@ def event_counts(events: Iterable[Crossings]) -> Iterator[str]:
 
 
 def _geometry(model: Model, run: Run) -> str:
-    """Return whether the map is symplectic; adaptive steps destroy this property."""
-    if not is_symplectic(model.method_of_runs, model.system):
+    """Return whether the map is symplectic: not with noise, contacts, changes at events and adaptive steps."""
+    system = model.array_system or model.system
+    if system.bath or model.system.contacts or not is_symplectic(model.method_of_runs, model.system):
         return "not symplectic"
+    if any(event.then or event.restitution not in (None, 1) for event in model.events):
+        return "symplectic only between events"
     return "symplectic" if isinstance(run.plan, FixedSteps) else "symplectic only at fixed step size"
 
 
@@ -231,8 +234,10 @@ def final_state(
         return
     yield f"final state ({_how_known(final_error)})"
     for i, (name, other, q, p) in enumerate(zip(shown, columns, positions, momenta, strict=False)):
-        error_q, error_p = (of[-1, i] for of in final_error.bounds) if final_error else (0.0, 0.0)
-        yield f"  {name:{width}} = {in_known_digits(q, error_q):24} {other:{column}} = {in_known_digits(p, error_p)}"
+        errors = [of[-1, i] for of in final_error.bounds] if final_error else [0.0, 0.0]
+        sizes = final_error.sizes[:, i] if final_error else [0.0, 0.0]
+        known_q, known_p = map(in_known_digits, (q, p), errors, sizes)
+        yield f"  {name:{width}} = {known_q:24} {other:{column}} = {known_p}"
     if len(names) > SHOWN_COORDINATES:
         yield f"  and {len(names) - SHOWN_COORDINATES} more coordinates"
 

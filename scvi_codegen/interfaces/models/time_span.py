@@ -103,15 +103,14 @@ class TimeSpan(RunOptions):
         if self.in_double_double:
             raise ModelFileError(
                 f"{what} is not available with precision = 'double-double': omit it, or use precision = 'double' "
-                "([run] precision, run --precision)"
+                "([run] precision)"
             )
 
     def _check_alone(self) -> None:
         """Raise an error for a single run with an option of ensembles."""
         if self.observe is not None:
             raise ModelFileError(
-                f"observe = {self.observe!r} ([run] observe, run --observe) is for ensembles only: give "
-                "--ensemble FILE, or omit observe"
+                f"observe = {self.observe!r} is for ensembles only: give --ensemble FILE, or omit observe"
             )
 
     def _run_section(self) -> dict[str, Any]:

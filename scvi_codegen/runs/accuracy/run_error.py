@@ -18,7 +18,7 @@ import math
 import sys
 from bisect import bisect_left
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
@@ -47,7 +47,7 @@ from scvi_codegen.runs.states.rotations import members_of
 from scvi_codegen.runs.states.words import low_words, with_low
 from scvi_codegen.runs.stepping.features import refusal, require
 from scvi_codegen.runs.stepping.projection import determined_coordinates, projected
-from scvi_codegen.runs.stepping.step_derivatives import Starts
+from scvi_codegen.runs.stepping.step_derivatives import Defects, Starts
 from scvi_codegen.runs.stepping.step_plan import Adaptive, absolute_tolerances, ending_at
 
 LOST = 0.1
@@ -230,19 +230,7 @@ def error_of(run: Any) -> RunError:
     if _is_compared(stepper, finer):
         return _compared(run, finer)
     finer = finer.with_events(stepper.events if stepper.changes_states else ())
-    replay = _Replay(run, finer)
-    vectors, reason = replay.of_run()
-    m = stepper.dimension
-    deviations = np.hypot.reduce(vectors[1:], axis=0) / math.sqrt(SAMPLES)  # squares may overflow
-    errors, rounding = ([of[:m].T, of[m:].T] for of in (vectors[0], deviations))
-    result = _described(run, errors, rounding, reason=reason)
-    if result.relative[-1] <= math.sqrt(roundoff(1)) or not replay.is_smooth:
-        return result
-    rows = replay.rows_proportional(vectors[0], result.relative)
-    if rows == len(run):
-        return result
-    result = replace(result, proportional=rows)
-    return replace(result, relative=relative_until(result, len(run))[1])
+    return _Replay(run, finer).error()
 
 
 def finer_of(stepper: Any) -> Any:
@@ -268,47 +256,54 @@ def _is_compared(stepper: Any, finer: Any) -> bool:
     return bool(stepper.in_tau or interface.words > 1 or stepper.origin is not None or unlocated)
 
 
-def _is_transported_by(finer: Any, stepper: Any) -> bool:
-    """Return whether the derivatives of the finer method's steps are better, of those of a method and of the finer one.
+def _iterating(stepper: Any, finer: Any) -> Any:
+    """Return which of the steppers of a method and of the finer one finds derivatives of steps by iterations, or None.
 
-    Newton's method factorises the equations of each step, which takes more time than iterations of four vectors.
+    Newton's method, which solves constraints and rotations, factorises the equations of each step for them.
     """
-    if stepper.interface.time_transformation is not None or stepper._lacks(Derivatives()):
-        return True
-    if stepper.constraints or stepper.interface.rotations or finer._lacks(Derivatives()):
-        return False  # Newton's method solves both
-    return not stepper.tangent.constant("VECTORS_ITERATED") and bool(finer.tangent.constant("VECTORS_ITERATED"))
+    if stepper.constraints or stepper.interface.rotations:
+        return None
+    own = [] if stepper.interface.time_transformation is not None or stepper._lacks(Derivatives()) else [stepper]
+    return next((of for of in (*own, finer) if of.tangent.constant("VECTORS_ITERATED")), None)
 
 
-def _described(run: Any, errors: list[Array], rounding: list[Array], **others: Any) -> RunError:
-    """Return the error of a run from (n, m) errors and rounding errors of positions and of momenta."""
-    error = RunError(
+def _described(run: Any, errors: Array, rounding: Array, **others: Any) -> RunError:
+    """Return the error of a run from (2, m, n) errors and rounding errors of positions and of momenta."""
+    reason, proportional = others.get("reason", ""), others.get("proportional", sys.maxsize)
+    sizes, relative_errors = _relative(run, np.abs(errors) + DEVIATIONS * rounding, reason, proportional)
+    return RunError(
         t=np.asarray(run.t),
-        q=errors[0],
-        p=errors[1],
-        rounding_q=rounding[0],
-        rounding_p=rounding[1],
-        relative=np.zeros(len(run)),
+        q=errors[0].T,
+        p=errors[1].T,
+        rounding_q=rounding[0].T,
+        rounding_p=rounding[1].T,
+        relative=relative_errors,
+        sizes=sizes,
         _run=run,
         **others,
     )
-    sizes, relative_errors = relative_until(error, len(run))
-    return replace(error, sizes=sizes, relative=relative_errors)
 
 
 def relative_until(error: RunError, rows: int) -> tuple[Array, Array]:
     """Return (2, m) sizes of the motion in the first ``rows`` states and (rows,) running maxima of relative errors."""
     bounds = np.array([part[:rows].T for part in error.bounds])
-    is_known = ~np.isnan(bounds).any(axis=(0, 1))
-    if not is_known.all():
-        bounds = np.where(is_known, bounds, 0.0)
-    sizes = sizes_of(error._run, rows, bounds.max(axis=2))
+    return _relative(error._run, bounds, error.reason, error.proportional)
+
+
+def _relative(run: Any, bounds: Array, reason: str, proportional: int) -> tuple[Array, Array]:
+    """Return the same for (2, m, n) bounds of the errors of the first n states, NaN where they are unknown."""
+    largest, last = bounds.max(axis=2), bounds.shape[2]
+    if np.isnan(largest).any():
+        is_known = ~np.isnan(bounds).any(axis=(0, 1))
+        bounds, last = np.where(is_known, bounds, 0.0), int(np.flatnonzero(is_known)[-1]) + 1 if is_known.any() else 0
+        largest = bounds.max(axis=2)
+    sizes = sizes_of(run, bounds.shape[2], largest)
     entries = relative(bounds, sizes[:, :, None])
-    leave_out_rounding(error._run, bounds, entries)
+    leave_out_rounding(run, bounds, entries)
     parts = entries.max(axis=(0, 1))
-    if error.reason:  # unknown from the last known state on
-        parts[np.count_nonzero(np.cumsum(is_known[::-1])[::-1]) :] = np.inf
-    parts[error.proportional :] = np.maximum(parts[error.proportional :], LOST)
+    if reason:  # unknown from the last known state on
+        parts[last:] = np.inf
+    parts[proportional:] = np.maximum(parts[proportional:], LOST)
     return sizes, np.asarray(np.maximum.accumulate(parts))
 
 
@@ -321,12 +316,14 @@ def leave_out_rounding(run: Any, bounds: Array, entries: Array) -> None:
         return
     epsilon = roundoff(run.stepper.interface.words)
     tiny = bounds[0] <= ROUNDINGS * epsilon * np.abs(np.asarray(run.q)[: bounds.shape[2]].T)
-    largest = np.where(tiny, 0.0, entries).max(initial=0.0)
-    for k in np.flatnonzero((np.where(tiny, entries, 0.0) > largest).any(axis=(0, 1))).tolist():
-        determined = np.zeros(tiny.shape[0], bool)
-        q, t = np.asarray(run.q[k]), float(run.t[k])
-        determined[determined_coordinates(run.stepper, q, t, parameters_on_sides(run, t))] = True
-        entries[:, tiny[:, k] & determined, k] = 0.0
+    parts, so_far = np.where(tiny, entries, 0.0).max(axis=(0, 1)), np.where(tiny, 0.0, entries).max(initial=0.0)
+    for k in np.flatnonzero(parts > so_far).tolist():
+        if parts[k] > so_far:  # a new maximum
+            determined = np.zeros(tiny.shape[0], bool)
+            q, t = np.asarray(run.q[k]), float(run.t[k])
+            determined[determined_coordinates(run.stepper, q, t, parameters_on_sides(run, t))] = True
+            entries[:, tiny[:, k] & determined, k] = 0.0
+            so_far = max(so_far, entries[:, :, k].max())
 
 
 def sizes_of(run: Any, rows: int, errors: Array) -> Array:
@@ -345,9 +342,9 @@ def sizes_of(run: Any, rows: int, errors: Array) -> Array:
 class _Replay:
     """Replay of a run from its saved states.
 
-    The derivatives of single steps are those of the run's own method, unless it has none or those of the finer method
-    are iterated and its own are not: both differ by derivatives of the local error, which times delta is below terms of
-    the order of delta^2.
+    The derivatives of single steps are those of the run's own method or of the finer one, found by iterations: both
+    differ by derivatives of the local error, which times delta is below terms of the order of delta^2. Where iterations
+    do not converge they are differences of steps of the finer method from neighbouring states.
 
     Args:
         run: trajectory.
@@ -356,30 +353,43 @@ class _Replay:
 
     def __init__(self, run: Any, finer: Any) -> None:
         self.run, self.finer, self.m = run, finer, run.stepper.dimension
-        self.linear = finer if _is_transported_by(finer, run.stepper) else run.stepper
+        self.linear = _iterating(run.stepper, finer)
         self.u, self.calls, self.left = roundoff(1), 0, LEFT / max(1, run.steps)
         self.steps = max(1.0, run.steps / max(1, len(run) - 1))  # mean number between two states
         self.now = np.zeros((1 + SAMPLES, 2 * self.m))
-        self.size = np.concatenate([np.ptp(np.ascontiguousarray(np.asarray(x).T), axis=1) for x in (run.q, run.p)])
+        self.states = np.concatenate([np.asarray(run.q).T, np.asarray(run.p).T])
+        self.size = np.ptp(self.states, axis=1)
+        self.results = np.full((2, 2 * self.m, len(run)), np.nan)  # errors and rounding errors
         self.resolved = np.zeros(len(run), bool)  # whether a state is the end of a step that the finer method resolves
 
-    def of_run(self) -> tuple[Array, str]:
-        """Return (1 + samples, 2m, n) errors and rounding errors, NaN where unknown, and the reason for that."""
-        first, result = 0, np.full((*self.now.shape, len(self.run)), np.nan)
-        (t, q, p), reason = self.run.initial, ""
+    def error(self) -> RunError:
+        """Return the error of the run: lost from the row on from which it is not proportional to those before."""
+        reason = self._replayed()
+        vectors = self.results.reshape(2, 2, self.m, -1)
+        result = _described(self.run, *vectors, reason=reason)
+        if result.relative[-1] <= math.sqrt(roundoff(1)) or not self.is_smooth:
+            return result
+        rows = self.rows_proportional(self.results[0], result.relative)
+        return result if rows == len(self.run) else _described(self.run, *vectors, reason=reason, proportional=rows)
+
+    def _replayed(self) -> str:
+        """Find errors and rounding errors of all states, NaN where unknown; return the reason for that."""
+        first, (t, q, p) = 0, self.run.initial
         try:
             self._by_run(self.run, t, q, p, 0, steps=self.steps)
-            result[..., 0] = self.now
+            self._store(0)
             for piece in self.run._runs:
-                for row, vectors in self._along(piece):
-                    result[..., first:][..., row] = vectors
-                    self.resolved[first:][row] = isinstance(row, slice)
+                self._along(piece, first)
                 first += len(piece) - 1
         except (ScviCodegenError, FloatingPointError) as failure:
-            known = int(np.count_nonzero(np.isfinite(result[0, 0])))
-            lost = known and not np.abs(self.now[0]).max() <= np.abs(self._state(self.run, slice(None))).max()
-            reason = f"errors are lost: {failure}" if lost else str(failure)
-        return result, reason
+            lost = not np.isnan(self.results[0, 0, 0]) and not np.abs(self.now[0]).max() <= np.abs(self.states).max()
+            return f"errors are lost: {failure}" if lost else str(failure)
+        return ""
+
+    def _store(self, row: int) -> None:
+        """Store the present vectors as those of a row; squares may overflow."""
+        deviations = np.hypot.reduce(self.now[1:], axis=0) / math.sqrt(SAMPLES)
+        self.results[:, :, row] = self.now[0], deviations
 
     @property
     def is_smooth(self) -> bool:
@@ -396,7 +406,7 @@ class _Replay:
         motion in the step. Of other rows, until errors so far are ``LOST``, the first one at which the formula differs
         by more than a tenth is found by bisection, as errors grow.
         """
-        states = self._state(self.run, slice(None))
+        states = self.states.T
         before = lengths(errors.T[:-1], self.size)
         with np.errstate(all="ignore"):
             parts = before / lengths(np.diff(states, axis=0), self.size)
@@ -428,58 +438,57 @@ class _Replay:
         apart = np.abs(states[row] - moved - errors[:, row])
         return bool(relative(apart, self.size).max() <= LOST * relative(np.abs(errors[:, row]), self.size).max())
 
-    def _along(self, piece: Any) -> Iterator[tuple[Any, Array]]:
-        """Yield indices of states, a slice or a number, and their vectors."""
+    def _along(self, piece: Any, first: int) -> None:
+        """Find the errors of the states of a part of the run, which begins at the row ``first``."""
         special = times_of_changes(piece)
         rows = _rows_between(piece, special)
         single = self._single_steps(piece, rows, special)
-        changes = (np.flatnonzero(single[1:] != single[:-1]) + 1).tolist()  # from single steps to others, and back
-        for first, last in pairwise([0, *changes, len(single)] if len(single) else ()):
-            if single[first]:
-                yield from self._by_steps(piece, int(rows[first]), int(rows[last]))
+        for begin, end in _alike(single):
+            if single[begin]:
+                self._by_steps(piece, int(rows[begin]), int(rows[end]), first)
                 continue
-            for begin, end in pairwise(rows[first : last + 1].tolist()):
-                start = float(piece.t[begin]), piece.q[begin], piece.p[begin]
-                self._by_run(piece, *start, end, steps=self.steps * (end - begin))
-                yield end, self.now
+            for k, stop in pairwise(rows[begin : end + 1].tolist()):
+                start = float(piece.t[k]), piece.q[k], piece.p[k]
+                self._by_run(piece, *start, stop, steps=self.steps * (stop - k))
+                self._store(first + stop)
 
     def _single_steps(self, piece: Any, rows: NDArray[np.intp], special: Array) -> NDArray[np.bool_]:
         """Return (rows - 1,) whether the interval after a row is one step of the run in one mode."""
-        begin, end = rows[:-1], rows[1:]
         with np.errstate(invalid="ignore"):
-            whole = np.abs(piece.stepped[end] - piece.stepped[begin]) < 1.5 * np.abs(piece.step_sizes[begin])
-        single = np.asarray(whole & (end == begin + 1))
-        if len(special):
-            passed = [np.searchsorted(piece.forward * special, piece.forward * piece.t[of]) for of in (begin, end)]
-            single &= passed[0] == passed[1]
-        return single
+            single = np.abs(np.diff(piece.stepped)) < 1.5 * np.abs(piece.step_sizes[:-1])
+        if not len(special):
+            return np.asarray(single)
+        begin, end = rows[:-1], rows[1:]
+        single = single[begin] & (end == begin + 1)
+        passed = [np.searchsorted(piece.forward * special, piece.forward * piece.t[of]) for of in (begin, end)]
+        return np.asarray(single & (passed[0] == passed[1]))
 
-    def _by_steps(self, piece: SavedStates, begin: int, end: int) -> Iterator[tuple[Any, Array]]:
-        """Transport the errors over single steps between two rows; yield slices of rows and their vectors."""
+    def _by_steps(self, piece: SavedStates, begin: int, end: int, first: int) -> None:
+        """Transport the errors over single steps between two rows of a part that begins at the row ``first``."""
         t, h = np.ascontiguousarray(piece.t[begin:end]), np.ascontiguousarray(steps_after(piece, begin, end))
         q, p = (np.ascontiguousarray(np.asarray(column)[begin : end + 1]) for column in (piece.q, piece.p))
         starts, parameters = Starts(t, h, q, p), parameters_on_sides(piece, float(piece.t[begin]))
         parts = [starts.part(k, k + MOST_STEPS) for k in range(0, len(h), MOST_STEPS)]
-        defects = self._defects(parts, parameters)
-        for k, part in enumerate(parts):
-            resolved, row = self._resolved(part, defects[k], parameters), begin + k * MOST_STEPS
-            changes = (np.flatnonzero(resolved[1:] != resolved[:-1]) + 1).tolist()
-            for first, last in pairwise([0, *changes, len(resolved)]):
-                if resolved[first]:
-                    vectors = self._transport(self.linear, part.part(first, last), defects[k][first:last], parameters)
-                    yield slice(row + first + 1, row + last + 1), vectors
+        for k, (part, defects) in enumerate(zip(parts, self._defects(parts, parameters), strict=True)):
+            resolved, row = self._resolved(part, defects, parameters), begin + k * MOST_STEPS
+            for start, stop in _alike(resolved):
+                if resolved[start]:
+                    rows = slice(first + row + start + 1, first + row + stop + 1)
+                    self.resolved[rows] = True
+                    results = self.results[:, :, rows]
+                    self._transport(part.part(start, stop), defects.part(start, stop), results, parameters)
                     continue
-                for start in range(row + first, row + last):
-                    self._by_run(piece, float(piece.t[start]), piece.q[start], piece.p[start], start + 1, steps=1.0)
-                    yield start + 1, self.now
+                for j in range(row + start, row + stop):
+                    self._by_run(piece, float(piece.t[j]), piece.q[j], piece.p[j], j + 1, steps=1.0)
+                    self._store(first + j + 1)
 
     def _defects(self, parts: list[Starts], parameters: Array) -> list[Any]:
-        """Return (n, 2m) states minus the ends of finer steps from those before, or the error of a step that fails."""
+        """Return the defects of steps, or the error of one that fails; small are those of :data:`CONVERGED`."""
         defects = list[Any]([None] * len(parts))
 
         def find(k: int, _: object = None) -> None:
             try:
-                defects[k] = self.finer._defects(parts[k], parameters)
+                defects[k] = self.finer._defects(parts[k], parameters, self.size, CONVERGED)
             except ScviCodegenError as failure:
                 defects[k] = failure
 
@@ -490,46 +499,51 @@ class _Replay:
         return defects
 
     def _resolved(self, starts: Starts, defects: Any, parameters: Array) -> NDArray[np.bool_]:
-        """Return (n,) whether errors of the finer method's steps are a tenth of their defects (n, 2m), or of rounding.
+        """Return (n,) whether errors of the finer method's steps are a tenth of their defects, or of rounding.
 
         They are where a defect is small beside the change of momenta, the motion by forces. Of other steps the errors
         are the differences from two steps of half the size (E. Hairer, S. P. Norsett, G. Wanner, Solving ODEs I, II.4).
         """
         if isinstance(defects, ScviCodegenError):
             return np.zeros(len(starts.h), bool)
-        impulses = lengths(np.diff(starts.p, axis=0), self.size[self.m :])
-        resolved = np.asarray(lengths(defects, self.size) <= CONVERGED * impulses)
+        resolved = defects.small != 0
+        if resolved.all():
+            return np.asarray(resolved)
         doubtful = np.flatnonzero(~resolved)
-        if not len(doubtful):
-            return resolved
         t, h = starts.t[doubtful], starts.h[doubtful] / 2.0
         begin, end = (np.concatenate([starts.q[k], starts.p[k]], axis=1) for k in (doubtful, doubtful + 1))
         try:
             halves = self._ends(t + h, h, self._ends(t, h, begin, parameters), parameters)
         except StepFailedError:
-            return resolved
+            return np.asarray(resolved)
         rounding = RESOLVED * self.u * (np.abs(begin) + np.abs(end - begin))
-        apart = np.maximum(np.abs(end - defects[doubtful] - halves) - rounding, 0.0)
+        apart = np.maximum(np.abs(end - defects.misfits[doubtful] - halves) - rounding, 0.0)
         resolved[doubtful] = lengths(apart, self.size) <= LOST * lengths(end - halves, self.size)
-        return resolved
+        return np.asarray(resolved)
 
     def _ends(self, t: Array, h: Array, states: Array, parameters: Array) -> Array:
         """Return the (n, 2m) ends of steps of the finer method from n states, up to rounding."""
         rows = np.concatenate([states, states[-1:]])
         q, p = (np.ascontiguousarray(part) for part in np.split(rows, 2, axis=1))
-        return np.asarray(rows[1:] - self.finer._defects(Starts(t, h, q, p), parameters))
+        return np.asarray(rows[1:] - self.finer._defects(Starts(t, h, q, p), parameters, self.size, CONVERGED).misfits)
 
     def _transport(
-        self, linear: Any, starts: Starts, defects: Array | None, parameters: Array, steps: float = 1.0
-    ) -> Array:
-        """Transport the errors over steps of a method, each of so many steps of the run; return their vectors."""
-        vectors = np.zeros((len(starts.h) + 1, 1 + SAMPLES, linear._input_size))
-        vectors[0, :, : 2 * self.m] = self.now
-        self.calls += 1
-        rounding = math.sqrt(steps) * self.u
-        linear._transport_errors(starts, defects, vectors, parameters, self.left / steps, rounding, self.calls)
-        self.now = vectors[-1, :, : 2 * self.m].copy()
-        return vectors[1:, :, : 2 * self.m].transpose(1, 2, 0)
+        self, starts: Starts, defects: Defects, results: Array, parameters: Array, steps: float = 1.0
+    ) -> None:
+        """Transport the errors over n steps of a method, each of so many steps of the run, into (2, 2m, n) results."""
+        rounding, first, length = math.sqrt(steps) * self.u, 0, len(starts.h) if self.linear is None else 1
+        while first < len(starts.h):
+            if self.linear is not None:
+                self.calls += 1
+                rest = [of.part(first, len(starts.h)) for of in (starts, defects)]
+                into = self.now, results[:, :, first:], parameters
+                first += self.linear._transport_errors(*rest, *into, self.left / steps, rounding, self.calls)
+            if first < len(starts.h):
+                self.calls += 1
+                part = [of.part(first, first + length) for of in (starts, defects)]
+                into = self.now, results[:, :, first:], parameters
+                self.finer._transport_by_differences(*part, *into, self.size, rounding, self.calls)
+                first, length = first + length, 2 * length  # so that calls are few where iterations fail again
 
     def _by_run(self, piece: Any, t: float, q: Array, p: Array, end: int, *, steps: float) -> None:
         """Transport the errors to a row by a run of the finer method at round-off, over the events in between."""
@@ -540,15 +554,16 @@ class _Replay:
         run = self.finer._run(np.asarray(q), np.asarray(p), plan=plan, t=t, parameters=parameters)
         fine = run._recorded(None, ALL_STATES)
         if len(times_of_changes(fine)) or (fine.modes is not None and len(fine.modes.t)):
-            self.now = fine.tangent(self.now.T)[-1].T
+            self.now = np.ascontiguousarray(fine.tangent(self.now.T)[-1].T)
             self.calls += 1
             normal = np.random.default_rng(self.calls).standard_normal((SAMPLES, 2 * self.m))
             self.now[1:] += math.sqrt(steps) * self.u * normal * np.abs(self._state(piece, end))
         else:
             times, h, x, y = (np.ascontiguousarray(of) for of in (fine.t, np.diff(fine.t), fine.q, fine.p))
             starts, sides = Starts(times, h, x, y), parameters_on_sides(fine, t)
-            for k in range(0, len(h), MOST_STEPS):
-                self._transport(self.finer, starts.part(k, k + MOST_STEPS), None, sides, steps / len(h))
+            results = np.empty((2, 2 * self.m, len(h)))  # of the states in between
+            defects = self.finer._defects(starts, sides, self.size, CONVERGED)  # as states have no low words
+            self._transport(starts, defects, results, sides, steps / len(h))
         self.now[0] += self._state(piece, end) - self._state(fine, -1)
 
     @staticmethod
@@ -560,6 +575,12 @@ def lengths(vectors: Array, sizes: Array) -> Array:
     """Return (n,) lengths of (n, k) vectors, parts of the sizes (k,)."""
     parts = relative(vectors, sizes)
     return np.asarray(np.sqrt(np.einsum("ij,ij->i", parts, parts)))
+
+
+def _alike(flags: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    """Yield the first and the last + 1 of flags in a row that are equal."""
+    changes = [] if flags.all() else (np.flatnonzero(flags[1:] != flags[:-1]) + 1).tolist()
+    return pairwise([0, *changes, len(flags)] if len(flags) else ())
 
 
 def _rows_between(states: Any, special: Array) -> NDArray[np.intp]:
@@ -584,9 +605,9 @@ def _compared(run: Any, finer: Any) -> RunError:
     finer = finer.with_events(run.stepper.events if run.stepper.changes_states else ())
     exact, rounded = _states_of(run, finer, np.asarray), _states_of(run, finer, neighbouring)
     growth = math.sqrt(max(1.0, run.steps))
-    errors = [np.abs(np.asarray(x - y)) for x, y in zip((run.q, run.p), exact, strict=True)]
-    rounding = [growth * np.abs(np.asarray(x - y)) for x, y in zip(exact, rounded, strict=True)]
-    return _described(run, errors, rounding, signed=False)
+    errors = [np.abs(np.asarray(x - y)).T for x, y in zip((run.q, run.p), exact, strict=True)]
+    rounding = [growth * np.abs(np.asarray(x - y)).T for x, y in zip(exact, rounded, strict=True)]
+    return _described(run, np.array(errors), np.array(rounding), signed=False)
 
 
 def _states_of(run: Any, finer: Any, begin: Callable[[Any], Any]) -> tuple[Any, Any]:

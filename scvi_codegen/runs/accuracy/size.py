@@ -78,6 +78,10 @@ def sizes_of_motion(
     momenta = of_groups(np.maximum(np.ptp(p, axis=1), kinetic))
     displacements, impulses = map(of_groups, by_reactions)
     resolution = RESOLVED * epsilon
+    unmoved = resolution * max(2.0 * largest.max(), NOISE_OF_MOMENTA * displacements.max())
+    moves = ranges.min() > unmoved and momenta.min() > NOISE_OF_MOMENTA * resolution * momenta.max()
+    if moves and not np.any(absolute):  # nothing rests, or is noise
+        return np.array([ranges, momenta])
     rest = ranges <= resolution * np.maximum(largest, displacements)
     rest |= _is_noise(ranges, errors[0], NOISE_OF_MOMENTA * resolution * displacements)
     noise = _is_noise(ranges, errors[0], resolution * ranges.max(initial=0.0))

@@ -24,7 +24,7 @@ from scvi_codegen.runs.results.saved_states import (
 from scvi_codegen.runs.stepping.projection import linearised, multipliers
 from scvi_codegen.systems.event import Crossings, Transition
 
-REACTIONS = 16
+REACTIONS = 4
 """Number of states of a run whose constraint forces are computed."""
 SAME_STEP_SIZE = 1e-9
 """Largest relative difference of step sizes that are equal."""

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.codegen.native.options import REASONS, STATUS
-from scvi_codegen.codegen.rendering.text import DEPENDENT, INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
+from scvi_codegen.codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
 from scvi_codegen.common.errors import AccuracyWarning, StateError, of_trajectory, warn
+from scvi_codegen.common.tangent_space import DEPENDENT, tangent_space
 from scvi_codegen.runs.states.validation import Array, Parameters, States, inputs_not_given, missing_input
 from scvi_codegen.runs.states.words import quotient_of
 from scvi_codegen.runs.stepping.features import require
@@ -234,25 +235,18 @@ def _at_unit_velocities(stepper: Integrator, q: Array, t: float, parameters: Par
 def determined_coordinates(stepper: Integrator, q: Array, t: float, parameters: Parameters) -> NDArray[np.intp]:
     """Return the indices of coordinates that the constraints of positions determine from the others.
 
-    They are those of the largest ``G_ki q_i``, by QR with column pivoting: differences of the others between two states
-    fix theirs, without the rounding errors of large positions, as of the height of a pendulum that hardly swings.
+    They are those of the largest ``G_ki q_i``: differences of the others between two states fix theirs, without the
+    rounding errors of large positions, as of the height of a pendulum that hardly swings.
     """
     if not stepper.constraints or stepper.dimension > MOST_DENSE:
         return np.empty(0, np.intp)
-    from scipy.linalg import qr  # imported on use: the core does without SciPy
-
     try:
         positions, momenta = _at_unit_velocities(stepper, q, t, parameters)
         g, rates = constraint_values(stepper, positions, momenta, t, parameters)
     except StateError:  # velocities have no momenta
         return np.empty(0, np.intp)
     weights = ((rates[1:] - rates[0]).T * q)[(g == g[0]).all(axis=0)]  # g of a constraint of velocities is its rate
-    largest = np.abs(weights).max(axis=1)
-    used = np.isfinite(largest) & (largest > 0.0)
-    if not used.any():
-        return np.empty(0, np.intp)
-    (triangle, order) = qr(weights[used] / largest[used, np.newaxis], mode="r", pivoting=True)
-    return np.asarray(order[: np.count_nonzero(np.abs(np.diagonal(triangle)) > DEPENDENT)])
+    return tangent_space(weights[np.isfinite(weights).all(axis=1)]).determined
 
 
 def roots_of_masses(stepper: Integrator, q: Array, t: float, parameters: Parameters) -> Array:
@@ -313,23 +307,9 @@ Jacobian: TypeAlias = Callable[[Array], tuple[Array, Array]]
 """Values g and Jacobian G of the constraints at positions."""
 
 
-def _unit_rows(jacobian: Array) -> Array:
-    with np.errstate(over="ignore"):
-        sizes = np.linalg.norm(jacobian, axis=1, keepdims=True)
-    return jacobian / np.where(sizes > 0.0, sizes, 1.0)
-
-
-def dependence(jacobian: Array) -> tuple[int, NDArray[np.intp]]:
-    """Return the rank of (c, m) rows, and the (k,) indices of those that depend on each other."""
-    left, values, _ = np.linalg.svd(_unit_rows(jacobian))
-    null = left[:, np.append(values, np.zeros(len(left) - len(values))) <= DEPENDENT]
-    shares = np.abs(null).max(axis=1, initial=0.0)
-    return len(left) - null.shape[1], np.flatnonzero(shares > NAMED_SHARE)
-
-
 def nearly_dependent(jacobian: Array) -> str:
     """Return a remark with the rank that a nearly singular Jacobian loses, or ""."""
-    values = np.linalg.svd(_unit_rows(jacobian), compute_uv=False) if np.isfinite(jacobian).all() else np.ones(1)
+    values = tangent_space(jacobian).singular_values if np.isfinite(jacobian).all() else np.ones(1)
     if values[-1] > NEARLY_DEPENDENT:
         return ""
     return (
@@ -353,7 +333,8 @@ def rank_deficiency(names: Sequence[str], q: Array, at: Jacobian, *, nearest: bo
     g, jacobian = at(q)
     if not (np.isfinite(g).all() and np.isfinite(jacobian).all()):
         return None
-    rank, rows = dependence(jacobian)
+    free = tangent_space(jacobian)
+    rows = np.flatnonzero(np.abs(free.conditions).max(axis=1, initial=0.0) > NAMED_SHARE)
     if not len(rows):
         return None
     listed = " and ".join(f"'{names[k]}'" for k in rows) if len(rows) < 5 else f"{len(rows)} of them"
@@ -364,6 +345,6 @@ def rank_deficiency(names: Sequence[str], q: Array, at: Jacobian, *, nearest: bo
             f"values are {rests}, not 0. Change or remove one of them"
         )
     return (
-        f"the constraints {listed} are linearly dependent there (rank {rank} of {len(g)}), so their multipliers are "
-        "undetermined. Remove one that follows from the others, or start from a state where they are independent"
+        f"the constraints {listed} are linearly dependent there (rank {free.rank} of {len(g)}), so their multipliers "
+        "are undetermined. Remove one that follows from the others, or start from a state where they are independent"
     )

@@ -7,6 +7,7 @@ are composed of these. In transformed time the energy is one of the parameters, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.codegen.native.arguments import checked_number, checked_step, real_array
-from scvi_codegen.codegen.native.options import REASONS, SolverOptions, step_failure
+from scvi_codegen.codegen.native.options import NOT_CONVERGED, REASONS, STATUS, SolverOptions, step_failure
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.runs.states.validation import Array, Parameters, check_step_given
@@ -88,6 +89,26 @@ class Starts:
         """Return a view of the steps ``first`` to ``last`` - 1."""
         steps, states = slice(first, last), slice(first, last + 1)
         return Starts(self.t[steps], self.h[steps], self.q[states], self.p[states], self.chained)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Defects:
+    """Defects of n steps of a run: its states minus the ends of the steps of another method from those before.
+
+    Attributes:
+        misfits: (n, 2m) defects of positions and momenta.
+        small: (n,) 1 where a defect is small beside the change of momenta in the step, else 0.
+        parts: (n,) numbers of equal parts in which the other method takes each step.
+    """
+
+    misfits: Array
+    small: NDArray[np.int32]
+    parts: NDArray[np.int32]
+
+    def part(self, first: int, last: int) -> Defects:
+        """Return a view of those of the steps ``first`` to ``last`` - 1."""
+        rows = slice(first, last)
+        return Defects(self.misfits[rows], self.small[rows], self.parts[rows])
 
 
 class LinearisedMethod(StateFunctions):
@@ -292,14 +313,52 @@ class LinearisedMethod(StateFunctions):
             raise step_failure(status, report, step=failed, h=float(starts.h[failed]))
         return q1, p1
 
-    def _defects(self, starts: Starts, parameters: Array) -> Array:
-        """Return (n, 2m) states minus the ends of the steps from those before them, along a run of another method."""
-        defects = np.empty((len(starts.h), 2 * self.dimension))
-        arrays = map(self.binding.pointer, (starts.t, starts.h, starts.q, starts.p, defects))
-        status, report = self._call_steps("defects", parameters, None, len(starts.h), *arrays)
+    def _defects(self, starts: Starts, parameters: Array, sizes: Array, part: float) -> Defects:
+        """Return the defects of n steps along a run of another method.
+
+        Args:
+            starts: the steps and the states of the run.
+            parameters: as of :meth:`_propagate`.
+            sizes: (2m,) sizes of positions and momenta.
+            part: of the change of momenta in a step, below which a defect is small.
+        """
+        count = len(starts.h)
+        defects = Defects(np.empty((count, 2 * self.dimension)), *np.empty((2, count), np.int32))
+        given = map(self.binding.pointer, (starts.t, starts.h, starts.q, starts.p, sizes))
+        results = [self.binding.pointer(of) for of in (defects.misfits, defects.small, defects.parts)]
+        status, report = self._call_steps("defects", parameters, None, count, *given, part, *results)
         if status:
             raise step_failure(status, report, step=0, h=float(starts.h[0]))
         return defects
+
+    def _transport_by_differences(
+        self,
+        starts: Starts,
+        defects: Defects,
+        vectors: Array,
+        results: Sequence[Array],
+        parameters: Array,
+        sizes: Array,
+        rounding: float,
+        seed: int,
+    ) -> None:
+        """As :meth:`_transport_errors`, by the steps of :meth:`_defects` from neighbouring states; (2m,) sizes."""
+        sizes = np.where(sizes > 0.0, sizes, sizes.max() or 1.0)
+        pointer, after = self.binding.pointer, np.empty_like(vectors)
+        steps = starts.t, starts.h, starts.q, starts.p
+        given = (*map(pointer, (*steps, sizes, defects.misfits)), pointer(defects.parts))
+        settings = len(vectors), rounding, seed, pointer(vectors), pointer(after)
+        status, report = self._call_steps(
+            "differences", parameters, None, len(starts.h), *given, *settings, *self._columns(self.binding, results)
+        )
+        if status:
+            raise step_failure(status, report, step=0, h=float(starts.h[0]))
+        vectors[:] = after
+
+    @staticmethod
+    def _columns(binding: Any, results: Sequence[Array]) -> tuple[Any, ...]:
+        """Return arguments of C for two (2m, n) arrays of columns: the distance of their rows, and their first rows."""
+        return results[0].strides[0] // results[0].itemsize, *(binding.pointer(of[0]) for of in results)
 
     def _call_steps(self, name: str, parameters: Array, options: SolverOptions | None, *arguments: Any) -> Any:
         """Call a function of C that takes steps from states of its own; return its status and report."""
@@ -314,43 +373,53 @@ class LinearisedMethod(StateFunctions):
     def _transport_errors(
         self,
         starts: Starts,
-        defects: Array | None,
+        defects: Defects,
         vectors: Array,
+        results: Sequence[Array],
         parameters: Array,
         left: float,
         rounding: float,
         seed: int,
-    ) -> None:
-        """Transport global errors, and further tangent vectors, along saved states, in place.
+    ) -> int:
+        """Transport global errors, and further tangent vectors, along saved states by iterations.
 
         Args:
             starts: n steps and their (n + 1, m) states.
-            defects: (n, 2m) states minus the ends of the steps of a finer method from those before.
-            vectors: (n + 1, count, 2m + k + 2) as of :meth:`_propagate`; the first one of each row is the error, to
-                which the defect of the state is added.
+            defects: those of a finer method.
+            vectors: (count, 2m) at the first state, replaced by those at the last one that is reached; the first one is
+                the error, to which the defect of each state is added.
+            results: two (2m, n) arrays, views of rows of contiguous numbers, which receive the errors and the root mean
+                squares of the other vectors after each step.
             parameters: as of :meth:`_propagate`.
             left: relative change of the step and of vectors that the iterations of a step leave.
             rounding: rounding errors relative to the states, which further vectors receive with random signs.
             seed: of the signs.
+
+        Returns:
+            The number of steps, fewer than n if an iteration fails.
         """
-        binding = self.tangent
-        report = binding.new("report *")
+        binding, size = self.tangent, 2 * self.dimension
+        report, ends = binding.new("report *"), np.zeros((2, len(vectors), self._input_size))
+        ends[0, :, :size] = vectors
         status = binding.function("transport_errors")(
             len(starts.h),
             *map(binding.pointer, (starts.t, starts.h, starts.q, starts.p, parameters)),
             binding.options(SolverOptions(tolerance=left)),
-            vectors.shape[1],
+            len(vectors),
             left,
             rounding,
             seed,
-            binding.null if defects is None else binding.pointer(defects),
-            binding.pointer(vectors),
+            binding.pointer(defects.misfits),
+            binding.pointer(ends),
+            *self._columns(binding, results),
             report,
             binding.workspace(),
         )
-        if status:
-            failed = int(report.steps)
-            raise step_failure(status, report, step=failed, h=float(starts.h[failed]))
+        steps = int(report.steps)
+        vectors[:] = ends[steps % 2, :, :size]
+        if status and STATUS[status] != NOT_CONVERGED:
+            raise step_failure(status, report, step=steps, h=float(starts.h[steps]))
+        return steps
 
     def _second_order_adjoint(
         self, starts: Starts, changes: Array, vectors: Array, parameters: Array, options: SolverOptions | None

@@ -12,6 +12,7 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
 from scvi_codegen.common.precision import Number, mp
+from scvi_codegen.common.tangent_space import TangentSpace, tangent_space, unit_rows
 from scvi_codegen.systems.checks.continuity import corner_in, irregularity
 from scvi_codegen.systems.constraints import (
     constraint_jacobian,
@@ -20,15 +21,12 @@ from scvi_codegen.systems.constraints import (
     without_coordinate,
 )
 from scvi_codegen.systems.derived_expressions import (
-    DEPENDENT,
     Entries,
     dense,
     forms_of,
     null_direction,
-    row_rank,
     sample_points,
     singular_part,
-    unit_rows,
     values_at,
 )
 from scvi_codegen.systems.forces import check_damping
@@ -337,9 +335,9 @@ def _dependent(system: MechanicalSystem) -> int:
     points = sample_points(system.coordinates, (system.time,), system.constants)
     for values in values_at(points, list(derivatives.values())):
         matrix = dense(derivatives, values, (count, system.dimension))
-        if row_rank(matrix) == count:
+        if tangent_space(matrix).rank == count:
             return 0
-        first = max(first, next(k for k in range(count) if row_rank(matrix[: k + 1]) <= k))
+        first = max(first, next(k for k in range(count) if tangent_space(matrix[: k + 1]).rank <= k))
     return first
 
 
@@ -362,16 +360,10 @@ def gauge_of_rates(system: MechanicalSystem) -> tuple[Expr, tuple[str, ...]]:
     m = system.dimension
     points = sample_points(system.velocities, (*system.coordinates, system.time), system.constants)
     for values in values_at(points, [*mass.values(), *jacobian.values()]):
-        motions = _null_space(unit_rows(dense(mass, values[: len(mass)], (m, m))))
+        motions = tangent_space(dense(mass, values[: len(mass)], (m, m))).basis
         hindered = unit_rows(dense(jacobian, values[len(mass) :], (len(rates), m))) @ motions
         used = [rate for rate, row in zip(rates, hindered, strict=True) if np.abs(row).max(initial=0.0) > SHARE]
-        moving = np.abs(motions @ _null_space(hindered)).max(axis=1, initial=0.0) > SHARE
+        moving = np.abs(motions @ TangentSpace(hindered).basis).max(axis=1, initial=0.0) > SHARE
         free = tuple(q.name for q, moves in zip(system.coordinates, moving, strict=True) if moves)
         return sympy.Add(*(constant or diagonal)) / 2 * sympy.Add(*(rate**2 for rate in used)), free
     return sympy.S.Zero, ()
-
-
-def _null_space(matrix: Array) -> Array:
-    """Return an orthonormal basis of the null space of a matrix whose rows have length 1 at most, as columns."""
-    _, values, right = np.linalg.svd(matrix)
-    return right[np.count_nonzero(values > DEPENDENT) :].T

@@ -65,6 +65,26 @@ static inline __attribute__((always_inline)) double plus(double x, double by, co
   return x;
 }
 
+#ifndef PLAIN_SUMS
+/* Moves `count` coordinates, apart from kicks, so that sums of more elements overlap in time. */
+static inline __attribute__((always_inline)) void drift_coordinates(double *restrict q, const double *restrict p,
+    double *restrict dq, const double *restrict dp, double *restrict X, const double *restrict inverse_mass,
+    long long count, int arrives, double by)
+{
+  const double drift = by * inverse_mass[0]; /* of equal masses */
+#pragma GCC unroll 2
+  for (long long i = 0; i < count; i++) {
+    double at = q[i], more_q = dq[i] + (EQUAL_MASSES ? drift : by * inverse_mass[i]) * (p[i] + dp[i]);
+    if (arrives) {
+      add_increment(&at, &more_q);
+      q[i] = at;
+    } else
+      X[i] = at + more_q;
+    dq[i] = more_q;
+  }
+}
+#endif
+
 /* Continues `count` coordinates behind the last forces, `addends` values of each, which kicks multiply by `factor`.
  * Forces that were used in both steps become 0 for the next ones, as they are before if `fresh`. */
 static inline __attribute__((always_inline)) void continue_coordinates(double *restrict q, double *restrict p,
@@ -72,9 +92,9 @@ static inline __attribute__((always_inline)) void continue_coordinates(double *r
     const double *restrict inverse_mass, long long count, continuation by, double factor, const addend *added,
     int addends, int fresh)
 {
-  const double drift = by.drift * inverse_mass[0]; /* of equal masses */
   const int forces = by.starts || (by.ends && ends_with_a_kick()); /* F, else increments that have them */
 #ifdef PLAIN_SUMS
+  const double drift = by.drift * inverse_mass[0]; /* of equal masses */
   for (long long i = 0; i < count; i++) {
     if (forces)
       p[i] += (by.starts ? by.start : by.end) * F[i];
@@ -107,16 +127,7 @@ static inline __attribute__((always_inline)) void continue_coordinates(double *r
       dp[i] = more_p;
     }
   if (by.moves)
-#pragma GCC unroll 2
-    for (long long i = 0; i < count; i++) { /* apart, so that sums of more elements overlap in time */
-      double at = q[i], more_q = dq[i] + (EQUAL_MASSES ? drift : by.drift * inverse_mass[i]) * (p[i] + dp[i]);
-      if (by.arrives) {
-        add_increment(&at, &more_q);
-        q[i] = at;
-      } else
-        X[i] = at + more_q;
-      dq[i] = more_q;
-    }
+    drift_coordinates(q, p, dq, dp, X, inverse_mass, count, by.arrives, by.drift);
 #endif
 }
 

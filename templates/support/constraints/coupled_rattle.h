@@ -68,13 +68,13 @@ static inline void invert(const lanes *mass, inverse_masses inverse)
 #pragma GCC unroll 64
   for (int e = 0; e < LOWER_MASSES; e++) {
     const int i = MASS_POSITION[LOWER_MASS_ENTRY[e][0]], j = MASS_POSITION[LOWER_MASS_ENTRY[e][1]];
-    l[(i > j ? i : j) * (MASS_REACH + 1) + (i > j ? i - j : j - i)] = mass[e];
+    l[MASS_REACH + (i > j ? i * MASS_REACH + j : j * MASS_REACH + i)] = mass[e];
   }
-  factorise_band(l, M, MASS_REACH);
+  factorise_symmetric(l, M, MASS_REACH, MASS_REACH);
   for (int column = 0; column < MASS_COLUMNS; column++) {
     for (int i = 0; i < M; i++)
       x[MASS_POSITION[i]] = lanes_of(MASS_COLUMN[i] == column);
-    solve_band(l, M, MASS_REACH, x);
+    solve_symmetric(l, M, MASS_REACH, MASS_REACH, x);
 #pragma GCC unroll 64
     for (int e = 0; e < INVERSE_MASSES; e++)
       if (MASS_COLUMN[INVERSE_MASS_ENTRY[e][1]] == column)

@@ -3,9 +3,10 @@
 #else
 #include "point_lanes.h"
 #endif
+#include "../core/symmetric.h"
 
 /* Iteration of a constrained step: systems of the multipliers, sizes, convergence. The matrix P = G M^-1 G^T of a
- * point is a band matrix factorised as L D L^T (Golub & Van Loan, Matrix Computations, sec. 4.3.6). Requires:
+ * point is a symmetric band matrix (symmetric.h). Requires:
  * point_lanes.h or trajectory_lanes.h, the kernel constraints; PRODUCT, {e, f, row, distance, entry}: the product of
  * derivatives e and f and this entry of M^-1 is part of the entry of P in this row at this distance below the
  * diagonal; INVERSE_MASS_ENTRY, {i, j}: the lower half of M^-1, the diagonal first; MASS_COLUMN, a number below
@@ -86,40 +87,6 @@ static inline void find_velocities(const number *inverse_mass, const number *p, 
   }
 }
 
-/* Factorises a symmetric band matrix as L D L^T. The entry at distance b below the diagonal in row k is l[k (reach + 1)
- * + b]; the factors replace it, D^-1 at distance 0. Singular matrices lead to solutions that are not finite. */
-LANE_FUNCTION void factorise_band(lanes *l, int count, int reach)
-{
-  const int width = reach + 1;
-  for (int k = 0; k < count; k++) {
-    lanes *row = l + k * width;
-    const int below = least(k, reach);
-    for (int b = below - 1; b > 0; b--)
-      for (int c = b + 1; c <= below; c++)
-        row[b] -= row[c] * l[(k - b) * width + c - b];
-    for (int b = 1; b <= below; b++) {
-      const lanes scaled = row[b] * l[(k - b) * width];
-      row[0] -= scaled * row[b];
-      row[b] = scaled;
-    }
-    row[0] = 1 / row[0];
-  }
-}
-
-/* Solves a system with these factors. */
-LANE_FUNCTION void solve_band(const lanes *l, int count, int reach, lanes *x)
-{
-  const int width = reach + 1;
-  for (int k = 1; k < count; k++)
-    for (int b = 1; b <= least(k, reach); b++)
-      x[k] -= l[k * width + b] * x[k - b];
-  for (int k = count - 1; k >= 0; k--) {
-    x[k] *= l[k * width];
-    for (int b = 1; b <= least(count - 1 - k, reach); b++)
-      x[k] -= l[(k + b) * width + b] * x[k + b];
-  }
-}
-
 /* Factorises P at a group of points with these derivatives. */
 static inline void factorise_points(const lanes *derivative, const inverse_masses inverse_mass, factors l)
 {
@@ -127,10 +94,10 @@ static inline void factorise_points(const lanes *derivative, const inverse_masse
 #pragma GCC unroll 64
   for (int q = 0; q < PRODUCTS; q++) {
     const int e = PRODUCT[q][0], f = PRODUCT[q][1];
-    l[PRODUCT[q][2] * (CONSTRAINT_REACH + 1) + PRODUCT[q][3]] +=
+    l[(PRODUCT[q][2] + 1) * (CONSTRAINT_REACH + 1) - 1 - PRODUCT[q][3]] +=
         inverse_mass[PRODUCT[q][4]] * derivative[e] * derivative[f];
   }
-  factorise_band(l, CONSTRAINTS, CONSTRAINT_REACH);
+  factorise_symmetric(l, CONSTRAINTS, CONSTRAINT_REACH, CONSTRAINT_REACH);
 }
 
 /* Factorises P, except where its factors are kept. */
@@ -153,7 +120,7 @@ static inline void refactorise_points(condition kept, const lanes *derivative, c
 /* Solves P x = right with these factors, both in the order CONSTRAINT_POSITION. */
 static inline void solve_points(const factors l, lanes *x)
 {
-  solve_band(l, CONSTRAINTS, CONSTRAINT_REACH, x);
+  solve_symmetric(l, CONSTRAINTS, CONSTRAINT_REACH, CONSTRAINT_REACH, x);
 }
 
 /* Sizes of the terms of the displacements by momenta, forces and, unless lambda is NULL, reactions, from the forces and

@@ -68,19 +68,18 @@ typedef struct {
 /* Computes the lower half of M^-1; NaN if M is singular. Coordinates that no masses couple share a solution. */
 static void invert_constant_masses(real t, const real *parameters, real *mass, real *inverse)
 {
-  const band shape = band_of(M, 1);
   real u[2 * M] = {0}, p[M], pivot[M], x[M];
   int regular;
   transform_and_derivatives(t, u, parameters, p, mass);
-  regular = factorise(mass, &shape, pivot);
+  regular = factorise_masses(mass, pivot) == OK;
   for (int column = 0; column < MASS_COLUMNS; column++) {
     for (int i = 0; i < M; i++)
-      x[MASS_POSITION[i]] = MASS_COLUMN[i] == column;
+      x[i] = MASS_COLUMN[i] == column;
     if (regular)
-      back_substitute(mass, &shape, pivot, x);
+      solve_masses(mass, pivot, x);
     for (int e = 0; e < INVERSE_MASSES; e++)
       if (MASS_COLUMN[INVERSE_MASS_ENTRY[e][1]] == column)
-        inverse[e] = regular ? x[MASS_POSITION[INVERSE_MASS_ENTRY[e][0]]] : (real)NAN;
+        inverse[e] = regular ? x[INVERSE_MASS_ENTRY[e][0]] : (real)NAN;
   }
 }
 

@@ -1,21 +1,20 @@
+#include "error_vectors.h"
 #include "jvp_and_vjp.h"
 
 /* Tangent and adjoint vectors over steps solved by Newton's method. */
 
 #define LEFT_TO_COME (DBL_EPSILON * DBL_EPSILON / 16.0) /* squared: relative change still to come that is accepted */
 
-/* Steps and the vectors propagated over them, of shape (steps + 1, count, STEP_INPUTS). */
+/* Steps and the vectors propagated over them, of shape (steps + 1, count, STEP_INPUTS); of global errors only those at
+ * both ends of the present step, (2, count, STEP_INPUTS). */
 typedef struct {
   const real *t, *h, *q, *p, *parameters;
   const solver_options *options;
   int back, count;
-  const real *defects; /* of the saved states, (steps, 2M), which the first vectors receive; NULL: none */
-  int together; /* whether VECTORS_AT_ONCE vectors are iterated together */
+  error_vectors *errors; /* of a run; NULL: others */
   real *vectors, *q1, *p1, *workspace;
   solver_report *report;
   real accepted; /* squared: relative change of vectors still to come that is accepted */
-  real rounding; /* relative error of the saved states that the vectors after the first receive; 0: none */
-  unsigned long long random;
   long long guess; /* number of previous steps that the predictor uses (fixed-point iteration only) */
   int look; /* first iteration of the linearised equations whose convergence is tested */
 } propagation;
@@ -34,32 +33,7 @@ static step_data step_of(const propagation *over, long long k, const real *nothi
 /* Vectors at the start of step k; step k propagates them from there to k + 1, or back. */
 static real *vectors_at(const propagation *over, long long k)
 {
-  return over->vectors + k * over->count * STEP_INPUTS;
-}
-
-/* Adds the defect of state k + 1 to the first vector at the end of step k. */
-static void add_defect(propagation *over, long long k)
-{
-  real *to = vectors_at(over, k + 1);
-  for (int j = 0; over->defects && j < 2 * M; j++)
-    to[j] += over->defects[k * 2 * M + j];
-}
-
-/* The next number of a linear congruential generator (D. E. Knuth, The Art of Computer Programming 2, 3.3.4). */
-static inline unsigned long long next_random(unsigned long long *x)
-{
-  return *x = 6364136223846793005ULL * *x + 1442695040888963407ULL;
-}
-
-/* Adds rounding errors of x[k + 1] with random signs to all vectors but the first at the end of step k. */
-static void add_rounding(propagation *over, long long k)
-{
-  const real *x[2] = {over->q + (k + 1) * M, over->p + (k + 1) * M};
-  for (int j = 1; over->rounding > 0 && j < over->count; j++) {
-    real *to = vectors_at(over, k + 1) + j * STEP_INPUTS;
-    for (int i = 0; i < 2 * M; i++)
-      to[i] += (next_random(&over->random) >> 63 ? over->rounding : -over->rounding) * x[i / M][i % M];
-  }
+  return over->vectors + (over->errors ? k % 2 : k) * over->count * STEP_INPUTS;
 }
 
 /* Propagates the vectors from index `first` on over step k. */
@@ -144,7 +118,7 @@ static int propagate_by_iteration(propagation *over, long long k, const double *
   at.accepted = over->accepted;
   for (int j = 0, own; j < over->count; j += own) {
     double v[VECTORS_AT_ONCE * STEP_INPUTS];
-    own = over->together && over->count - j >= VECTORS_AT_ONCE ? VECTORS_AT_ONCE : 1;
+    own = over->errors && over->count - j >= VECTORS_AT_ONCE ? VECTORS_AT_ONCE : 1;
     memcpy(v, from + j * STEP_INPUTS, sizeof(double) * (size_t)(own * STEP_INPUTS));
     if ((over->back ? vjp_by_iteration : own > 1 ? jvps_by_iteration
                                                  : jvp_by_iteration)(&at, v, &over->look) != OK)
@@ -170,15 +144,15 @@ static int propagate_steps(propagation *over, long long first, long long end)
   iterated = solve_steps(over, first, end);
   for (long long done = 0; status == OK && done < end - first; done++) {
     const long long k = over->back ? end - 1 - done : first + done;
+    if (over->errors)
+      memset(vectors_at(over, k + 1), 0, sizeof(real) * (size_t)(over->count * STEP_INPUTS));
     const int carried = iterated ? propagate_by_iteration(over, k, stored_of(over, k - first)) : 0;
-    if (!iterated || carried < over->count)
-      status = vectors_by_newton(over, k, carried);
+    if (carried < over->count)
+      status = over->errors ? NOT_CONVERGED : vectors_by_newton(over, k, carried);
     else if (!all_finite(vectors_at(over, k + !over->back), over->count * STEP_INPUTS))
       status = NOT_FINITE;
-    if (status == OK) {
-      add_defect(over, k);
-      add_rounding(over, k);
-    }
+    if (status == OK && over->errors)
+      receive_errors(over->errors, k, over->q + (k + 1) * M, over->p + (k + 1) * M, vectors_at(over, k + 1));
     over->report->steps += status == OK;
   }
   return status;
@@ -208,14 +182,18 @@ int NAME(linearise)(long long steps, const real *t, const real *h, const real *q
   return propagate_blocks(&over, steps);
 }
 
-/* Global errors delta[k + 1] = D psi(x[k]) delta[k] + defect[k] of a run by the step psi from its saved states, with
- * their defects, x[k + 1] - phi(x[k]) by a finer method (Hairer, Norsett & Wanner, Solving ODEs I, II.3 and II.4);
- * further vectors receive rounding errors. What is `left` of the change of a vector compounds over the steps. */
+#ifdef VECTORS_BY_ITERATION
+/* Global errors delta[k + 1] = D psi(x[k]) delta[k] + defect[k] of a run by the step psi from its saved states, and
+ * samples of rounding errors, until an iteration fails. The vectors after the last of k steps are those of row k % 2.
+ * What is `left` of the change of a vector compounds over the steps. */
 int NAME(transport_errors)(long long steps, const real *t, const real *h, const real *q, const real *p,
     const real *parameters, const solver_options *options, int count, double left, double rounding,
-    unsigned long long seed, const real *defects, real *vectors, solver_report *report, real *workspace)
+    unsigned long long seed, const real *defects, real *vectors, long long stride, real *errors, real *deviations,
+    solver_report *report, real *workspace)
 {
-  propagation over = {PROPAGATION_OF_ARGUMENTS, .together = 1, .accepted = left * left, .count = count,
-      .rounding = rounding, .random = seed, .defects = defects, .vectors = vectors};
+  error_vectors all = {count, STEP_INPUTS, rounding, seed, defects, stride, errors, deviations};
+  propagation over = {PROPAGATION_OF_ARGUMENTS, .accepted = left * left, .count = count, .errors = &all,
+      .vectors = vectors};
   return propagate_blocks(&over, steps);
 }
+#endif

@@ -21,20 +21,19 @@ static inline int transform_of(dd t, const dd *q, const dd *x, const double *par
 static inline int correct_transform(dd t, dd *u, const dd *y, const double *parameters, double *workspace)
 {
   enum { CORRECTIONS = 3 };
-  const band shape = band_of(M, 1);
   double high[2 * M], value[M], pivot[M];
   for (int i = 0; i < 2 * M; i++)
     high[i] = u[i].high;
   transform_and_derivatives(t.high, high, parameters, value, workspace);
-  TRY(factorise(workspace, &shape, pivot) ? OK : SINGULAR);
+  TRY(factorise_masses(workspace, pivot));
   for (int k = 0; k < CORRECTIONS; k++) {
     dd now[M];
     transform_of(t, u, u + M, parameters, now);
     for (int i = 0; i < M; i++)
-      value[MASS_POSITION[i]] = dd_subtract(y[i], now[i]).high;
-    back_substitute(workspace, &shape, pivot, value);
+      value[i] = dd_subtract(y[i], now[i]).high;
+    solve_masses(workspace, pivot, value);
     for (int i = 0; i < M; i++)
-      u[M + i] = dd_add(u[M + i], dd_word(value[MASS_POSITION[i]]));
+      u[M + i] = dd_add(u[M + i], dd_word(value[i]));
   }
   return OK;
 }
@@ -76,19 +75,16 @@ static inline int velocities_of(dd t, const dd *q, const dd *p, const double *pa
 {
 #ifdef FIRST_ORDER_SYSTEM
   enum { SOLUTIONS = 4 }; /* of theta_y^T v = H_y: the first one, and corrections */
-  const band shape = band_of(M, 1);
-  double right[M], pivot[M];
+  double right[M], pivot[M], derivative[MASS_ENTRIES];
   dd u[2 * M], theta[M + MASS_ENTRIES], rates[M];
   memcpy(u, q, sizeof(dd) * M);
   memcpy(u + M, p, sizeof(dd) * M);
   legendre_pairs(u, t, parameters, theta);
   first_order_rates_pairs(u, t, parameters, rates);
-  memset(workspace, 0, sizeof(double) * band_size(&shape));
   for (int e = 0; e < MASS_ENTRIES; e++)
-    workspace[shape.first + MASS_POSITION[MASS_ENTRY[e][0]] * shape.stride + MASS_POSITION[MASS_ENTRY[e][1]]] =
-        theta[M + e].high;
-  TRY(all_finite(workspace, (int)band_size(&shape)) ? OK : NOT_FINITE);
-  TRY(factorise(workspace, &shape, pivot) ? OK : SINGULAR);
+    derivative[e] = theta[M + e].high;
+  store_masses(derivative, 1, workspace);
+  TRY(factorise_masses(workspace, pivot));
   memset(v, 0, sizeof(dd) * M);
   for (int k = 0; k < SOLUTIONS; k++) {
     dd rest[M];
@@ -96,10 +92,10 @@ static inline int velocities_of(dd t, const dd *q, const dd *p, const double *pa
     for (int e = 0; e < MASS_ENTRIES; e++)
       rest[MASS_ENTRY[e][1]] = dd_subtract(rest[MASS_ENTRY[e][1]], dd_multiply(theta[M + e], v[MASS_ENTRY[e][0]]));
     for (int i = 0; i < M; i++)
-      right[MASS_POSITION[i]] = rest[i].high;
-    back_substitute(workspace, &shape, pivot, right);
+      right[i] = rest[i].high;
+    solve_masses(workspace, pivot, right);
     for (int i = 0; i < M; i++)
-      v[i] = dd_add(v[i], dd_word(right[MASS_POSITION[i]]));
+      v[i] = dd_add(v[i], dd_word(right[i]));
   }
   return OK;
 #elif defined(HAMILTONIAN_SYSTEM)

@@ -36,36 +36,21 @@ static inline void solve_mass(const lanes *mass, lanes *r)
   solve_lanes(u, t, 0, r);
 }
 #else
+#include "../core/symmetric.h"
+
 /* Full mass matrices in every lane, in their lower triangles. Requires: points.h or trajectories.h. */
 enum { DIAGONAL = 0,
   MASS = M * M };
 
-/* L D L^T factors of the mass matrix without pivoting, 1 / D on the diagonal; a zero pivot gives NaN. */
+/* Factors of the mass matrix; a zero pivot gives NaN. */
 static inline void factor_mass(lanes *mass)
 {
-  for (int j = 0; j < M; j++) {
-    const lanes inverse = 1.0 / mass[j * M + j];
-    for (int i = j + 1; i < M; i++) {
-      const lanes entry = mass[i * M + j], factor = entry * inverse;
-      for (int k = j + 1; k < i; k++)
-        mass[i * M + k] -= entry * mass[k * M + j];
-      mass[i * M + i] -= entry * factor;
-      mass[i * M + j] = factor;
-    }
-    mass[j * M + j] = inverse;
-  }
+  factorise_symmetric(mass, M, M - 1, M);
 }
 
 /* r = mass^-1 r with the factors. */
 static inline void solve_mass(const lanes *mass, lanes *r)
 {
-  for (int j = 0; j < M; j++) {
-    for (int i = j + 1; i < M; i++)
-      r[i] -= mass[i * M + j] * r[j];
-    r[j] *= mass[j * M + j];
-  }
-  for (int j = M - 1; j > 0; j--)
-    for (int i = 0; i < j; i++)
-      r[i] -= mass[j * M + i] * r[j];
+  solve_symmetric(mass, M, M - 1, M, r);
 }
 #endif

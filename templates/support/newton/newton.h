@@ -153,6 +153,22 @@ static void add_boundary(const step_data *step, newton_data *data, const real *q
   }
 }
 
+/* Evaluates the equations, the sizes of their terms and the increment p1 - p0, which changes by `change`. */
+static int evaluate_increment(const step_data *step, newton_data *data, const real *q1, int with_jacobian,
+    const band *shape, real *size_p, real *size_q, real *increment, real *change)
+{
+  evaluate(step, data->z, data->rows, size_p, size_q, with_jacobian ? data->factors : NULL, shape);
+  for (int i = 0; i < M; i++) {
+    change[i] = data->rows[i * (B + 1) + B] - increment[i];
+    increment[i] = data->rows[i * (B + 1) + B];
+  }
+  if (q1)
+    add_boundary(step, data, q1, with_jacobian, shape);
+  return all_finite(data->rows, N + SITES) && all_finite(increment, M) && all_finite(size_p, M) && all_finite(size_q, M)
+      ? OK
+      : NOT_FINITE;
+}
+
 /* Factorises the Jacobian and stores where it was evaluated. Returns 0 if it is singular. */
 static int linearise(const step_data *step, newton_data *data, const band *shape)
 {
@@ -207,17 +223,9 @@ static int newton(const step_data *step, newton_data *data, const real *q1, real
   int trials = 0, stagnations = 0, slow = 0;
   memset(increment, 0, sizeof(real) * M);
   for (int k = 0;; k++) {
-    evaluate(step, data->z, data->rows, size_p, size_q, *keep ? NULL : data->factors, &shape);
-    for (int i = 0; i < M; i++) {
+    TRY(evaluate_increment(step, data, q1, !*keep, &shape, size_p, size_q, increment, change));
+    for (int i = 0; i < M; i++)
       size_q[i] += added[i];
-      change[i] = data->rows[i * (B + 1) + B] - increment[i];
-      increment[i] = data->rows[i * (B + 1) + B];
-    }
-    if (q1)
-      add_boundary(step, data, q1, !*keep, &shape);
-    if (!all_finite(data->rows, N + SITES) || !all_finite(increment, M) || !all_finite(size_p, M) ||
-        !all_finite(size_q, M))
-      return NOT_FINITE;
     if (k > 0) {
       measure(&moved, change, size_p);
       report->change = options->absolute ? moved.absolute : moved.relative;

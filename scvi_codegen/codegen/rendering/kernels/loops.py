@@ -110,13 +110,7 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
     terms = [(rolled, rolled.scalar) for rolled in loops.forces if rolled.scalar]
     terms += [(rolled, rolled.kernel) for rolled in loops.constants]
     constants = (*loops.masses, *loops.frictions, *loops.heats)
-    scalars = [rolled.kernel for rolled in constants] + [scalar for _, scalar in terms]
-    for rolled in loops.forces if fixed_point is None else ():
-        apart = _apart(rolled)
-        scalars += apart[1:] if apart else [rolled.kernel]
-    if constrained:
-        scalars += [rolled.kernel for rolled in (*constrained.conditions, *constrained.curvatures)]
-    scalars += [rolled.kernel for rolled in (*loops.velocities, *loops.momenta)]
+    scalars = _scalar_kernels(program, [*(rolled.kernel for rolled in constants), *(scalar for _, scalar in terms)])
     return {
         "program": program,
         "most_threads": 1 if constrained else MOST_THREADS,
@@ -125,12 +119,6 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
         "energies": [_energy_text(program, rolled, scalar, declared=rolled in pairs) for rolled, scalar in terms],
         "masses": [_mass_text(program, rolled) for rolled in constants],
         "lists": [(name, _list_text(program, count, lengths)) for name, count, lengths in loops.neighbours],
-        "circulants": {rolled.kernel.name: _circulant_text(program, rolled) for rolled in pairs},
-        "sums": len(sums),
-        "convolutions": describing_function(layout, "convolutions", "convolution", sums),
-        "summed": [rolled.kernel.name for rolled in loops.applied if _has_sums(rolled)],
-        "plans": len(_plans(program)),
-        "most_stages": max((len(_stages(convolutions)) for convolutions in program.layout.sums), default=0),
         "force_names": [rolled.kernel.name for rolled in loops.forces],
         "energy_names": [(scalar.name, _has_sums(rolled)) for rolled, scalar in terms],
         "equal_masses": [*map(_is_uniform, loops.masses)] == [True],
@@ -158,13 +146,37 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
         "maps": describing_function(layout, "maps", "momentum_map", [*_map_texts(program)]),
         "hot": "static",
         "rows": rows,
-        "waves": _lattice_context(program) if _on_lattices(program) else None,
         "arrays": function_of_sizes(
             layout,
             "static inline void describe_coordinate_arrays(const problem *arrays, coordinate_array *all)",
             ["long long end = 0;", *_appended_arrays(program)],
         ),
         **_constraint_context(program, constrained),
+        **_transform_context(program, pairs, sums),
+    }
+
+
+def _scalar_kernels(program: ArrayProgram, first: Sequence[Kernel]) -> list[Kernel]:
+    """Return the kernels of numbers: the first ones, of explicit forces, of constraints and of sites."""
+    loops, kernels = program.loops, [*first]
+    for rolled in loops.forces if program.fixed_point is None else ():
+        apart = _apart(rolled)
+        kernels += apart[1:] if apart else [rolled.kernel]
+    if loops.constrained:
+        kernels += [rolled.kernel for rolled in (*loops.constrained.conditions, *loops.constrained.curvatures)]
+    return kernels + [rolled.kernel for rolled in (*loops.velocities, *loops.momenta)]
+
+
+def _transform_context(program: ArrayProgram, pairs: Sequence[RolledKernel], sums: Sequence[str]) -> dict[str, Any]:
+    """Return the context of Fourier transforms: forces of circulant pairs, convolutions, plans and lattices."""
+    return {
+        "circulants": {rolled.kernel.name: _circulant_text(program, rolled) for rolled in pairs},
+        "sums": len(sums),
+        "convolutions": describing_function(program.layout, "convolutions", "convolution", sums),
+        "summed": [rolled.kernel.name for rolled in program.loops.applied if _has_sums(rolled)],
+        "plans": len(_plans(program)),
+        "most_stages": max((len(_stages(convolutions)) for convolutions in program.layout.sums), default=0),
+        "waves": _lattice_context(program) if _on_lattices(program) else None,
     }
 
 

@@ -325,11 +325,16 @@ def _kept(fixed_point: FixedPointIteration) -> dict[str, str]:
 
 
 def _vector_function(name: str) -> str:
+    """Return the definition of a function of vectors, each function by a macro whose first argument is its name."""
     if name.startswith(INVERSE_ROOT):
         k = int(name.removeprefix(INVERSE_ROOT))
-        powers = " * ".join(["square"] * (k // 2) + ["y"])
-        return f"LANES_INVERSE_ROOT({k}, ({powers}), ({' * '.join(['inverse'] * ((k + 1) // 2))}))"
-    return f"LANES_{'LIBRARY_' * (name in LIBRARY)}FUNCTION{'_OF_TWO' * (name in OF_TWO)}({name})"
+        powers, inverses = " * ".join(["square"] * (k // 2) + ["y"]), " * ".join(["inverse"] * ((k + 1) // 2))
+        times = f"LANES_INVERSE_ROOT(lanes_{name}_times, {k}, ({powers}), ({inverses}));"
+        return f"{times}\nINVERSE_ROOT_ALONE(lanes_{name}, lanes_{name}_times)"
+    of_two = "_OF_TWO" * (name in OF_TWO)
+    if name in LIBRARY:
+        return f"LANES_LIBRARY_FUNCTION{of_two}(lanes_{name}, {name})"
+    return f"LANE_BY_LANE{of_two}(lanes_{name}, MATH({name}))"
 
 
 def _tables(fixed_point: FixedPointIteration, meaning: Lanes, number: Target, *, changes: bool) -> Iterator[str]:

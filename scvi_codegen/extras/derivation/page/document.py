@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import count, groupby, takewhile
+from typing import Any
 
 import sympy
 from sympy import Function as Applied
@@ -20,7 +21,6 @@ from scvi_codegen.codegen.rendering.program_source import render
 from scvi_codegen.common.display.tables import TableBlock
 from scvi_codegen.extras.derivation.equations import StepEquations, derive
 from scvi_codegen.extras.derivation.notation import contact_lines, events_text, table_entries
-from scvi_codegen.extras.derivation.outline import Function, functions_of, reached
 from scvi_codegen.extras.derivation.page.drawings import curve_section, jacobian_section, tables_section
 from scvi_codegen.extras.derivation.page.sums import end_formulas, gather_formulas, meaning, row_formulas
 from scvi_codegen.extras.derivation.writing import (
@@ -251,7 +251,7 @@ def derivation_html(system: MechanicalSystem, method: Method, *, events: Sequenc
 
 def _sections(system: MechanicalSystem, method: Method) -> Iterator[Section]:
     program = program_of(system, method, prefix=c_identifier(system.name))
-    functions = functions_of(render(program).amalgamated().code)
+    functions = render(program).functions
     stages = Discretisation(system, method).paper
     derived = component_equations(system, method, stages)
     yield system_section(system)
@@ -322,7 +322,7 @@ def operations_section(program: Program) -> Section:
     return Section(name="operations", title="Operation counts", contents=contents)
 
 
-def kernels_section(system: MechanicalSystem, program: Program, functions: Mapping[str, Function]) -> Section:
+def kernels_section(system: MechanicalSystem, program: Program, functions: Mapping[str, Any]) -> Section:
     """Return the section with one pair per kernel: formulas at the left, C at the right."""
     names = _names(system)
     pairs = tuple(_pair(program, kernel, functions, names) for kernel in kernels_of(program))
@@ -343,15 +343,13 @@ def _names(system: MechanicalSystem) -> dict[Symbol, Symbol]:
     }
 
 
-def kernel_text(functions: Mapping[str, Function], name: str) -> str:
+def kernel_text(functions: Mapping[str, Any], name: str) -> str:
     """Return the C of a kernel; a large one is divided into parts, which it calls in order."""
     parts = takewhile(functions.__contains__, (f"{name}_{k}" for k in count(1)))
     return "\n".join(functions[part].text for part in (*parts, name))
 
 
-def _pair(
-    program: Program, kernel: Kernel, functions: Mapping[str, Function], names: Mapping[Symbol, Symbol]
-) -> SideBySide:
+def _pair(program: Program, kernel: Kernel, functions: Mapping[str, Any], names: Mapping[Symbol, Symbol]) -> SideBySide:
     function = functions[kernel.name]
     values, partials = (
         [
@@ -382,7 +380,7 @@ inverse_mass = Symbol("M__-1")
 
 
 def functions_section(
-    system: MechanicalSystem, method: Method, program: Program, functions: Mapping[str, Function]
+    system: MechanicalSystem, method: Method, program: Program, functions: Mapping[str, Any]
 ) -> Section:
     """Return the section on functions, from the loop over the steps down: formulas or words left, C right."""
     stages = Discretisation(system, method).equations
@@ -401,7 +399,17 @@ def functions_section(
     return Section(name="functions", title="The step: what the C does", contents=(Paragraph(text), *pairs))
 
 
-def _function_pair(function: Function, start: str, all_formulas: Iterator[Content]) -> SideBySide:
+def reached(functions: Mapping[str, Any], start: str) -> Iterator[Any]:
+    """Yield ``start`` and the functions that it calls, directly or not, each once, callers first."""
+    done, pending = set[str](), [start]
+    while pending:
+        if (name := pending.pop()) not in done:
+            done.add(name)
+            pending.extend(reversed(functions[name].calls))
+            yield functions[name]
+
+
+def _function_pair(function: Any, start: str, all_formulas: Iterator[Content]) -> SideBySide:
     words = function.comment or "The loop over the steps, with compensated sums."
     return SideBySide(
         title=f"{function.name}({', '.join(function.arguments)})",

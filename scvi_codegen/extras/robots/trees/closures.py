@@ -16,9 +16,10 @@ from sympy import Add, Expr, Matrix, cos, eye, sin
 
 from scvi_codegen.api.formulas import RotationNames, Tape, jacobian, mp, symbol
 from scvi_codegen.common.errors import SystemDefinitionWarning, warn
+from scvi_codegen.common.tangent_space import DEPENDENT
 from scvi_codegen.extras.robots.trees.energies import exact_matrix, exact_number, exact_vector, position_of, rotation_of
 from scvi_codegen.extras.robots.trees.tree import SINGLE, Link, Pose, Vector, hat, rounded
-from scvi_codegen.systems.derived_expressions import DEPENDENT, dense
+from scvi_codegen.systems.derived_expressions import dense
 from scvi_codegen.systems.formulas.intermediates import intermediate
 
 ATTEMPTS, ITERATIONS = 4, 20
