@@ -1,15 +1,9 @@
-"""States along runs, and how runs are judged.
+"""How runs are judged.
 
-``STEPPER``
-    Kind of an argument that is a compiled stepper.
-``EnsembleSettings``
-    The arguments of ``integrate_ensemble`` but the initial states, checked for one stepper. StateError.
-``without_accuracy_warnings()``
-    Context or decorator without AccuracyWarning, for large steps on purpose.
+``without_accuracy_warnings()``, ``warnings_wanted()``
+    Context or decorator without AccuracyWarning, for large steps on purpose; whether they are wanted.
 """
 
-from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
-from scvi_codegen.runs.ensembles.ensemble import EnsembleSettings
-from scvi_codegen.runs.stepper import STEPPER
+from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
 
-__all__ = ["STEPPER", "EnsembleSettings", "without_accuracy_warnings"]
+__all__ = ["warnings_wanted", "without_accuracy_warnings"]

@@ -92,7 +92,7 @@ from scvi_codegen.systems.kinks import located_kinks
 from scvi_codegen.systems.legendre.of_arrays import SiteHamiltonian, site_hamiltonian
 from scvi_codegen.systems.legendre.transform import energy_of_states, equivalent_lagrangian
 from scvi_codegen.systems.symmetry.symmetry import SYMMETRIES, Symmetry, all_symmetries
-from scvi_codegen.systems.system import BATH_ENERGY, SYSTEM, MechanicalSystem
+from scvi_codegen.systems.system import BATH_ENERGY, MechanicalSystem
 from scvi_codegen.systems.term_groups import roll_terms
 
 LONGEST_PREFIX = 64
@@ -614,7 +614,7 @@ def _modes_of(kinks: Iterable[Kink]) -> tuple[tuple[str, ...], ...]:
     return tuple((u.mode, str(u.function), "jumps" * u.is_wall, u.held, *map(str, u.power_sides)) for u in kinks)
 
 
-@checks_arguments(system=SYSTEM, symmetries=SYMMETRIES)
+@checks_arguments(system=MechanicalSystem.KIND, symmetries=SYMMETRIES)
 @without_collection
 def generate_source(
     system: MechanicalSystem,

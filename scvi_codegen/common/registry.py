@@ -62,7 +62,7 @@ EXTRAS = {
     "pages": Extra(
         commands={"page": "Write a page that computes the motion in the browser."},
         sections="page picture",
-        services="page.page_of",
+        services="page.page",
     ),
     "frameworks": Extra(),
     "distributed": Extra(services="blocks.integrate_ensemble"),

@@ -1,5 +1,6 @@
 """Representations of objects for ``repr``: constructor-like or a summary, at most ``LONGEST`` characters."""
 
+import math
 import numbers
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -35,6 +36,28 @@ def one_line(value: Any, title: str, facts: str) -> str:
 def clipped(text: str, length: int = LONGEST) -> str:
     """Return the text, or its beginning and "..", in at most ``length`` characters."""
     return text if len(text) <= length else f"{text[: max(length - 2, 0)]}.."
+
+
+def with_uncertainty(value: float, error: float) -> str:
+    """Return a value with the uncertain digits of its error in parentheses: ``0.512345(12)`` is 0.512345 +- 0.000012.
+
+    The error has two digits, rounded up; an error above the value is written in full, ``3(12)``.
+    """
+    if not (math.isfinite(value) and math.isfinite(error)):
+        return f"{value:.3g}(lost)"
+    if error == 0.0:
+        return repr(float(value))
+    decimals = 1 - math.floor(math.log10(error))
+    digits = math.ceil(error * 10.0**decimals - 1e-9) if abs(decimals) < 300 else 0
+    if digits >= 100:
+        digits, decimals = 10, decimals - 1
+    exponent = math.floor(math.log10(abs(value))) if value else -decimals
+    if -5 < exponent < 16 and decimals >= 0:
+        return f"{value:.{decimals}f}({digits})"
+    shown = max(0, decimals + exponent)
+    if decimals + exponent < 0:
+        digits = math.ceil(error / 10.0**exponent)
+    return f"{value / 10.0**exponent:.{shown}f}({digits})e{exponent:+03d}"
 
 
 def _short(value: Any) -> str:

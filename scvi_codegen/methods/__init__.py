@@ -1,6 +1,6 @@
 """Integration methods: each has an order, symmetry and symplecticity, and defines its stage equations for a system."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from inspect import Parameter, signature
 from typing import Any, Final
 
@@ -97,16 +97,19 @@ LOOSE = 1e-4
 """Tolerance of adaptive steps from which on those of SVI(4) take less time than those of SVI(8) (docs/steps.md)."""
 
 
-def as_method(method: Method | str, system: MechanicalSystem | None = None) -> Method:
+def as_method(method: Method | str | Specification, system: MechanicalSystem | None = None) -> Method:
     """Return a method from its name: ``"svi"`` (degree 8), ``"svi:6"``, ``"gauss:3"``; methods are returned unchanged.
 
-    For a system with constraints an SVI gets the quadrature points that they require.
+    For a system with constraints an SVI gets the quadrature points that they require. Plain data of a method,
+    ``{"method": "svi", "degree": 8}``, are accepted, too.
 
     Raises:
         MethodError: for an unknown name, an invalid number or one that the method does not accept, and other types.
     """
     if isinstance(method, Method):
         return method
+    if isinstance(method, Mapping):
+        return method_from_specification(method)
     if not isinstance(method, str):
         raise MethodError(f"method must be a method, as SVI(8), or a name such as 'svi:8', not {method!r}")
     return method_from_specification(fitted(sized(specification_of(method)), system))

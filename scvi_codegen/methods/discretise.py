@@ -28,12 +28,13 @@ from scvi_codegen.systems.first_order import FirstOrderSystem
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
 from scvi_codegen.systems.formulas.intermediates import intermediate, symbols_of
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
-from scvi_codegen.systems.kinks import check_continuity
+from scvi_codegen.systems.kinks import check_continuity, warn_of_formulas
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 from scvi_codegen.systems.legendre.of_rotations import hamiltonian_of_rotations
 from scvi_codegen.systems.splittings.axial import Turn, axial_turns, frame_potential, rotated
+from scvi_codegen.systems.splittings.kinetic import kinetic_splitting
 from scvi_codegen.systems.system import MechanicalSystem
-from scvi_codegen.systems.time_transformation import reparametrise
+from scvi_codegen.systems.time_transformation import reparametrise, time_rescaling_function
 
 NUMBERS = {"34a": "35a", "34c": "35c", "34d": "35d", "34e": "35e"}
 """Equation numbers of the paper for the shooting method in phase space, by those for Lagrangians."""
@@ -381,6 +382,32 @@ class Discretisation:
     def conformally_symplectic(self) -> bool:
         """Whether the steps multiply dq ^ dp by exp(-gamma h), where gamma is the damping rate."""
         return is_conformally_symplectic(self.method, self.system)
+
+    @property
+    def turns(self) -> tuple[Turn, ...]:
+        """Rotations whose axial symmetry splits the step, see :func:`axial_turns`."""
+        return tuple(axial_turns(self.system)[1])
+
+    @property
+    def explicit(self) -> bool:
+        """Whether the step is an explicit one of kicks and drifts."""
+        split = kinetic_splitting(self.system)
+        return not isinstance(split, str) and self.method.explicit_step(split) is not None
+
+    @staticmethod
+    def time_rate(system: MechanicalSystem, g: str | Expr) -> Expr:
+        """Return the formula of a time-rescaling function from its name or text, which may depend on time."""
+        return time_rescaling_function(system, g, in_time=True)
+
+    @staticmethod
+    def check_continuity(system: MechanicalSystem) -> None:
+        """Raise MethodError if L or H jumps where steps do not refract momenta."""
+        check_continuity(system)
+
+    @staticmethod
+    def warn_of_kinks(system: MechanicalSystem, subject: str) -> None:
+        """Warn that steps of a subject do not end at kinks of a system, other than rint and cutoffs of lists."""
+        warn_of_formulas(system, subject)
 
     def check(self) -> None:
         """Raise MethodError for a Hamiltonian with singular d2H/dp2 and a method that requires regularity."""

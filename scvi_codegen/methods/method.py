@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from scvi_codegen.common.cache import key_of
 from scvi_codegen.common.display.cards import card, plain
@@ -30,6 +30,7 @@ from scvi_codegen.methods.tables.tableau import MAX_STAGES
 from scvi_codegen.systems.system import MechanicalSystem
 
 if TYPE_CHECKING:
+    from scvi_codegen.common.display.tables import TableBlock
     from scvi_codegen.methods.recurrence import ExplicitStep
     from scvi_codegen.methods.stage_system import StageSystem
     from scvi_codegen.methods.tables.number_tables import Part
@@ -151,8 +152,22 @@ class Method(ABC):
         """Nodes, quadrature and tableau that the method is made from."""
         return ()
 
+    @property
+    def tables(self) -> tuple[TableBlock, ...]:
+        """Nodes, quadratures and tableaux as tables, in radicals where these are short."""
+        from scvi_codegen.methods.tables.number_tables import number_table  # imports SymPy
+
+        return tuple(map(number_table, self.parts))
+
+    @property
+    def closed_forms(self) -> list[Sequence[Any] | None]:
+        """Points, weights and coefficients of each part as rationals and radicals; ``None`` for other numbers."""
+        from scvi_codegen.methods.tables.closed_forms import exact_part
+
+        return [*map(exact_part, self.parts)]
+
     def _repr_html_(self) -> str:
-        from scvi_codegen.methods.tables.number_tables import number_table, numbers_html
+        from scvi_codegen.methods.tables.number_tables import numbers_html
 
         facts = (
             ("name", plain(self.name)),
@@ -160,7 +175,7 @@ class Method(ABC):
             ("symplectic", plain("yes" if self.symplectic else "no")),
             ("symmetric", plain("yes" if self.symmetric else "no")),
         )
-        return card(self.title, facts, *(numbers_html(number_table(part)) for part in self.parts))
+        return card(self.title, facts, *map(numbers_html, self.tables))
 
     def key(self) -> tuple[str, ...]:
         """Return the key of this method in caches, made from its type and all of its fields."""

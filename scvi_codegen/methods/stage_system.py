@@ -264,6 +264,11 @@ class StageGroup(StagePoints):
         scatters = (replace(scatter, table=table) for scatter, table in zip(self.scatters, tables, strict=True))
         return replace(self, gathers=tuple(gathers), scatters=tuple(scatters))
 
+    def abscissa_name(self, n: int) -> EntryName | None:
+        """Return the name of the abscissa of point n on the step; ``None`` for 0 and 1."""
+        prefix = "d" if self.name == "quadrature" else "c"
+        return None if self.abscissae[n] in (0, 1) else EntryName(prefix, n + 1)
+
 
 class Shape:
     """Base class of the structure used by matrix-free solvers: :mod:`scvi_codegen.methods.stage_system`."""
@@ -304,6 +309,15 @@ class StageSystem:
     def row_sizes(self, dimension: int) -> tuple[int, ...]:
         """Return the number of equations of each row; the last entry is m, for p1."""
         return (*(dimension if row.size is None else row.size for row in self.rows), dimension)
+
+    def straight(self, q: Any, v: Any, p: Any, h: Any, number: Callable[[Any], Any] = float) -> list[Any]:
+        """Return an initial guess of each block of unknowns: the straight line from (q, p) with velocity v."""
+        return [
+            number(block.straight[0]) * q + number(block.straight[1]) * h ** (1 - block.power) * v + block.momentum * p
+            if block.size is None
+            else 0 * q[[0] * block.size]
+            for block in self.blocks
+        ]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -431,16 +445,6 @@ def stationary_nodal(
         end_momentum=mp.zero,
         end_numbers=end_numbers,
     )
-
-
-def straight(stages: StageSystem, q: Any, v: Any, p: Any, h: Any, number: Callable[[Any], Any] = float) -> list[Any]:
-    """Return an initial guess of each block of unknowns: the straight line from (q, p) with velocity v."""
-    return [
-        number(block.straight[0]) * q + number(block.straight[1]) * h ** (1 - block.power) * v + block.momentum * p
-        if block.size is None
-        else 0 * q[[0] * block.size]
-        for block in stages.blocks
-    ]
 
 
 def unit_sum(weights: Sequence[Number]) -> Vector:

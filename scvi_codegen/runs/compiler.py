@@ -44,12 +44,12 @@ from scvi_codegen.methods import (
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
 from scvi_codegen.runs.stepping.compiled_method import Variants
-from scvi_codegen.runs.stepping.features import warn_of_formulas
 from scvi_codegen.systems.contact import ContactLike
 from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.event import Event, EventLike, as_events
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
-from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS, MechanicalSystem
+from scvi_codegen.systems.kinks import warn_of_formulas
+from scvi_codegen.systems.system import MechanicalSystem
 
 if TYPE_CHECKING:
     from sympy import Expr
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from scvi_codegen.systems.symmetry.symmetry import Symmetry
 
 
-@checks_arguments(system=SYSTEM_OR_ARRAYS, flags=TEXTS)
+@checks_arguments(system=MechanicalSystem.OR_ARRAYS, flags=TEXTS)
 def compile_stepper(
     system: MechanicalSystem,
     method: Method | str | None = None,

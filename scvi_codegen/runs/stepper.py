@@ -12,7 +12,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial, wraps
 from math import isfinite
-from typing import Any, Self, TypeVar, cast
+from typing import Any, ClassVar, Self, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,40 +25,30 @@ from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.codegen.variants import Variant
 from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.common.once import Once
-from scvi_codegen.common.validation import checked_count, checks_arguments, of
-from scvi_codegen.runs.accuracy.global_error import Runs, checked_error, warn_of_unconfirmed, warn_of_unconfirmed_run
+from scvi_codegen.common.validation import ArgumentType, checked_count, checks_arguments, of
+from scvi_codegen.runs.accuracy.global_error import Runs, checked_error, warn_of_unconfirmed_run
 from scvi_codegen.runs.accuracy.growth import measures_growth, warn_of_error_growth
-from scvi_codegen.runs.accuracy.local_error import warn_of_energy_errors, warn_of_inaccuracy
-from scvi_codegen.runs.accuracy.resolution import warn_of_unresolved_members
+from scvi_codegen.runs.accuracy.local_error import warn_of_inaccuracy
 from scvi_codegen.runs.accuracy.warning_switch import warn_of_failed_check
 from scvi_codegen.runs.driver.bounded_motion import BoundedMotion
 from scvi_codegen.runs.driver.observation import Observe
 from scvi_codegen.runs.driver.run import Run
 from scvi_codegen.runs.driver.segments import InputSegments, checked_inputs, final_time
 from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings
-from scvi_codegen.runs.ensembles.individual import IndividualRuns, runs_of
-from scvi_codegen.runs.ensembles.lanes import CommonRuns
 from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
 from scvi_codegen.runs.events.contacts import in_first_modes
 from scvi_codegen.runs.events.refinement import WithEventsInDouble, constantly
 from scvi_codegen.runs.forwarding import Forwarded, OfSteppers
+from scvi_codegen.runs.products import ForProducts
 from scvi_codegen.runs.results.dense_output import check_has_end, times_of_run
 from scvi_codegen.runs.results.output import ALL_STATES, Output
 from scvi_codegen.runs.states.layout import InitialData
 from scvi_codegen.runs.states.times import times_after
-from scvi_codegen.runs.states.validation import (
-    Array,
-    EnsembleParameters,
-    Parameters,
-    States,
-    check_step_given,
-    flat_state,
-)
+from scvi_codegen.runs.states.validation import Array, Parameters, States, check_step_given, flat_state
 from scvi_codegen.runs.states.words import check_doubles, hashed
 from scvi_codegen.runs.stepping.array_interface import RunSizes, interface_of_sizes, shapes_of_call, sizes_of_run
 from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.runs.stepping.features import check_together, require
-from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise, with_sequences
 from scvi_codegen.runs.stepping.projection import consistent, constraint_values, multipliers, projected
 from scvi_codegen.runs.stepping.saving import read_checkpoint
@@ -83,9 +73,11 @@ from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
 Called = TypeVar("Called", bound=Callable[..., Any])
 
 
-class Stepper(WithEventsInDouble, OfSteppers, Integrator):
+class Stepper(WithEventsInDouble, OfSteppers, ForProducts):
     """Compiled integrator of one system: :class:`Integrator` with integrations, runs, ensembles and projections."""
 
+    KIND: ClassVar[ArgumentType]
+    """Kind of an argument that is a stepper, for ``checks_arguments``."""
     _trajectory_type = Trajectory
     _precise: Callable[[], Stepper | None] | None = None
     """Function that returns the stepper in double-double if there is one, for ``error=`` with precision="auto"."""
@@ -491,7 +483,7 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
         save_every: int = 1,
         t: float = 0.0,
         t_eval: ArrayLike | None = None,
-        parameters: EnsembleParameters = None,
+        parameters: Parameters = None,
         options: SolverOptions | None = None,
         progress: Callable[[int], None] | None = None,
         threads: int | None = None,
@@ -544,9 +536,9 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
         errors: Any = {"tolerance": tolerance, "absolute_tolerance": absolute_tolerance, "error": error}
         others: Any = {"inputs": inputs, "parameters": parameters, "seed": seed, "metropolis": metropolis}
         settings = EnsembleSettings(**times, **errors, **others, observe=observe, precision=precision)
-        runs = runs_of(self._ensemble(q, p, settings, velocity=velocity, action=action))
+        runs = self.ensemble_runs(q, p, settings, velocity=velocity, action=action)
         runs.run(progress=progress, threads=threads)
-        return checked_ensemble_result(runs)
+        return self.ensemble_result(runs)
 
     def _ensemble(
         self,
@@ -775,21 +767,6 @@ class StepperOfRunTimeSizes(Stepper):
         return self._reason is not None or "advance_to" in self.source.contents.functions
 
 
-def checked_ensemble_result(runs: CommonRuns | IndividualRuns) -> EnsembleTrajectory:
-    """Return the trajectories of an ensemble that was integrated; issue warnings of inaccurate ones."""
-    trajectories = runs.result()
-    if isinstance(runs, IndividualRuns):
-        runs.warn_of_too_many_states(trajectories)
-    try:
-        if isinstance(runs, IndividualRuns):
-            warn_of_unconfirmed(trajectories.confirmations)
-            warn_of_energy_errors(trajectories, None if runs.successive is None else runs.successive.energies)
-        warn_of_unresolved_members(trajectories)
-    except Exception as error:  # noqa: BLE001  (the runs are complete)
-        warn_of_failed_check(error)
-    return trajectories
-
-
 PER_STEP = (Stepper.integrate, Stepper.start)
 """Methods whose ``threads`` are those of each step."""
 
@@ -798,5 +775,5 @@ def _rebuild_bound(origin: StepperOfRunTimeSizes, problem: RunSizes, events: tup
     return origin._bound_to(problem)._copy(events)
 
 
-STEPPER = of("a compiled stepper", Stepper)
+Stepper.KIND = of("a compiled stepper", Stepper)
 """Type check of steppers."""

@@ -19,7 +19,7 @@ from scvi_codegen.common.errors import EventError, StateError, StepFailedError
 from scvi_codegen.common.labelled_arrays import checked_units, to_dataset
 from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.runs.accuracy.global_error import Confirmed, GlobalError
-from scvi_codegen.runs.accuracy.local_error import TOLERABLE_ERROR
+from scvi_codegen.runs.accuracy.local_error import ADAPTIVE_REMEDY, TOLERABLE_ERROR, warn_of_large_steps
 from scvi_codegen.runs.accuracy.resolution import unresolved_parts
 from scvi_codegen.runs.accuracy.run_error import RunError, WithErrors
 from scvi_codegen.runs.accuracy.size import relative
@@ -29,7 +29,7 @@ from scvi_codegen.runs.events.contacts import contact_forces, contact_modes
 from scvi_codegen.runs.events.refinement import crossings_of
 from scvi_codegen.runs.forwarding import OfRuns
 from scvi_codegen.runs.results.dense_output import states_at, times_of_words, within
-from scvi_codegen.runs.results.energy import energy_account
+from scvi_codegen.runs.results.energy import EnergyAccount, energy_account
 from scvi_codegen.runs.results.export import COLUMNS, States, to_dataframe, write_states
 from scvi_codegen.runs.results.joining import (
     Number,
@@ -230,6 +230,10 @@ class Trajectory(
             raise StateError("a single step that failed has no trajectory")
         return failure.trajectory
 
+    def warn_of_large_steps(self, remedy: str = ADAPTIVE_REMEDY) -> None:
+        """Issue an :class:`AccuracyWarning` for the worst fixed step if its error is large; ``remedy`` ends it."""
+        warn_of_large_steps(self, remedy=remedy)
+
     def energy(self) -> Array:
         """Return (n,) energies p.v - L, constant along exact trajectories if L does not depend on time."""
         if self.conserved is not None:
@@ -242,6 +246,10 @@ class Trajectory(
         if self.conserved is not None:
             return self.conserved[:, :3]
         return self._joined(lambda piece: in_modes(piece, piece.stepper._energy_parts))
+
+    def energy_account(self, *, limited: bool = False) -> EnergyAccount:
+        """Return the change of the energy and the work along the run; ``limited``: the work of short runs only."""
+        return energy_account(self, limited=limited)
 
     def energy_error(self) -> float:
         """Return the largest error of the energy, relative to the largest sum of its parts, abs(T) + abs(E - T).

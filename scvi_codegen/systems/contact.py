@@ -91,6 +91,7 @@ class Contact:
         SystemDefinitionError: for friction without slip or slip without friction, and invalid coefficients.
     """
 
+    MOST_ROWS = MOST_ROWS
     gap: Formula
     slip: Formula | tuple[Formula, ...] | None = None
     friction: Formula | None = None
@@ -110,6 +111,17 @@ class Contact:
     def table(self) -> dict[str, Any]:
         """Arguments by name, as in ``[[contacts]]`` of a model file."""
         return _table(self)
+
+    @property
+    def laws(self) -> tuple[Expr, Expr, Expr]:
+        """Coefficients of friction and static friction, 0 without, and of restitution, of expressions."""
+        friction: Any = zero() if self.friction is None else self.friction
+        return friction, zero() if self.friction is None else static_limit(self), cast("Expr", self.restitution)
+
+    @property
+    def rows(self) -> int:
+        """Number of gaps and slips, of which a system may have ``MOST_ROWS``."""
+        return 1 + len(slips_of(self))
 
     def __post_init__(self) -> None:
         shown = f"the contact '{self.gap}'"
@@ -157,6 +169,16 @@ class Friction:
         """Arguments by name, as in ``[[contacts]]`` of a model file."""
         return _table(self)
 
+    @property
+    def laws(self) -> tuple[Expr, Expr, Expr]:
+        """Limits of friction and static friction, and 0, of expressions."""
+        return cast("Expr", self.limit), static_limit(self), zero()
+
+    @property
+    def rows(self) -> int:
+        """Number of gaps and slips, of which a system may have ``MOST_ROWS``."""
+        return len(slips_of(self))
+
     def __post_init__(self) -> None:
         _set_slip(self, f"the friction '{self.slip}'")
         _check_limits(f"the friction '{self.slip}'", ("limit", self.limit), ("static_limit", self.static_limit))
@@ -177,11 +199,6 @@ def slips_of(item: Any) -> tuple[Any, ...]:
     if item.slip is None:
         return ()
     return item.slip if isinstance(item.slip, tuple) else (item.slip,)
-
-
-def rows_of(contacts: Iterable[ContactLike]) -> int:
-    """Return the number of gaps and slips of contacts."""
-    return sum(isinstance(item, Contact) + len(slips_of(item)) for item in contacts)
 
 
 def _number_or_text(value: Any) -> float | str:
@@ -290,15 +307,12 @@ def static_limit(item: Any) -> Any:
 
 
 def coefficients(system: Any) -> list[Expr]:
-    """Return (friction, static friction, restitution) of each contact; limits, and 0, of friction without a gap."""
+    """Return the ``laws`` of each contact, one after another."""
+    return [law for item in system.contacts for law in item.laws]
+
+
+def zero() -> Any:
+    """Return 0 as an expression."""
     from sympy import S
 
-    values: list[Expr] = []
-    for item in system.contacts:
-        if isinstance(item, Contact):
-            none = item.friction is None
-            values += [S.Zero, S.Zero] if none else [cast("Expr", item.friction), static_limit(item)]
-            values.append(cast("Expr", item.restitution))
-        else:
-            values += [item.limit, static_limit(item), S.Zero]
-    return values
+    return S.Zero

@@ -25,7 +25,7 @@ from scvi_codegen.systems.formulas.grammar import parse_expression
 from scvi_codegen.systems.formulas.symbols import DOT, check_names, symbol
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 from scvi_codegen.systems.legendre.transform import equivalent_lagrangian
-from scvi_codegen.systems.system import SYSTEM, MechanicalSystem
+from scvi_codegen.systems.system import MechanicalSystem
 
 
 @checks_arguments(system=of("a LagrangianSystem", LagrangianSystem))
@@ -101,7 +101,7 @@ def _projected(
     return tuple(forces)
 
 
-@checks_arguments(system=SYSTEM)
+@checks_arguments(system=MechanicalSystem.KIND)
 def variational_system(system: MechanicalSystem, count: int) -> LagrangianSystem:
     """Return the system extended by ``count`` tangent vectors of its trajectory, as coordinates named ``x_change_1``.
 

@@ -30,7 +30,7 @@ from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.representation import counted, summary
 from scvi_codegen.common.tangent_space import tangent_space
 from scvi_codegen.systems.checks.continuity import irregularity
-from scvi_codegen.systems.formulas.expressions import SAMPLES, dot, gradient, samples, sums_to_zero
+from scvi_codegen.systems.formulas.expressions import SAMPLES, Tape, dot, gradient, sums_to_zero
 from scvi_codegen.systems.formulas.intermediates import written_out
 from scvi_codegen.systems.formulas.symbols import DOT, inputs_by_name, symbol
 from scvi_codegen.systems.formulas.translation import format_expression
@@ -179,7 +179,7 @@ class OneForm:
         """Return the largest rank of omega at the points."""
         n = len(self.coordinates)
         entries = [self.omega(i, j) for i in range(n) for j in range(n)]
-        matrices = (np.array(values, dtype=float).reshape(n, n) for values in islice(samples(entries), SAMPLES))
+        matrices = (np.array(values, dtype=float).reshape(n, n) for values in islice(Tape.samples(entries), SAMPLES))
         return max((tangent_space(matrix).rank for matrix in matrices), default=0)
 
     def choices(self, auxiliary: tuple[int, ...] = (), first: int = 0) -> Iterator[tuple[int, ...]]:

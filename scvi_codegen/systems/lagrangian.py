@@ -8,6 +8,7 @@ from functools import partial
 from numbers import Real
 from typing import TYPE_CHECKING, Any, Literal
 
+from scvi_codegen.common.atomic import naming_folders
 from scvi_codegen.common.collection import without_collection
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.registry import part
@@ -442,17 +443,17 @@ class LagrangianSystem(MechanicalSystem):
                 and is not read: equalities of flexible bodies, tendons around geoms; or if it names a file that
                 is neither in its folder nor in ``folders``.
         """
-        read: LagrangianSystem = part("readers", "of_mjcf")(
-            cls,
-            path,
-            parts={"limits": limits, "friction": friction, "contacts": contacts},
-            law=(restitution, impacts),
-            actuators=actuators,
-            folders=folders,
-            actuated=actuated,
-            check_inertias=check_inertias,
-            name=name,
-        )
+        with naming_folders(folders):
+            read: LagrangianSystem = part("readers", "of_mjcf")(
+                cls,
+                path,
+                parts={"limits": limits, "friction": friction, "contacts": contacts},
+                law=(restitution, impacts),
+                actuators=actuators,
+                actuated=actuated,
+                check_inertias=check_inertias,
+                name=name,
+            )
         return read
 
     @classmethod

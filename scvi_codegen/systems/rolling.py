@@ -11,7 +11,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,7 +28,7 @@ from scvi_codegen.systems.formulas.indices import Access, Array, Loop, Place, Si
 from scvi_codegen.systems.formulas.symbols import DOT, input_formulas, symbol, with_inputs
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
 from scvi_codegen.systems.lagrangian import LagrangianSystem
-from scvi_codegen.systems.system import SYSTEM, MechanicalSystem
+from scvi_codegen.systems.system import MechanicalSystem
 from scvi_codegen.systems.term_groups import MAX_GROUPS, SimilarTerms, TermGroup, similar_terms
 
 
@@ -51,7 +50,7 @@ class RolledSums:
     __repr__ = summary("system", "tables", "parameters")
 
 
-@checks_arguments(SystemDefinitionError, system=SYSTEM)
+@checks_arguments(SystemDefinitionError, system=MechanicalSystem.KIND)
 def roll_sums(system: MechanicalSystem) -> RolledSums:
     """Return the array system of a Lagrangian or Hamiltonian with many similar terms, and of its forces.
 
@@ -188,38 +187,6 @@ class _Rolled:
         """Yield the arrays of constants with their values."""
         for slot, column in zip(self.group.constants, self.group.values, strict=True):
             yield self.accesses[slot].array, np.array([float(defaults.get(constant, constant)) for constant in column])
-
-
-def unrolled_at(system: MechanicalSystem, q: Mapping[str, Any] | Any, parameters: Any = None) -> tuple[Any, Any]:
-    """Return the system with the sizes and the array parameters of a call, and the other parameters.
-
-    Of several states, whose arrays have one more axis, all have the sizes of the first; parameters of each are others.
-    """
-    if not isinstance(system, ArraySystem):
-        return system, parameters
-    if parameters is not None and not isinstance(parameters, Mapping):
-        raise SystemDefinitionError("parameters of arrays of run-time sizes must be given by name")
-    state = q if isinstance(q, Mapping) else {system.coordinates[0].name: q}
-    arrays_by_name = {array.name: array for array in system.arrays}
-    others = dict(parameters or {})
-    arguments = (*state.items(), *others.items())
-    declared = [(arrays_by_name[name], values) for name, values in arguments if name in arrays_by_name]
-    sizes = {
-        axis.name: length
-        for array, values in declared
-        for axis, length in zip(array.axes, np.shape(values)[_states_axes(array, values) :], strict=False)
-        if axis.name
-    }
-    shared = [array.name for array, values in declared if np.ndim(values) and not _states_axes(array, values)]
-    arrays = {name: others.pop(name) for name in shared if name in others}
-    return unroll_sums(system, sizes, parameters=arrays), others
-
-
-def _states_axes(array: Array, values: Any) -> int:
-    """Return the number of axes of values before those of an array: 1 of several states, else 0."""
-    shape = np.shape(values)
-    of_matrices = array.letters == "wxyz" and shape[-2:] == (3, 3)
-    return max(0, len(shape) - len(array.axes) - of_matrices)
 
 
 @checks_arguments(SystemDefinitionError, system=ARRAYS)

@@ -31,7 +31,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from scvi_codegen.common.cache import key_of, store_text, stored_text
 from scvi_codegen.common.display.cards import Html, card, listed, plain
@@ -197,6 +197,10 @@ class MechanicalSystem(Deferred, ABC):
         bath: heat bath of a Lagrangian, with its friction (:mod:`scvi_codegen.systems.bath`).
     """
 
+    KIND: ClassVar[ArgumentType]
+    """Kind of an argument that is a system of known sizes, for ``checks_arguments``."""
+    OR_ARRAYS: ClassVar[ArgumentType]
+    """The same for systems that may have arrays of run-time sizes."""
     name: str
     coordinates: tuple[Symbol, ...]
     time: Symbol
@@ -411,6 +415,18 @@ class MechanicalSystem(Deferred, ABC):
     def _shown_formula(self) -> Expr:
         return self.reduced.lagrangian if self.reduced else self.formula
 
+    @staticmethod
+    def formula_text(formula: Expr) -> str:
+        """Return a formula as text that ``parse_expression`` reads; SystemDefinitionError outside of the grammar."""
+        from scvi_codegen.systems.formulas.translation import format_expression
+
+        return format_expression(formula)
+
+    @staticmethod
+    def parameter_value(name: str, value: Any) -> float:
+        """Return the default value of a parameter; SystemDefinitionError unless it is a finite real number."""
+        return number(name, value)
+
     def text_of(self, formula: Expr) -> str:
         """Return a formula of the system as text, with its inputs by their names."""
         from scvi_codegen.systems.formulas.intermediates import written_out
@@ -457,14 +473,14 @@ class MechanicalSystem(Deferred, ABC):
     def _repr_html_(self) -> str:
         from sympy import Symbol, count_ops
 
-        from scvi_codegen.common.display.mathml import mathml_terms
+        from scvi_codegen.common.display.mathml import Typeset
         from scvi_codegen.systems.formulas.intermediates import LONGEST_WRITTEN, written_out, written_size
 
         letter = "H" if self.auxiliaries else "L"
         shown = self._shown_formula
         short = written_size(shown) <= LONGEST_WRITTEN
         size = count_ops(shown) if short else written_size(shown)
-        formula = mathml_terms(written_out(shown), Symbol(letter)) if size <= MAX_OPERATIONS else ()
+        formula = Typeset.terms(written_out(shown), Symbol(letter)) if size <= MAX_OPERATIONS else ()
         written = " ".join(formula) or plain(f"{letter}: {size} operations")
         rotations = [rotation.declaration for rotation in self.rotations]
         parameters = [f"{parameter.name} = {value:g}" for parameter, value in self.constants.items()]
@@ -499,8 +515,7 @@ def _free(name: str, taken: set[str]) -> str:
     return name if name not in taken else _free(f"_{name}", taken)
 
 
-SYSTEM = of("a LagrangianSystem or a HamiltonianSystem", MechanicalSystem)
-"""Type check of mechanical systems of known sizes, for :func:`~scvi_codegen.common.validation.checks_arguments`."""
-
-SYSTEM_OR_ARRAYS = ArgumentType(SYSTEM.words, lambda value: isinstance(value, MechanicalSystem))
-"""Type check of systems, also of those with arrays of run-time sizes."""
+MechanicalSystem.KIND = of("a LagrangianSystem or a HamiltonianSystem", MechanicalSystem)
+MechanicalSystem.OR_ARRAYS = ArgumentType(
+    MechanicalSystem.KIND.words, lambda value: isinstance(value, MechanicalSystem)
+)

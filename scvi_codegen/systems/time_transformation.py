@@ -46,14 +46,14 @@ from scvi_codegen.systems.formulas.translation import format_expression
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 from scvi_codegen.systems.legendre.transform import positive_parameters
-from scvi_codegen.systems.system import SYSTEM, MechanicalSystem, TimeTransformation
+from scvi_codegen.systems.system import MechanicalSystem, TimeTransformation
 
 ENERGY_NAMES = ("E", "E_0", "energy", "initial_energy")
 """Candidate names of the energy parameter; the first that is unused is taken."""
 REVERSIBLE = 'the reversible controller: compile_stepper(time_transformation=...), controller = "reversible" in [run]'
 
 
-@checks_arguments(system=SYSTEM)
+@checks_arguments(system=MechanicalSystem.KIND)
 def reparametrise(system: MechanicalSystem, time_transformation: str | Expr) -> MechanicalSystem:
     """Return the system in a fictitious time tau with dt = g dtau; holonomic constraints are unchanged.
 

@@ -15,7 +15,7 @@ from browsing import seen_by_firefox
 from printed_formulas import mp, names, trees_of_mathml, value
 from sympy import Float, Function, Matrix, Mul, Pow, Rational, Symbol, cos, exp, pi, sin, sqrt, symbols
 
-from scvi_codegen.common.display.mathml import latex_name, mathml, mathml_terms
+from scvi_codegen.common.display.mathml import Typeset
 from scvi_codegen.extras.derivation.writing import mathematics_font
 
 x, y, h = symbols("x y h")
@@ -23,7 +23,7 @@ x, y, h = symbols("x y h")
 
 def inner(expression: sympy.Basic) -> str:
     """The MathML of an expression within ``<math>``."""
-    return mathml(expression).removeprefix("<math>").removesuffix("</math>")
+    return Typeset.whole(expression).removeprefix("<math>").removesuffix("</math>")
 
 
 def read(*elements: str, **values: float) -> float:
@@ -53,9 +53,9 @@ def check_read_back(expression: sympy.Expr, seed: int = 1) -> None:
     values = dict(zip(sorted(expression.free_symbols, key=str), map(float, draws), strict=True))
     if Symbol("n") in values:
         values[Symbol("n")] = 3.0
-    printed = {next(names(trees_of_mathml([mathml(symbol)]))): number for symbol, number in values.items()}
+    printed = {next(names(trees_of_mathml([Typeset.whole(symbol)]))): number for symbol, number in values.items()}
     expected = float(expression.xreplace({symbol: Float(value) for symbol, value in values.items()}).evalf())
-    for elements in ([mathml(expression)], mathml_terms(expression)):
+    for elements in ([Typeset.whole(expression)], Typeset.terms(expression)):
         assert read(*elements, **printed) == pytest.approx(expected, rel=1e-10, abs=1e-12)
 
 
@@ -97,7 +97,7 @@ def test_names_are_typeset(name):
     [("0.1", "0.1"), ("3.0", "3.0"), ("0.33333333333333333", "0.333333"), ("1e-12", "1.0·10\N{MINUS SIGN}12")],
 )
 def test_numbers_have_sensible_digits(number, text):
-    assert "".join(ElementTree.fromstring(mathml(Float(number, 50))).itertext()) == text
+    assert "".join(ElementTree.fromstring(Typeset.whole(Float(number, 50))).itertext()) == text
 
 
 def test_a_power_of_a_symbol_with_an_upper_index_is_in_brackets():
@@ -123,7 +123,7 @@ def test_a_power_of_a_symbol_with_an_upper_index_is_in_brackets():
     ids=lambda expression: type(expression).__name__,
 )
 def test_all_kinds_are_well_formed_and_without_html_entities(expression):
-    for text in (mathml(expression), *mathml_terms(expression)):
+    for text in (Typeset.whole(expression), *Typeset.terms(expression)):
         ElementTree.fromstring(text)
         assert set(re.findall(r"&\w+;", text)) <= {"&lt;", "&gt;", "&amp;"}
 
@@ -134,25 +134,25 @@ def test_functions_have_their_standard_names():
 
 class TestTerms:
     def test_a_sum_is_split_before_its_signs(self):
-        terms = mathml_terms(x - y / 2 - h * (x + y))
+        terms = Typeset.terms(x - y / 2 - h * (x + y))
         signs = [re.findall(r'^<math displaystyle="true"><mo form="(\w+)">(.)</mo>', term) for term in terms]
         assert signs == [[("prefix", "\N{MINUS SIGN}")], [("infix", "+")], [("infix", "\N{MINUS SIGN}")]]
 
     def test_a_product_is_one_term(self):
         assert (
-            len(mathml_terms(x * (x + y + 111111) * (x - y + 222222) * sin(x + 333333 * y) * cos(y + 444444 * x))) == 1
+            len(Typeset.terms(x * (x + y + 111111) * (x - y + 222222) * sin(x + 333333 * y) * cos(y + 444444 * x))) == 1
         )
 
     def test_the_right_side_begins_with_the_equals_sign(self):
-        terms = mathml_terms(x + y, h - x)
+        terms = Typeset.terms(x + y, h - x)
         assert [('<mo form="infix">=</mo>' in term) for term in terms] == [False, False, True, False]
-        assert mathml_terms(sympy.Eq(h - x, x + y)) == terms
+        assert Typeset.terms(sympy.Eq(h - x, x + y)) == terms
 
 
 def test_round_trip_detects_a_wrong_sign():
-    assert read(mathml(x - y), x=2.0, y=3.0) == -1.0
-    assert read(mathml(x - y).replace("\N{MINUS SIGN}", "+"), x=2.0, y=3.0) == 5.0
-    assert math.isclose(read(mathml(sin(x) ** 2), x=2.0), math.sin(2.0) ** 2)
+    assert read(Typeset.whole(x - y), x=2.0, y=3.0) == -1.0
+    assert read(Typeset.whole(x - y).replace("\N{MINUS SIGN}", "+"), x=2.0, y=3.0) == 5.0
+    assert math.isclose(read(Typeset.whole(sin(x) ** 2), x=2.0), math.sin(2.0) ** 2)
 
 
 @pytest.mark.parametrize(
@@ -170,7 +170,7 @@ def test_round_trip_detects_a_wrong_sign():
     ],
 )
 def test_latex_names_are_parsed_like_mathml_names(name, latex):
-    assert latex_name(name) == latex
+    assert Typeset.latex_name(name) == latex
 
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -222,7 +222,7 @@ class TestInABrowser:
 
     def test_dots_of_velocities_are_visible(self, pieces):
         names = [Symbol(name + dot) for dot in ("", "_dot") for name in ("q", "x", "theta", "m")]
-        assert [rows for rows, _ in pieces(*map(mathml, names))] == [1] * 4 + [2] * 4
+        assert [rows for rows, _ in pieces(*map(Typeset.whole, names))] == [1] * 4 + [2] * 4
 
     def test_letters_come_from_the_font(self, browser):
         view = browser.new_page()
@@ -239,7 +239,7 @@ class TestInABrowser:
         view.close()
 
     def test_functions_stand_apart_from_factors(self, pieces):
-        product = mathml(Symbol("r") * cos(Symbol("a")))[6:-7]
+        product = Typeset.whole(Symbol("r") * cos(Symbol("a")))[6:-7]
         (_, close), (_, apart) = pieces("<mi>r</mi><mtext>cos</mtext>", product)
         assert apart[0] > close[0] + 0.14
 

@@ -21,7 +21,7 @@ from oracle import points
 from printed_formulas import FUNCTIONS, mp, names, trees_of_mathml, value
 
 import scvi_codegen as sc
-from scvi_codegen.common.display.mathml import mathml_terms
+from scvi_codegen.common.display.mathml import Typeset
 from scvi_codegen.extras.derivation.equations import derive
 from scvi_codegen.extras.derivation.page.document import derivation_html
 from scvi_codegen.methods.discretise import discretise, paper_equations
@@ -544,13 +544,13 @@ def of_components(name: str, entry: Entry, index: int) -> bool:
     equations = derived(name)
     values = [e.residual for e in (*equations.equations, *equations.end_position, *equations.end_momentum)]
     right = [*values, *equations.initial_guess.values()][index]
-    return entry.tree[2] == trees_of_mathml(mathml_terms(right))
+    return entry.tree[2] == trees_of_mathml(Typeset.terms(right))
 
 
 def of_jacobian(name: str, entry: Entry, index: int) -> bool:
     """Entries are the derivatives of the equations."""
     row, column = (int(k) - 1 for k in entry.tree[1][2].split(","))
-    return entry.tree[2] == trees_of_mathml(mathml_terms(derived(name).jacobian[row, column]))
+    return entry.tree[2] == trees_of_mathml(Typeset.terms(derived(name).jacobian[row, column]))
 
 
 STATEMENT = re.compile(r"(?:const (?:double|lanes|real) )?(\w+(?:\[\d+\])?) = ([^;]*);")

@@ -17,11 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native.building import Library
-from scvi_codegen.codegen.native.options import FAILURES, FALLBACK_REQUIRED, SolverOptions, checked_options
+from scvi_codegen.codegen.native.options import (
+    FAILURES,
+    FALLBACK_REQUIRED,
+    SolverOptions,
+    checked_options,
+    step_failure,
+)
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.codegen.rendering.text import INPUT_PRECISION, ROUNDING_UNITS
 from scvi_codegen.common.cache import template_folder
-from scvi_codegen.common.errors import MethodError
+from scvi_codegen.common.errors import MethodError, StepFailedError
 from scvi_codegen.common.tangent_space import DEPENDENT
 
 RESULTS, FIRST_RESULT = Struct("=4d4q"), "error"
@@ -291,6 +297,10 @@ class Binding:
 
     def _refer_to_fallback(self, workspace: Any) -> None:
         getattr(self._lib, f"{self._prefix}_set_fallback")(self._shared_fallback, workspace)
+
+    def failure(self, status: int, report: Any, *, step: int, h: float) -> StepFailedError:
+        """Return the exception for a failed step: its number, its size, 0 if it is adaptive; see ``step_failure``."""
+        return step_failure(status, report, step=step, h=h, failures=self.failures)
 
     def options(self, options: SolverOptions | None) -> Any:
         """Return the C struct, NULL for the defaults."""

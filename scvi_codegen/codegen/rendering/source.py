@@ -7,6 +7,7 @@ contains the step and its run, and includes the rest of what an integrator uses.
 
 from __future__ import annotations
 
+import difflib
 import json
 import math
 import re
@@ -18,6 +19,7 @@ from typing import Any, NamedTuple
 from scvi_codegen.codegen.rendering.own_names import with_distinct_names, with_exported_names, with_own_names
 from scvi_codegen.codegen.rendering.preprocessor import preprocessed
 from scvi_codegen.codegen.rendering.reachable import Function, functions_of, readable
+from scvi_codegen.common.errors import StateError
 from scvi_codegen.systems.contact import Impacts
 from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.event import Event, Kink, Refraction, Transition
@@ -472,6 +474,25 @@ class Interface:
     def own_parameters(self) -> tuple[str, ...]:
         """Names of the parameters of the system, without those of modes."""
         return self.parameters[: len(self.parameters) - len(self.mode_names)]
+
+    @staticmethod
+    def bodies(names: Sequence[str]) -> tuple[Any, ...]:
+        """Return the bodies, ``name`` and ``columns``, whose positions are coordinates such as ``sun_x``."""
+        from scvi_codegen.systems.symmetry.sampling import bodies  # imports SymPy
+
+        return bodies(names)
+
+    def parameter_index(self, name: str) -> int:
+        """Return the index of a parameter; raise ``StateError`` with the nearest name if unknown."""
+        names = self.parameters
+        if name in names:
+            return names.index(name)
+        folded = {parameter.lower(): parameter for parameter in names}
+        near = [folded[key] for key in difflib.get_close_matches(str(name).lower(), folded, 1)]
+        if not names:
+            raise StateError(f"there is no parameter {name!r}: '{self.system}' has none. Declare it in its definition")
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise StateError(f"there is no parameter {name!r} among {', '.join(self.own_parameters)}{hint}")
 
     def searched(self, events: Iterable[Event]) -> tuple[Event, ...]:
         """Return the events that runs search for: some events, the transitions of contacts, and the kinks."""

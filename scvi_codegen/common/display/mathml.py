@@ -1,10 +1,10 @@
 """SymPy expressions as presentation MathML, which browsers typeset.
 
     >>> from sympy import Symbol
-    >>> mathml(Symbol("theta_1_dot") / 2)  # doctest: +ELLIPSIS
+    >>> Typeset.whole(Symbol("theta_1_dot") / 2)  # doctest: +ELLIPSIS
     '<math><mrow><mfrac><msub><mover accent="true"><mi mathvariant="normal" ...>θ</mi><mo ...>˙</mo></mover>...</math>'
 
-Browsers do not break lines within ``<math>``, so :func:`mathml_terms` returns an equation as terms, between which a
+Browsers do not break lines within ``<math>``, so :meth:`Typeset.terms` returns an equation as terms, between which a
 line may end.
 
 Names of symbols are parsed: ``theta_1_dot`` is a letter with an accent and an index, ``l_1_0`` is l_0(tau_1).
@@ -85,15 +85,6 @@ def table_name(name: str) -> TableName | None:
     if prefix in PRODUCTS and indices and all(index.isdigit() or index in RUNNING for index in indices):
         return TableName(tuple(map(parsed, PRODUCTS[prefix])), None, tuple(indices))
     return None
-
-
-def latex_name(name: str) -> str:
-    """Return the name in LaTeX: ``l_1_0`` as l_0(tau_1), ``Q_2_x`` with 2 above and x below."""
-    entry = table_name(name)
-    if entry is None:
-        return _latex(parsed(name))
-    factors = "".join(map(_latex, entry.factors))
-    return f"{factors}({_latex(entry.point)})" if entry.point else f"({factors}){_script('_', entry.indices)}"
 
 
 def _latex(name: Name) -> str:
@@ -249,22 +240,35 @@ def _finish(node: Any) -> None:
                 node.setAttribute(name, value)
 
 
-def mathml(expression: sympy.Basic) -> str:
-    """Return an expression, a matrix or a relation as one ``<math>`` element; well-formed XML and HTML."""
-    printer = Printer()
-    return printer.text(printer._print(expression))
+class Typeset:
+    """Formulas as MathML, which browsers typeset, and names in LaTeX."""
 
+    @staticmethod
+    def whole(expression: sympy.Basic) -> str:
+        """Return an expression, a matrix or a relation as one ``<math>`` element; well-formed XML and HTML."""
+        printer = Printer()
+        return printer.text(printer._print(expression))
 
-def mathml_terms(right: sympy.Basic, left: sympy.Basic | None = None) -> tuple[str, ...]:
-    """Return the terms of an expression or an equation as ``<math>`` elements of full size; each begins with its sign.
+    @staticmethod
+    def terms(right: sympy.Basic, left: sympy.Basic | None = None) -> tuple[str, ...]:
+        """Return the terms of an expression or an equation as ``<math>`` elements of full size, each with its sign.
 
-    ``left``: the left side of an equation, whose right side then begins with the equals sign.
-    """
-    if left is None and isinstance(right, sympy.Eq):
-        left, right = right.lhs, right.rhs
-    printer = Printer()
-    terms = list(printer.terms(right))
-    if left is not None:
-        terms[0].insert(0, printer.element("mo", "=", form="infix"))
-        terms = [*printer.terms(left), *terms]
-    return tuple(printer.text(*term, displaystyle="true") for term in terms)
+        ``left``: the left side of an equation, whose right side then begins with the equals sign.
+        """
+        if left is None and isinstance(right, sympy.Eq):
+            left, right = right.lhs, right.rhs
+        printer = Printer()
+        terms = list(printer.terms(right))
+        if left is not None:
+            terms[0].insert(0, printer.element("mo", "=", form="infix"))
+            terms = [*printer.terms(left), *terms]
+        return tuple(printer.text(*term, displaystyle="true") for term in terms)
+
+    @staticmethod
+    def latex_name(name: str) -> str:
+        """Return the name in LaTeX: ``l_1_0`` as l_0(tau_1), ``Q_2_x`` with 2 above and x below."""
+        entry = table_name(name)
+        if entry is None:
+            return _latex(parsed(name))
+        factors = "".join(map(_latex, entry.factors))
+        return f"{factors}({_latex(entry.point)})" if entry.point else f"({factors}){_script('_', entry.indices)}"

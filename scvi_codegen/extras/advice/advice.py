@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from scvi_codegen.api.checks import checks_arguments
-from scvi_codegen.api.methods import Discretisation, Method, method_from_specification
+from scvi_codegen.api.methods import Discretisation, Method
 from scvi_codegen.api.runs import without_accuracy_warnings
-from scvi_codegen.api.states import RESOLVED, States, checked_number, roundoff
-from scvi_codegen.api.systems import SYSTEM_OR_ARRAYS, MechanicalSystem
-from scvi_codegen.api.text import Html, card, grid, plain, summary
+from scvi_codegen.api.states import Parameters, States, checked_number
+from scvi_codegen.api.systems import MechanicalSystem
+from scvi_codegen.api.text import Html, summary
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import (
     ArgumentError,
@@ -30,16 +30,12 @@ from scvi_codegen.common.errors import (
     StepFailedError,
     UnresolvedError,
 )
-from scvi_codegen.extras.paths.size import largest_range
-from scvi_codegen.methods import ARGUMENTS, as_method
-from scvi_codegen.runs.accuracy.run_error import DEVIATIONS, LOST, relative_until
-from scvi_codegen.runs.accuracy.size import relative
+from scvi_codegen.extras.exact.arrays import unrolled_at
+from scvi_codegen.extras.paths.size import ROUNDOFF, largest_range
+from scvi_codegen.methods import as_method
 from scvi_codegen.runs.compiler import compile_stepper
-from scvi_codegen.runs.ensembles.ensemble import momenta_of_each, start_of_ensemble
-from scvi_codegen.runs.states.validation import EnsembleParameters
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.systems.lagrangian import LagrangianSystem
-from scvi_codegen.systems.rolling import unrolled_at
 
 DEGREES = {1: (2, 4, 6, 8, 10, 12), 2: (8, 12, 16, 20, 24, 32)}
 """Degrees, or numbers of stages, among which ``advise`` chooses, by the number of words of the states."""
@@ -98,20 +94,25 @@ class Advice:
 
     def _repr_html_(self) -> str:
         facts = [
-            ("step", plain(f"h = {self.h:.6g}, {self.steps} of them")),
-            ("expected error", plain(f"{self.expected_error:.1e}")),
-            *(("warning", plain(warning)) for warning in self.warnings),
+            ("step", Html.plain(f"h = {self.h:.6g}, {self.steps} of them")),
+            ("expected error", Html.plain(f"{self.expected_error:.1e}")),
+            *(("warning", Html.plain(warning)) for warning in self.warnings),
         ]
         rows = [
-            (plain(f"{h:.4g}"), plain(f"{error:.1e}"), plain(f"{iterations:.1f}"), plain(f"{seconds:.2e}"))
+            (
+                Html.plain(f"{h:.4g}"),
+                Html.plain(f"{error:.1e}"),
+                Html.plain(f"{iterations:.1f}"),
+                Html.plain(f"{seconds:.2e}"),
+            )
             for h, error, iterations, seconds in self.evidence
         ]
         head = ("h", "error at the end", "iterations per step", "seconds per unit of time")
-        pilots = grid(rows, head=head, caption="Pilot runs") if rows else Html("")
-        return card(f"Advice: {self.method.title}", facts, pilots)
+        pilots = Html.grid(rows, head=head, caption="Pilot runs") if rows else Html("")
+        return Html.card(f"Advice: {self.method.title}", facts, pilots)
 
 
-@checks_arguments(system=SYSTEM_OR_ARRAYS)
+@checks_arguments(system=MechanicalSystem.OR_ARRAYS)
 @without_accuracy_warnings()
 def advise(
     system: MechanicalSystem,
@@ -122,7 +123,7 @@ def advise(
     tolerance: float | None = None,
     *,
     velocity: States | None = None,
-    parameters: EnsembleParameters = None,
+    parameters: Parameters = None,
     t: float = 0.0,
     degree: bool = False,
     solver: str = "auto",
@@ -223,12 +224,12 @@ def _steppers(system: MechanicalSystem, method: Method, solver: str, precision: 
 
 def _candidates(method: Method, words: int) -> list[Method]:
     specification = dict(method.specification())
-    sized = [name for name in ("degree", "stages") if name in ARGUMENTS[str(specification["method"])]]
+    sized = [name for name in ("degree", "stages") if name in specification]
     if not sized:
         raise MethodError(f"{method.name} has no degree or number of stages to choose: pass degree=False")
     if specification.get("quadrature") == f"gauss-legendre:{specification.get('degree')}":
         del specification["quadrature"]  # the default of its degree: each degree has its own
-    return [method_from_specification(specification | {sized[0]: number}) for number in DEGREES[words]]
+    return [as_method(specification | {sized[0]: number}) for number in DEGREES[words]]
 
 
 def _work(advice: Advice, words: int) -> float:
@@ -318,7 +319,7 @@ class _Pilot(NamedTuple):
             lasted = abs(failure.t - self.settings["t"])
             return _Trial(n, h, covered=abs(h) * steps, duration=lasted, failure=failure.status)
         price = {"seconds": (time.perf_counter() - began) / abs(h * steps), "iterations": run.iterations.sum() / steps}
-        if largest_range(np.asarray(run.q)) <= RESOLVED * roundoff(1) * np.abs(np.asarray(run.q)).max():
+        if largest_range(np.asarray(run.q)) <= Stepper.RESOLVED * ROUNDOFF * np.abs(np.asarray(run.q)).max():
             raise StateError(
                 f"the motion is at rest over t = {abs(h) * steps:.3g}: errors relative to its size are undefined; give "
                 "an initial state that moves, or choose h below the shortest period"
@@ -329,11 +330,10 @@ class _Pilot(NamedTuple):
     def judged(self, run: Any, trial: _Trial) -> _Trial:
         """Return a pilot run with its errors."""
         error, t = run.error, np.abs(np.asarray(run.t) - run.t[0])
-        lost = not error.relative[-1] < LOST
-        rows = int(np.flatnonzero(error.relative < LOST)[-1]) + 1
-        sizes, errors = relative_until(error, rows)
-        deviations = DEVIATIONS * np.stack([error.rounding_q, error.rounding_p], axis=1)
-        roundings = np.maximum.accumulate(np.nan_to_num(relative(deviations, sizes).max(axis=(1, 2)))[:rows])
+        lost = not error.relative[-1] < Stepper.LOST
+        rows = int(np.flatnonzero(error.relative < Stepper.LOST)[-1]) + 1
+        sizes, errors = error.relative_until(rows)
+        roundings = np.maximum.accumulate(error.roundings(sizes)[:rows])
         row = int(np.flatnonzero(SAFETY * roundings <= self.tolerance)[-1]) if lost else rows - 1
         half = int(np.searchsorted(t, t[row] / 2.0))
         powers = [math.log2(max(1.0, x[row] / x[half])) if x[half] else 0.0 for x in (errors, roundings)]
@@ -341,7 +341,7 @@ class _Pilot(NamedTuple):
         power = powers[1] if lost else powers[0]  # neighbours leave each other as rounding errors grow
         grown = [k * (2.0 * (ratio - 1.0) if power > EXPONENTIAL else math.log2(ratio)) for k in powers]
         ends = [float(x[row]) * 2.0 ** min(k, 1000.0) for x, k in zip((errors, roundings), grown, strict=True)]
-        if not lost and ends[1] >= LOST:  # rounding alone exceeds it later: the run is judged as far as it goes
+        if not lost and ends[1] >= Stepper.LOST:  # rounding alone exceeds it later: the run is judged as far as it goes
             lost, power, ends = True, powers[1], [float(errors[row]), float(roundings[row])]
         if lost and (row == 0 or row == rows - 1 < len(t) - 1):  # errors are those of the steps, not of rounding
             ends[0] = math.inf
@@ -363,7 +363,7 @@ class _Pilot(NamedTuple):
             if not worst < n < (best or math.inf):
                 n = max(1, math.ceil(math.sqrt(worst * best))) if best else FACTOR * worst
             if n > self.most and not best:
-                if any(k.error < LOST and not k.lost for k in trials):
+                if any(k.error < Stepper.LOST and not k.lost for k in trials):
                     break
                 # Digits are lost at once at an encounter or a singularity, by and by where neighbours diverge.
                 at_once = trial.until > (1.0 - 1.0 / FACTOR**2) * trial.duration
@@ -432,8 +432,7 @@ def _starts(stepper: Stepper, q: States, state: dict[str, Any]) -> tuple[list[tu
     if stepper._states.axes(q) != 2:
         start = stepper.start(q, p, velocity=velocity, t=t, parameters=parameters, h=1.0)  # checks the arguments
         return [(start.q, start.p, parameters)], ()
-    momenta = momenta_of_each(stepper, q, p, velocity, t, parameters)
-    together = start_of_ensemble(stepper, q, momenta, t, parameters)
+    together = stepper.ensemble_start(q, p, velocity, t=t, parameters=parameters)
     by_name = (lambda values: values) if stepper.interface.words > 1 else stepper.parameters_by_name
     return [(x, y, by_name(values)) for x, y, values in zip(*together, strict=True)], together
 

@@ -12,7 +12,6 @@ from scvi_codegen.api.systems import MechanicalSystem
 from scvi_codegen.api.text import summary
 from scvi_codegen.common.errors import ArgumentError, StateError, StepFailedError
 from scvi_codegen.runs.compiler import compile_stepper
-from scvi_codegen.runs.results.dense_output import times_of_run
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.trajectory import Trajectory
 
@@ -57,7 +56,7 @@ def solve_ivp(system: Any, t_span: Any, y0: Any, *, velocity: Any = None, method
         raise StateError(f"y0 must be 2 m numbers, positions and then momenta, or give velocity, too: not {y0!r}")
     stepper = system if isinstance(system, Stepper) else compile_stepper(system, method)
     q, p = (y0, None) if velocity is not None else np.split(real_array(y0, "y0"), 2)
-    times = None if t_eval is None else times_of_run(t_eval, *span)
+    times = None if t_eval is None else real_array(t_eval, "t_eval")
     plan: Any = {"t": span[0], "t_end": span[1], "tolerance": rtol, "absolute_tolerance": absolute,
                  "first_step": first_step, "max_step": None if max_step == math.inf else max_step,
                  "parameters": args, "events": events, "t_eval": None if dense_output else times}  # fmt: skip

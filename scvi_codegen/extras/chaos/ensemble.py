@@ -16,15 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.api.checks import checked_count
-from scvi_codegen.api.program import Source
-from scvi_codegen.api.runs import EnsembleSettings
-from scvi_codegen.api.states import Array, Fixed, Starts, States, checked_number, checked_step, require
-from scvi_codegen.codegen.native import building
-from scvi_codegen.codegen.native.binding import Binding
-from scvi_codegen.codegen.native.options import SolverOptions, checked_options
-from scvi_codegen.codegen.variants import TangentVectors
+from scvi_codegen.api.runs import without_accuracy_warnings
+from scvi_codegen.api.states import Array, Fixed, Parameters, Starts, States, checked_number
+from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import StateError, StepFailedError
-from scvi_codegen.common.thread_pool import StopCheck, run_jobs
 from scvi_codegen.extras.chaos.indicators import MOST as LARGEST_CHUNK
 from scvi_codegen.extras.chaos.indicators import (
     SERIES,
@@ -33,17 +28,9 @@ from scvi_codegen.extras.chaos.indicators import (
     StepSegment,
     TangentPropagation,
 )
-from scvi_codegen.runs.accuracy.local_error import warn_of_large_steps
-from scvi_codegen.runs.driver.run_loop import record
-from scvi_codegen.runs.ensembles.ensemble import Ensemble, momenta_of_each, start_of_ensemble
-from scvi_codegen.runs.ensembles.lanes import LaneRuns
-from scvi_codegen.runs.ensembles.result import OK
-from scvi_codegen.runs.ensembles.schedule import CommonSteps
-from scvi_codegen.runs.states.times import times_after
-from scvi_codegen.runs.states.validation import EnsembleParameters
-from scvi_codegen.runs.stepping.integrator import Integrator
-from scvi_codegen.runs.stepping.memory import Memory
+from scvi_codegen.runs.stepper import Stepper
 
+OK = "ok"
 CHECKED_STRIDE: Final = 64
 """Stride of the trajectories whose step error is estimated."""
 
@@ -53,9 +40,10 @@ class ChaosIndicatorsEnsemble:
 
     def __init__(
         self,
-        stepper: Integrator,
+        stepper: Stepper,
         q: States,
-        p: States,
+        p: States | None,
+        velocity: States | None,
         *,
         h: float,
         steps: int,
@@ -63,20 +51,20 @@ class ChaosIndicatorsEnsemble:
         directions: ArrayLike | None,
         save_every: int | None,
         t: float,
-        parameters: EnsembleParameters,
+        parameters: Parameters,
         options: SolverOptions | None,
     ) -> None:
-        require(stepper, "chaos_ensemble")
-        self.stepper, self.options = stepper, checked_options(options)
-        self.h, steps = checked_step(h), checked_count(steps, "steps", least=1)
+        stepper.require("chaos_ensemble")
+        self.stepper, self.options = stepper, options
+        self.h, steps = Fixed.checked(h).h, checked_count(steps, "steps", least=1)
         self.save_every = steps if save_every is None else checked_count(save_every, "save_every", least=1)
         if steps % self.save_every:
             raise StateError(
                 f"steps={steps} must be a multiple of save_every={self.save_every}, so that the last value is saved"
             )
         start = checked_number(t, "the time t")
-        self.t = times_after(start, self.h, np.arange(steps + 1))[0]
-        self.q, self.p, self.parameters = start_of_ensemble(stepper, q, p, start, parameters)
+        self.t = Fixed(self.h).times(start, np.arange(steps + 1))
+        self.q, self.p, self.parameters = stepper.ensemble_start(q, p, velocity, t=start, parameters=parameters)
         self.changes = InitialTangents.checked(stepper, count, directions)
         self.status = np.full(len(self.q), OK, dtype="<U32")
         self.values = np.full((len(SERIES), len(self.t[:: self.save_every]), len(self.q), self._width()), np.nan)
@@ -86,13 +74,12 @@ class ChaosIndicatorsEnsemble:
 
         Trajectories without SIMD support, or whose SIMD steps failed, use the derivatives of single steps.
         """
-        report, left = progress or (lambda _: None), np.arange(len(self.q))
-        if (source := self._source()) is not None:
-            left = self._in_lanes(source, report, threads)
+        report = progress or (lambda _: None)
+        left = self._in_lanes(report, threads)
         if len(left):
             self.stepper.tangent  # noqa: B018  (compiled once, before threads ask for it)
             before = len(self.q) - len(left)
-            run_jobs(
+            self.stepper.in_threads(
                 len(left),
                 lambda k, check_stop: self._follow(int(left[k]), check_stop),
                 progress=lambda done: report(before + done),
@@ -106,22 +93,17 @@ class ChaosIndicatorsEnsemble:
         steps, runs = len(self.t) - 1, {}
         for j in range(0, len(self.q), CHECKED_STRIDE):
             start = self.q[j], self.p[j]
-            arguments: dict[str, Any] = {"t": self.t[0], "parameters": self.parameters[j], "options": self.options}
-            memory = Memory.started(self.stepper, *start, plan=Fixed(self.h), **arguments)
-            with suppress(StepFailedError):
-                runs[j] = record(memory, steps, save_every=steps)
+            settings: dict[str, Any] = {"t": self.t[0], "parameters": self.parameters[j], "options": self.options}
+            with suppress(StepFailedError), without_accuracy_warnings():
+                runs[j] = self.stepper.integrate(*start, h=self.h, steps=steps, save_every=steps, **settings)
         worst = max(runs, key=lambda j: np.nan_to_num(runs[j].step_error), default=None)
         if worst is not None:
-            warn_of_large_steps(runs[worst], remedy=f" (trajectory {worst} of {len(self.q)})")
+            runs[worst].warn_of_large_steps(f" (trajectory {worst} of {len(self.q)})")
 
-    def _source(self) -> Source | None:
-        """Return the source of an ensemble with tangent vectors, or ``None``."""
+    def _in_lanes(self, report: Callable[[int], None], threads: int | None) -> NDArray[np.intp]:
+        """Process all trajectories in SIMD lanes; return those that failed, all without variational equations."""
         if self.stepper.interface.constraints or self.stepper.interface.rotations:
-            return None
-        return self.stepper._variants[TangentVectors(self.values.shape[-1])]
-
-    def _in_lanes(self, source: Source, report: Callable[[int], None], threads: int | None) -> NDArray[np.intp]:
-        """Process all trajectories in SIMD lanes; return those that failed."""
+            return np.arange(len(self.q))
         count, steps, tangents = len(self.q), len(self.t) - 1, self._first(0)
         orthonormal, triangle = np.linalg.qr(tangents)
         frames = (np.tile(half.T.ravel(), (count, 1)) for half in np.split(orthonormal, 2))  # one vector after another
@@ -130,14 +112,13 @@ class ChaosIndicatorsEnsemble:
             diagonal = np.log(np.abs(np.diagonal(triangle)))
         k = tangents.shape[1]
         growth = np.concatenate([np.zeros(2 * k), diagonal, np.zeros(3 * k), triangle.ravel()])  # of tangent_growth.h
-        plan = CommonSteps(self.t[0], self.h, self.save_every, steps)
-        saved = np.full((len(plan.numbers), count, len(SERIES), k), np.nan)
+        saved = np.full((len(self.t[:: self.save_every]), count, len(SERIES), k), np.nan)
         saved[0] = growth[: len(SERIES) * k].reshape(len(SERIES), k)
-        binding = Binding(building.load(source, flags=self.stepper.flags), source.prefix)
-        settings = EnsembleSettings(options=self.options)
-        start: dict[str, Any] = {"t0": plan.t0, "q": q, "p": p, "parameters": self.parameters}
-        ensemble = Ensemble(stepper=self.stepper, settings=settings, **start, fixed=plan)
-        runs = LaneRuns(binding, ensemble, {"positions": saved, "growth": growth})
+        plan: dict[str, Any] = {"h": self.h, "t": self.t[0], "steps": steps, "save_every": self.save_every}
+        settings: dict[str, Any] = {"parameters": self.parameters, "options": self.options}
+        runs = self.stepper.tangent_lanes(q, p, growth, saved, **plan, **settings)
+        if runs is None:
+            return np.arange(count)
         runs.run(progress=lambda _: report(int(np.count_nonzero(runs.status == 0))), threads=threads)
         ended = runs.status == 0
         self.values[:, :, ended] = saved.transpose(2, 0, 1, 3)[:, :, ended]
@@ -155,7 +136,7 @@ class ChaosIndicatorsEnsemble:
         start = self.q[j], self.p[j], self.h, float(self.t[0])
         return self.changes.at(*start, self.parameters[j], self.options)
 
-    def _follow(self, j: int, check_stop: StopCheck) -> None:
+    def _follow(self, j: int, check_stop: Callable[[int], None]) -> None:
         """Integrate trajectory j with tangent vectors, by derivatives of single steps; NaN after a failed step."""
         stepper, steps = self.stepper, len(self.t) - 1
 
@@ -193,5 +174,4 @@ def indicators_of_ensemble(
 ) -> ChaosIndicators:
     """Return the indicators of :meth:`scvi_codegen.Stepper.chaos_indicators_ensemble`."""
     q, p, velocity = stepper._states.start(q, p, velocity)
-    p = momenta_of_each(stepper, q, p, velocity, settings["t"], settings["parameters"])
-    return ChaosIndicatorsEnsemble(stepper, q, p, **settings).run(progress=progress, threads=threads)
+    return ChaosIndicatorsEnsemble(stepper, q, p, velocity, **settings).run(progress=progress, threads=threads)

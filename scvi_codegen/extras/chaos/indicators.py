@@ -13,19 +13,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.api.checks import checked_count
-from scvi_codegen.api.states import Array, Reduction, Starts, real_array, require
+from scvi_codegen.api.states import Array, Starts, real_array
 from scvi_codegen.api.text import summary
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.runs.derivatives.gradients import pieces, propagate, starts_of
-from scvi_codegen.runs.results.saved_states import SavedStates, parameters_on_sides
-from scvi_codegen.runs.stepping.integrator import Integrator
+from scvi_codegen.runs.stepper import Stepper
+from scvi_codegen.runs.trajectory import Trajectory
 
 SERIES = ("log_norms", "max_log_norms", "log_r_diagonal", "rates", "mean_rates")
 """Names of the accumulated series, defined in :class:`~scvi_codegen.extras.chaos.indicators.ChaosIndicators`."""
@@ -211,17 +210,17 @@ class InitialTangents:
         reduction: maps to the reduced space, ``None`` without rotations.
     """
 
-    stepper: Integrator
+    stepper: Stepper
     count: int | None
     directions: Array | None
-    reduction: Reduction | None
+    reduction: Any
 
     @classmethod
-    def checked(cls, stepper: Integrator, count: int | None, directions: ArrayLike | None) -> InitialTangents:
+    def checked(cls, stepper: Stepper, count: int | None, directions: ArrayLike | None) -> InitialTangents:
         """Construct from user arguments; raise :class:`StateError` for invalid numbers or directions."""
         size = 2 * stepper.dimension
-        require(stepper, "chaos")
-        reduction = Reduction(stepper.interface) if stepper.interface.rotations else None
+        stepper.require("chaos")
+        reduction = stepper.reduction if stepper.interface.rotations else None
         if directions is None:
             most = reduction.size if reduction else size
             count = None if count is None else checked_count(count, "count", least=1, most=most)
@@ -284,13 +283,12 @@ def _frame(dimension: int) -> Array:
     return np.hstack([first, second[:, ::-1]])
 
 
-def along(states: SavedStates, tangents: InitialTangents) -> ChaosIndicators:
+def along(states: Trajectory, tangents: InitialTangents) -> ChaosIndicators:
     """Return the deviations of a run at its saved states; steps between these are recomputed."""
     first = states.q[0], states.p[0], float(states.step_sizes[0]), float(states.t[0])
-    parameters = parameters_on_sides(states, first[3])
+    parameters = states.parameters_on_sides(first[3])
     propagation = TangentPropagation(tangents, tangents.at(*first, parameters, states.options), states.t)
-    segments = (starts_of(states, first, last) for first, last in pieces(states))
-    propagation.follow(segments, partial(propagate, states, back=False))
+    propagation.follow(states.tangent_segments(), states.propagate_tangents)
     return ChaosIndicators.of(states.t, propagation.growth.values)
 
 

@@ -8,12 +8,11 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from scvi_codegen.api.checks import checked_count, checks_arguments
-from scvi_codegen.api.states import Array, States
+from scvi_codegen.api.states import Array, Parameters, States
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.extras.chaos.ensemble import indicators_of_ensemble
 from scvi_codegen.extras.chaos.indicators import ChaosIndicators, InitialTangents, along
-from scvi_codegen.runs.states.validation import EnsembleParameters
 
 
 class OfSteppers:
@@ -32,7 +31,7 @@ class OfSteppers:
         directions: ArrayLike | None = None,
         save_every: int | None = None,
         t: float = 0.0,
-        parameters: EnsembleParameters = None,
+        parameters: Parameters = None,
         options: SolverOptions | None = None,
         progress: Callable[[int], None] | None = None,
         threads: int | None = None,

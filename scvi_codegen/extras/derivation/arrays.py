@@ -2,19 +2,14 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from textwrap import shorten
+from typing import Any
 
-from sympy import latex
-
+from scvi_codegen.api.formulas import Number
 from scvi_codegen.api.methods import Method
+from scvi_codegen.api.program import Derivation
 from scvi_codegen.api.systems import ArraySystem
-from scvi_codegen.api.text import clipped
-from scvi_codegen.codegen.ir.equations import FixedPointIteration, Splitting
-from scvi_codegen.codegen.ir.kernel import Number
-from scvi_codegen.codegen.ir.program import ArrayProgram
-from scvi_codegen.codegen.lowering.program import lower_arrays
-from scvi_codegen.systems.arrays.symmetry import momentum_maps
-from scvi_codegen.systems.arrays.system import constraint_text, force_of
-from scvi_codegen.systems.formulas.array_statements import latex_entry, latex_sums
+from scvi_codegen.systems.symmetry.symmetry import symmetries
 
 DIGITS = 17
 
@@ -27,13 +22,12 @@ class ArrayStepEquations:
     method: Method
 
     def __repr__(self) -> str:
-        return clipped(f"<equations of {self.system.name} by {self.method.name}>")
+        return shorten(f"<equations of {self.system.name} by {self.method.name}>", 100, placeholder="..")
 
     @property
-    def program(self) -> ArrayProgram:
+    def program(self) -> Any:
         """Lowered program; MethodError without fixed-point iteration, and for a system that requires known sizes."""
-        self.system.check_run_time_sizes()
-        return lower_arrays(self.system, self.method, prefix="derived")
+        return Derivation(self.system, self.method).program
 
     def to_text(self) -> str:
         """Return plain text."""
@@ -50,7 +44,7 @@ def _text(system: ArraySystem) -> Iterator[str]:
     yield "Terms of -H, and their derivatives:" if system.momenta else "Terms of -V, and what each adds to the forces:"
     for term in system.potentials:
         yield f"  {term}"
-        yield from (f"    by {access}: {derivative}" for access, derivative in force_of(term, system.state).targets)
+        yield from (f"    by {access}: {derivative}" for access, derivative in system.derivatives(term, system.state))
     if not system.momenta:
         yield "Masses:"
         for mass in system.masses:
@@ -62,24 +56,21 @@ def _text(system: ArraySystem) -> Iterator[str]:
     if system.constraints:
         yield "Constraints, each with what it adds to the forces:"
     for term in system.constraints:
-        yield f"  {constraint_text(term)}"
-        pushed = force_of(term, system.coordinates).targets
+        yield f"  {system.constraint_text(term)}"
+        pushed = system.derivatives(term, system.coordinates)
         yield from (f"    on {access}: lambda*({derivative})" for access, derivative in pushed)
     energy = () if system.changes_energy else ("energy",)
-    conserved = (*energy, *(symmetry.name for symmetry in momentum_maps(system)))
+    conserved = (*energy, *(symmetry.name for symmetry in symmetries(system)))
     yield f"Conserved: {', '.join(conserved) or 'nothing that is known'}"
 
 
 def _latex(system: ArraySystem) -> Iterator[str]:
     yield rf"\[ {system.latex} \]"
     for term in system.potentials:
-        entries = {slot: latex_entry(access) for slot, access in term.slots}
-        for access, derivative in force_of(term, system.state).targets:
-            by = rf"\frac{{\partial}}{{\partial {latex_entry(access)}}}"
-            yield rf"\[ {latex_sums(term)} \; {by}: \quad {latex(derivative, symbol_names=entries)} \]"
+        yield from (rf"\[ {line} \]" for line in system.latex_derivatives(term))
 
 
-def _step(program: ArrayProgram, method: Method) -> Iterator[str]:
+def _step(program: Any, method: Method) -> Iterator[str]:
     yield f"A step of h by {method.title}, from q, p to q', p', the same for every coordinate"
     if program.loops.constrained:
         yield "(m its mass, F the force on it, G the Jacobian of the constraints g, q, p going on from part to part):"
@@ -92,7 +83,7 @@ def _step(program: ArrayProgram, method: Method) -> Iterator[str]:
         yield from (_separable if program.fixed_point.name == "separable" else _hamiltonian)(program.fixed_point)
 
 
-def _splitting(splitting: Splitting) -> Iterator[str]:
+def _splitting(splitting: Any) -> Iterator[str]:
     yield "(m its mass, F the force on it):"
     numbers = [splitting.numbers[name] for name in ("KICK", "DRIFT", "KICK_ABSCISSA")]
     for kick, drift, abscissa in zip(*numbers, strict=True):
@@ -102,7 +93,7 @@ def _splitting(splitting: Splitting) -> Iterator[str]:
             yield f"  q += h*({_number(drift)})*p/m"
 
 
-def _separable(scheme: FixedPointIteration) -> Iterator[str]:
+def _separable(scheme: Any) -> Iterator[str]:
     yield "(m its mass, F_n the force on it at the points X_n of all):"
     (drift,), (abscissae,), product = map(scheme.numbers, ("DRIFT", "ABSCISSA", "PRODUCT"))
     for n in range(scheme.points):
@@ -115,7 +106,7 @@ def _separable(scheme: FixedPointIteration) -> Iterator[str]:
     yield f"  p' = p + h*({p1})"
 
 
-def _hamiltonian(scheme: FixedPointIteration) -> Iterator[str]:
+def _hamiltonian(scheme: Any) -> Iterator[str]:
     yield "(V_n = H_p and F_n = -H_q at the points Q_n, P_n of all):"
     kinds = (("Q", "q", "POSITION", "V"), ("P", "p", "MOMENTUM", "F"))
     weights = {name: scheme.numbers(f"{name}_WEIGHT")[0] for _, _, name, _ in kinds}

@@ -5,13 +5,13 @@ from typing import Any
 
 import click
 
-from scvi_codegen.api.commands import check_writable, model_arguments, read_model, reporting, with_known_sizes
+from scvi_codegen.api.commands import check_writable, model_arguments, note, read_model, reporting, tell
+from scvi_codegen.api.text import write_text
 from scvi_codegen.extras.derivation.equations import StepEquations
 from scvi_codegen.extras.derivation.equations import derive as derive_equations
 from scvi_codegen.extras.derivation.notation import events_text
 from scvi_codegen.extras.derivation.page.document import derivation_html
 from scvi_codegen.extras.fields.laws import derivation_of
-from scvi_codegen.interfaces.cli.command_group import emit
 
 
 @click.command()
@@ -48,9 +48,9 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
     model = read_model(model_name, choices)
     about = {"system": model.system.name, "method": model.method.name}
     if html is not None or radicals:
-        model = with_known_sizes(model, "--html" if html is not None else "--radicals")
+        model = model.with_known_sizes("--html" if html is not None else "--radicals")
     if html is not None:
-        emit(derivation_html(model.system, model.method, events=model.events), html, **about)
+        _emit(derivation_html(model.system, model.method, events=model.events), html, **about)
         return
     equations = derive_equations(model.system, model.method, radicals=radicals)
     text = equations.to_latex() if latex else equations.to_text()
@@ -59,7 +59,18 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
     if not latex and model.events:
         text += f"\n{events_text(model.events, model.system)}\n"
     formulas = _formulas(equations) if isinstance(equations, StepEquations) else {}
-    emit(text, output, **about, **formulas, text=text)
+    _emit(text, output, **about, **formulas, text=text)
+
+
+def _emit(text: str, output: str | None, /, **numbers: Any) -> None:
+    """Print a text, or write it to a file; with ``--json`` the numbers."""
+    if output is None:
+        tell(text, **numbers)
+        return
+    check_writable(Path(output), "'-o'")
+    write_text(output, text.rstrip("\n") + "\n")
+    tell(**numbers, written=[output])
+    note(f"wrote {output}")
 
 
 def _formulas(equations: StepEquations) -> dict[str, Any]:

@@ -19,17 +19,17 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, overload
+from textwrap import shorten
+from typing import TYPE_CHECKING, Any, cast, overload
 
 import sympy
 
 from scvi_codegen.api.checks import checks_arguments
 from scvi_codegen.api.formulas import Number, jacobian
-from scvi_codegen.api.methods import Discretisation, Method, StageGroup, StageSystem
-from scvi_codegen.api.systems import SYSTEM_OR_ARRAYS, ArraySystem, MechanicalSystem
-from scvi_codegen.api.text import card, clipped, counted, plain
-from scvi_codegen.codegen.lowering.program import step_texts
-from scvi_codegen.common.display.cards import listed
+from scvi_codegen.api.methods import Discretisation, Method, StageSystem
+from scvi_codegen.api.program import Derivation
+from scvi_codegen.api.systems import ArraySystem, MechanicalSystem
+from scvi_codegen.api.text import Html, counted
 from scvi_codegen.extras.derivation.notation import (
     LARGEST_DENOMINATOR,
     LARGEST_SHOWN,
@@ -43,12 +43,8 @@ from scvi_codegen.extras.derivation.notation import (
     text_lines,
 )
 from scvi_codegen.methods import as_method
-from scvi_codegen.methods.stage_system import Block, EntryName, Row, Table
-from scvi_codegen.systems.contacts.modes import in_all_modes
+from scvi_codegen.methods.stage_system import Table
 from scvi_codegen.systems.first_order import FirstOrderSystem
-from scvi_codegen.systems.formulas.intermediates import inner_of, written_out
-from scvi_codegen.systems.formulas.translation import format_expression
-from scvi_codegen.systems.splittings.axial import axial_turns
 from scvi_codegen.systems.symmetry.symmetry import Symmetry, symmetries
 
 if TYPE_CHECKING:
@@ -102,7 +98,7 @@ class StepEquations:
     @property
     def statements(self) -> Mapping[str, str]:
         """Statements that the C of a step is generated from, by their titles; none of other steps."""
-        return step_texts(self.system, self.method)
+        return Derivation(self.system, self.method).statements
 
     @property
     def jacobian(self) -> sympy.ImmutableSparseMatrix:
@@ -132,7 +128,10 @@ class StepEquations:
     def _heading(self) -> Iterator[str]:
         q, p = self.state
         yield f"{self.system.name}: {self.method.title}"
-        yield from (rotation.description for rotation in (*self.system.rotations, *axial_turns(self.system)[1]))
+        yield from (
+            rotation.description
+            for rotation in (*self.system.rotations, *Discretisation(self.system, self.method).turns)
+        )
         if Discretisation(self.system, self.method).in_moving_frame:
             yield from (MOVING_FRAME, FREE_ROTATION)
         yield f"{'H' if self.system.auxiliaries else 'L'} = {formula_text(self.system.formula)}"
@@ -140,9 +139,9 @@ class StepEquations:
             yield f"0 = {formula_text(g)}"
         yield from contact_lines(self.system)
         if isinstance(self.system, FirstOrderSystem):
-            yield f"subtracted from L: d/dt of {format_expression(self.system.integrated)}"
+            yield f"subtracted from L: d/dt of {self.system.text_of(self.system.integrated)}"
             for momentum, theta in zip(p, self.system.one_form, strict=True):
-                yield f"{momentum.name.removesuffix('_k')} = {format_expression(theta)}"
+                yield f"{momentum.name.removesuffix('_k')} = {self.system.text_of(theta)}"
         yield f"known: {', '.join(s.name for s in (*q, *p, self.time, self.step))}"
         yield f"unknown: {', '.join(s.name for s in self.unknowns)}"
 
@@ -161,7 +160,7 @@ class StepEquations:
 
     def __repr__(self) -> str:
         count = counted(len(self.equations), "equation")
-        return clipped(f"<{count} of {self.system.name} by {self.method.name}>")
+        return shorten(f"<{count} of {self.system.name} by {self.method.name}>", 100, placeholder="..")
 
     def _repr_latex_(self) -> str | None:
         """Return the LaTeX of all equations, nothing if a notebook could not show them."""
@@ -173,12 +172,12 @@ class StepEquations:
     def _repr_html_(self) -> str:
         shown = [html(equation) for equation in self.equations[:MOST_SHOWN]]
         left_out = len(self.equations) - len(shown)
-        more = [plain(f"and {left_out} more: to_text and to_latex have all")] if left_out else []
+        more = [Html.plain(f"and {left_out} more: to_text and to_latex have all")] if left_out else []
         facts = (
-            ("unknown", listed([symbol.name for symbol in self.unknowns])),
-            ("table entries", listed([entry.symbol.name for entry in self.entries])),
+            ("unknown", Html.listed([symbol.name for symbol in self.unknowns])),
+            ("table entries", Html.listed([entry.symbol.name for entry in self.entries])),
         )
-        return card(f"{self.system.name}: {self.method.title}", facts, *shown, *more)
+        return Html.card(f"{self.system.name}: {self.method.title}", facts, *shown, *more)
 
 
 @overload
@@ -187,7 +186,7 @@ def derive(  # type: ignore[overload-overlap]
 ) -> ArrayStepEquations: ...
 @overload
 def derive(system: MechanicalSystem, method: Method | str, *, radicals: bool = False) -> StepEquations: ...
-@checks_arguments(system=SYSTEM_OR_ARRAYS)
+@checks_arguments(system=MechanicalSystem.OR_ARRAYS)
 def derive(
     system: MechanicalSystem, method: Method | str, *, radicals: bool = False
 ) -> StepEquations | ArrayStepEquations:
@@ -201,15 +200,11 @@ def derive(
     """
     if isinstance(system, ArraySystem):
         from scvi_codegen.extras.derivation.arrays import ArrayStepEquations
-        from scvi_codegen.systems.legendre.of_arrays import site_hamiltonian
 
-        sites = site_hamiltonian(system) if system.coupled_terms else None
-        return ArrayStepEquations(sites.system if sites else system, as_method(method, system))
+        method = as_method(method, system)
+        return ArrayStepEquations(cast(ArraySystem, Derivation(system, method).form), method)
     method = as_method(method, system)
-    system = Discretisation(in_all_modes(system), method).form
-    if inner_of(system.formula):
-        kind = "hamiltonian" if system.auxiliaries else "lagrangian"
-        system = replace(system, **{kind: written_out(system.formula)})
+    system = Derivation(system, method).written_form
     stages = Discretisation(system, method).paper
     writer = _Writer(system, stages)
     equations = writer.equations()
@@ -250,7 +245,7 @@ class _Writer:
             for block in stages.blocks
             for parts in [names if block.size is None else range(1, block.size + 1)]
         ]
-        self.values: dict[sympy.Symbol, tuple[EntryName, Number]] = {}
+        self.values: dict[sympy.Symbol, tuple[Any, Number]] = {}
 
     def _symbol(self, name: str) -> sympy.Symbol:
         """Return a symbol of the derivation, with underscores before its name if the system has one of that name."""
@@ -299,7 +294,7 @@ class _Writer:
                 self._scatter(group, n, powers, rows)
         return rows
 
-    def _momentum(self, column: int, row: Row) -> sympy.Expr:
+    def _momentum(self, column: int, row: Any) -> sympy.Expr:
         """Return the coefficient of p_k: the named entry of q_(k+1) in that column if it is one, else a number."""
         table = self.stages.end_position
         name = table.names[0][column] if column < len(table.names[0]) else None
@@ -307,7 +302,7 @@ class _Writer:
             return self._named(name, row.momentum)
         return _rational(row.momentum)
 
-    def _scatter(self, group: StageGroup, n: int, powers: Sequence[int], rows: list[list[list[sympy.Expr]]]) -> None:
+    def _scatter(self, group: Any, n: int, powers: Sequence[int], rows: list[list[list[sympy.Expr]]]) -> None:
         arguments = self._arguments(group, n)
         weight = self._named(group.weight_names[n], group.weights[n]) * self._growth(group, n)
         for scatter in group.scatters:
@@ -321,18 +316,17 @@ class _Writer:
                 for i, value in enumerate(values):
                     rows[r][i].append(factor * value)
 
-    def _growth(self, group: StageGroup, n: int) -> sympy.Expr:
+    def _growth(self, group: Any, n: int) -> sympy.Expr:
         """Return the factor of a weight due to damping."""
         if self.stages.damping == 0:
             return sympy.S.One
         return sympy.exp(self.stages.damping * self._abscissa(group, n) * self.step)
 
-    def _abscissa(self, group: StageGroup, n: int) -> sympy.Expr:
+    def _abscissa(self, group: Any, n: int) -> sympy.Expr:
         """Return the abscissa of point n on the step, by its name."""
-        prefix, abscissa = "d" if group.name == "quadrature" else "c", group.abscissae[n]
-        return self._named(None if abscissa in (0, 1) else EntryName(prefix, n + 1), abscissa)
+        return self._named(group.abscissa_name(n), group.abscissae[n])
 
-    def _arguments(self, group: StageGroup, n: int) -> dict[sympy.Symbol, sympy.Expr]:
+    def _arguments(self, group: Any, n: int) -> dict[sympy.Symbol, sympy.Expr]:
         replaced = {}
         if any(self.system.time in result.free_symbols for result in group.results):
             replaced[self.system.time] = self.time + self._abscissa(group, n) * self.step
@@ -342,7 +336,7 @@ class _Writer:
         return replaced
 
     def _gathered(self, table: Table, n: int, *, power: int, scale: sympy.Rational) -> tuple[sympy.Expr, ...]:
-        columns: list[tuple[Block | None, tuple[sympy.Symbol, ...]]] = [(None, self.q)]
+        columns: list[tuple[Any, tuple[sympy.Symbol, ...]]] = [(None, self.q)]
         columns += list(zip(self.stages.blocks, self.unknowns, strict=True))
         sums: list[list[sympy.Expr]] = []
         for b, (block, symbols) in enumerate(columns):
@@ -362,7 +356,7 @@ class _Writer:
         factor = sympy.Rational(name.factor.numerator, name.factor.denominator)
         return factor * self._named(name, value / name.factor.numerator * name.factor.denominator)
 
-    def _named(self, name: EntryName | None, value: Number) -> sympy.Expr:
+    def _named(self, name: Any, value: Number) -> sympy.Expr:
         """Return the symbol of a number and record its value; without a name, the number."""
         if name is None:
             return sympy.Integer(int(value))

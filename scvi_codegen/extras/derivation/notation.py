@@ -5,21 +5,16 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
+from typing import Any
 
 import sympy
 
-from scvi_codegen.api.formulas import TIME, Number, Vector, mp, parse_expression, symbol
+from scvi_codegen.api.formulas import TIME, Number, mp, parse_expression, symbol
 from scvi_codegen.api.methods import Method, StageSystem
 from scvi_codegen.api.systems import MechanicalSystem
-from scvi_codegen.api.text import Html, plain
-from scvi_codegen.common.display.mathml import latex_name, mathml_terms
+from scvi_codegen.api.text import Html, Typeset
 from scvi_codegen.common.errors import ExpressionError
-from scvi_codegen.methods.stage_system import EntryName
-from scvi_codegen.methods.tables.closed_forms import exact_points, exact_rule, exact_tableau
-from scvi_codegen.methods.tables.quadrature import Quadrature
-from scvi_codegen.methods.tables.tableau import Tableau
 from scvi_codegen.systems.event import Event
-from scvi_codegen.systems.formulas.translation import format_expression
 from scvi_codegen.systems.symmetry.symmetry import Symmetry
 
 LARGEST_BASIS = 8
@@ -54,7 +49,7 @@ def recognised(value: Number, basis: tuple[sympy.Expr, ...]) -> sympy.Expr | Non
 
 
 @lru_cache(maxsize=64)
-def in_digits(basis: tuple[sympy.Expr, ...]) -> Vector:
+def in_digits(basis: tuple[sympy.Expr, ...]) -> tuple[Number, ...]:
     """Return the elements in 60 digits."""
     return tuple(mp.mpf(str(sympy.N(element, mp.dps + 5))) for element in basis)
 
@@ -78,7 +73,7 @@ def readable(expression: sympy.Expr) -> sympy.Expr:
 def formula_text(expression: sympy.Expr) -> str:
     """Return a formula in the grammar of model files, unless decimals replace numbers in it."""
     shown = readable(expression)
-    return format_expression(expression) if shown == expression else str(shown)
+    return MechanicalSystem.formula_text(expression) if shown == expression else str(shown)
 
 
 LARGEST_SHOWN = 400
@@ -93,7 +88,7 @@ class TableEntry:
     """A number of a table: its symbol and name, its value in 60 digits, and a short exact form or ``None``."""
 
     symbol: sympy.Symbol
-    name: EntryName
+    name: Any
     value: Number
     exact: sympy.Expr | None
 
@@ -141,7 +136,7 @@ def latex(
     """Return an ``align*`` environment with numbers as tags, one for the tables, one for the momentum maps."""
     shown = [*(equation.residual for equation in (*equations, *end.values())), *(s.momentum_map for s in symmetries)]
     symbols = set(end).union(*(expression.free_symbols for expression in shown), (entry.symbol for entry in entries))
-    names = {symbol: latex_name(symbol.name) for symbol in symbols}
+    names = {symbol: Typeset.latex_name(symbol.name) for symbol in symbols}
 
     def written(expression: sympy.Expr) -> str:
         return str(sympy.latex(readable(expression), symbol_names=names))
@@ -151,7 +146,7 @@ def latex(
 
     lines = [rf"0 &= {written(e.residual)} \tag{{{_tag(e.number)}}}" for e in equations]
     for start, equation in end.items():
-        new = latex_name(f"{start.name}+1")
+        new = Typeset.latex_name(f"{start.name}+1")
         lines.append(rf"{new} &= {written(equation.residual)} \tag{{{_tag(equation.number)}}}")
     tables = [rf"{names[entry.symbol]} &= {exact(entry)}{mp.nstr(entry.value, 17)}" for entry in entries]
     maps = [rf"J &= {written(s.momentum_map)} \tag{{{_tag(s.name)}}}" for s in symmetries]
@@ -163,9 +158,9 @@ def html(equation: Equation) -> Html:
     """Return an equation for a notebook, or its size if that is large."""
     size = sympy.count_ops(equation.residual)
     if size > LARGEST_SHOWN:
-        return Html(f"<div>{plain(f'({equation.number}) {size} operations')}</div>")
-    terms = " ".join(mathml_terms(readable(equation.residual), sympy.S.Zero))
-    return Html(f"<div>{plain(f'({equation.number})')} {terms}</div>")
+        return Html(f"<div>{Html.plain(f'({equation.number}) {size} operations')}</div>")
+    terms = " ".join(Typeset.terms(readable(equation.residual), sympy.S.Zero))
+    return Html(f"<div>{Html.plain(f'({equation.number})')} {terms}</div>")
 
 
 def _tag(number: str) -> str:
@@ -174,7 +169,7 @@ def _tag(number: str) -> str:
     return "$" + number.replace("dG", r"\partial G").replace("/d", r"/\partial ") + "$"
 
 
-def entries(values: Mapping[sympy.Symbol, tuple[EntryName, Number]], method: Method) -> tuple[TableEntry, ...]:
+def entries(values: Mapping[sympy.Symbol, tuple[Any, Number]], method: Method) -> tuple[TableEntry, ...]:
     """Return numbers of a method's tables by symbol, sorted by name and index, with their radicals."""
     basis = _basis(method)
     result = [TableEntry(symbol, name, value, recognised(value, basis)) for symbol, (name, value) in values.items()]
@@ -184,7 +179,7 @@ def entries(values: Mapping[sympy.Symbol, tuple[EntryName, Number]], method: Met
 def table_entries(stages: StageSystem, method: Method) -> tuple[TableEntry, ...]:
     """Return the named numbers of all tables of a method's equations, also those that do not occur in the equations."""
     tables = [stages.end_position]
-    values: dict[EntryName, Number] = {}
+    values: dict[Any, Number] = {}
     for group in stages.stage_groups:
         tables += [gather.table for gather in group.gathers] + [scatter.table for scatter in group.scatters]
         values |= {name: weight for name, weight in zip(group.weight_names, group.weights, strict=True) if name}
@@ -199,21 +194,8 @@ def table_entries(stages: StageSystem, method: Method) -> tuple[TableEntry, ...]
 @lru_cache(maxsize=64)
 def _basis(method: Method) -> tuple[sympy.Expr, ...]:
     """Return 1 and the roots in the method's nodes and points with their products; () if one has no closed form."""
-    forms = list(_closed_forms(method))
+    forms = method.closed_forms
     return () if None in forms else radical_basis(x for form in forms for x in form or ())
-
-
-def _closed_forms(method: Method) -> Iterator[Sequence[sympy.Expr] | None]:
-    """Yield the exact points, weights and coefficients of the method's tables."""
-    for part in method.parts:
-        if isinstance(part, Tableau):
-            exact = exact_tableau(part)
-            yield None if exact is None else [x for row in exact[0] for x in row] + list(exact[1]) + list(exact[2])
-        elif isinstance(part, Quadrature):
-            rule = exact_rule(part)
-            yield None if rule is None else [x for group in rule for x in group]
-        else:
-            yield exact_points(part)
 
 
 IMPULSE = "p := p + (1 + e)/2 lambda n, H(q, p + lambda n) - H(q, p) + lambda g_t = 0"

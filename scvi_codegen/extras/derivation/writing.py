@@ -12,17 +12,14 @@ from base64 import b64encode
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import sympy
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 from sympy.printing.pretty.pretty_symbology import greek_unicode
 
-from scvi_codegen.api.text import counted
-from scvi_codegen.common.cache import template_folder
-from scvi_codegen.common.display.mathml import mathml, mathml_terms
-from scvi_codegen.common.display.tables import Cell, TableBlock
+from scvi_codegen.api.text import TableBlock, Typeset, counted, template_folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +182,7 @@ def column_heading(text: str) -> Markup:
     return Markup(INDEX.sub(r"<var>\1</var>", str(prose(text))))
 
 
-def cell(value: Cell, specification: str | None = None) -> Markup:
+def cell(value: Any, specification: str | None = None) -> Markup:
     """Return an entry of a table; numbers in the given format, a dash if there is none."""
     match value:
         case None:
@@ -193,7 +190,7 @@ def cell(value: Cell, specification: str | None = None) -> Markup:
         case str():
             return prose(value)
         case sympy.Basic():
-            return Markup(mathml(value))
+            return Markup(Typeset.whole(value))
         case float():
             return prose(format(value, specification or FORMAT))
     return prose(format(value, specification or ""))
@@ -240,6 +237,11 @@ KINDS = {
 COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
 
 
+def plain_template(name: str) -> Template:
+    """Return the template of that file name, of text that is not HTML."""
+    return _environment().overlay(autoescape=False, keep_trailing_newline=True).get_template(name)
+
+
 def page_template(name: str, **filters: Callable[..., object]) -> Template:
     """Return the template of that file name, with ``filters`` in addition to those of all pages."""
     environment = _environment()
@@ -277,7 +279,7 @@ def _environment() -> Environment:
         "cell": cell,
         "column_heading": column_heading,
         "column": column_class,
-        "equation": lambda formula: Markup(" ".join(mathml_terms(formula.right, formula.left))),
+        "equation": lambda formula: Markup(" ".join(Typeset.terms(formula.right, formula.left))),
         "c_text": lambda text: Markup(COMMENT.sub(r'<span class="comment">\g<0></span>', str(escape(text)))),
         "markup": Markup,
     }

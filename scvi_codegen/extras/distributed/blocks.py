@@ -15,12 +15,8 @@ from inspect import signature
 from typing import TYPE_CHECKING, Any, cast
 
 from scvi_codegen.api.checks import checked_count
-from scvi_codegen.api.runs import EnsembleSettings
 from scvi_codegen.common.errors import StateError, closest
-from scvi_codegen.runs.ensembles.individual import IndividualRuns, runs_of
-from scvi_codegen.runs.ensembles.lanes import CommonRuns
 from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
-from scvi_codegen.runs.stepper import checked_ensemble_result
 
 if TYPE_CHECKING:
     from scvi_codegen.api.states import Array, States
@@ -65,14 +61,13 @@ def integrate_ensemble(
     """
     _check_arguments(stepper, arguments)
     velocity, action = arguments.pop("velocity", None), arguments.pop("action", False)
-    settings = EnsembleSettings(**{name: value for name, value in arguments.items() if name != "threads"})
-    ensemble = stepper._ensemble(q, p, settings, velocity=velocity, action=action)
-    runs = runs_of(ensemble)
+    settings = {name: value for name, value in arguments.items() if name != "threads"}
+    runs = stepper.ensemble_runs(q, p, settings, velocity=velocity, action=action)
     blocks = None if blocks is None else checked_count(blocks, "blocks", least=1)
     with _client(address) as client:
         count = blocks or BLOCKS_A_THREAD * sum(client.ncores().values())
-        _gather(client, runs, list(_slices(len(ensemble), count)), progress)
-    return checked_ensemble_result(runs)
+        _gather(client, runs, list(_slices(len(runs.ensemble), count)), progress)
+    return stepper.ensemble_result(runs)
 
 
 def _check_arguments(stepper: Stepper, arguments: dict[str, Any]) -> None:
@@ -118,9 +113,7 @@ def _slices(count: int, blocks: int) -> Iterator[slice]:
         yield slice(first, min(first + size, count))
 
 
-def _gather(
-    client: Any, runs: CommonRuns | IndividualRuns, parts: list[slice], progress: Callable[[int], None] | None
-) -> None:
+def _gather(client: Any, runs: Any, parts: list[slice], progress: Callable[[int], None] | None) -> None:
     """Submit the slices and store their results."""
     from distributed import as_completed
 
@@ -141,9 +134,9 @@ def _gather(
         client.cancel(list(futures))
 
 
-def _integrate(pickled: bytes, arguments: tuple[Array, Array, EnsembleSettings]) -> EnsembleTrajectory:
+def _integrate(pickled: bytes, arguments: tuple[Array, Array, Any]) -> EnsembleTrajectory:
     """Integrate one slice on a single worker thread; return its results without stepper and functions."""
-    runs = runs_of(_stepper(pickled)._ensemble(*arguments))
+    runs = _stepper(pickled).ensemble_runs(*arguments)
     runs.run(threads=1)
     return replace(runs.result(), stepper=cast(Any, None), spans=())
 

@@ -19,8 +19,7 @@ from scvi_codegen.api.formulas import Number, mp
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.extras.exact.newton import Array, Floats, Solve, inverse, largest, newton, scaled, solver
 from scvi_codegen.extras.exact.solution import ExactMotion
-from scvi_codegen.methods.tables.basis import cardinal_integrals
-from scvi_codegen.methods.tables.quadrature import gauss_legendre
+from scvi_codegen.methods import Gauss
 
 BITS = 240
 """Precision of fixed-point numbers in bits (72 digits)."""
@@ -85,10 +84,8 @@ class Grid:
 
 @lru_cache(maxsize=16)
 def _gauss_tables(points: int) -> tuple[Array, Array, Array]:
-    rule = gauss_legendre(points)
-    c = rule.abscissae
-    A = cardinal_integrals(c, c, 0)
-    return np.array(c, dtype=object), np.array(rule.unit_weights, dtype=object), np.array(A, dtype=object)
+    tableau = Gauss(points).tableau
+    return np.array(tableau.c, dtype=object), np.array(tableau.b, dtype=object), np.array(tableau.A, dtype=object)
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,16 +16,16 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.api.checks import Kind, checked_count, checks_arguments
-from scvi_codegen.api.formulas import Number, Vector, mp
+from scvi_codegen.api.formulas import Number, mp
+from scvi_codegen.api.methods import Discretisation
+from scvi_codegen.api.systems import ArraySystem
 from scvi_codegen.api.text import summary
 from scvi_codegen.common.errors import StateError, closest
+from scvi_codegen.extras.exact.arrays import unrolled_at
 from scvi_codegen.extras.exact.curve import Curve, Grid
 from scvi_codegen.extras.exact.newton import Array, NotConvergedError, largest
 from scvi_codegen.extras.exact.solution import ExactMotion
-from scvi_codegen.systems.arrays.system import ArrayLagrangian
-from scvi_codegen.systems.kinks import check_continuity
 from scvi_codegen.systems.lagrangian import LagrangianSystem
-from scvi_codegen.systems.rolling import unrolled_at
 
 MOST_DIGITS = 50
 POINTS = (10, 15, 22, 32)
@@ -35,7 +35,10 @@ MAX_STRAIGHT_PIECES = 2
 """Maximum number of pieces for which the straight line is the initial guess; more have not helped."""
 
 Values = Mapping[str, Any] | Sequence[Any] | None
-LAGRANGIAN_OR_ARRAYS = Kind.of("a LagrangianSystem", LagrangianSystem, ArrayLagrangian)
+LAGRANGIAN_OR_ARRAYS = Kind(
+    "a LagrangianSystem",
+    lambda system: isinstance(system, LagrangianSystem) or (isinstance(system, ArraySystem) and not system.momenta),
+)
 VALUES = Kind(
     "values by name or a list of all", lambda value: Kind.MAPPING.accepts(value) or Kind.NUMBERS.accepts(value)
 )
@@ -54,12 +57,12 @@ class ExactStep:
         error: estimated error, relative to the size of the position, of the momentum and of the integral of ``|L|``.
     """
 
-    q0: Vector
-    q1: Vector
-    p0: Vector
-    p1: Vector
-    v0: Vector
-    v1: Vector
+    q0: tuple[Number, ...]
+    q1: tuple[Number, ...]
+    p0: tuple[Number, ...]
+    p1: tuple[Number, ...]
+    v0: tuple[Number, ...]
+    v1: tuple[Number, ...]
     action: Number
     error: Number
 
@@ -165,7 +168,7 @@ class _Problem:
 
     def __init__(self, system: LagrangianSystem, h: Any, t: Any, parameters: Values, digits: int) -> None:
         checked_count(digits, "digits", least=1, most=MOST_DIGITS)
-        check_continuity(system)
+        Discretisation.check_continuity(system)
         self.names = [coordinate.name for coordinate in system.coordinates]
         self.arrays = [array.name for array in system.arrays] or self.names
         self.digits, self.t, self.h = digits, _number(t, "the time t"), _number(h, "the step h")

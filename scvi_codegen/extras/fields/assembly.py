@@ -21,18 +21,16 @@ from numpy.typing import NDArray
 from sympy import Add, Expr, Float, Rational, Symbol
 
 from scvi_codegen.api.formulas import DOT, TIME, Array, symbol
+from scvi_codegen.api.systems import ArraySystem
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.extras.fields.axes import Axis, Cells, fixed_place, rational, same, span
 from scvi_codegen.extras.fields.density import Density, place_text
 from scvi_codegen.extras.fields.mesh import Mesh, MeshSystem
-from scvi_codegen.systems.arrays.system import ArrayHamiltonian, ArrayLagrangian, friction
-from scvi_codegen.systems.formulas.array_statements import ArrayForce, array_text
-from scvi_codegen.systems.formulas.arrays import MAX_UNROLLED_TERMS, ArrayTerm, term_of
-from scvi_codegen.systems.formulas.indices import Access, Convolution, Loop, Place, Size
+from scvi_codegen.systems.arrays.system import friction
 
 Slot: TypeAlias = Any
 """Number of a point within a cell, or in the general term of a sum its index as text."""
-Summed: TypeAlias = tuple[tuple[Loop, ...], Expr]
+Summed: TypeAlias = tuple[tuple[Any, ...], Expr]
 SHOWN_DENOMINATOR = 10**6
 """Largest denominator of fractions that texts contain; other numbers are decimal."""
 
@@ -59,10 +57,10 @@ class Assembly:
     def __init__(self, system: Density, axes: Mapping[str, Axis]) -> None:
         self.system = system
         self.axes = axes
-        self.sizes = tuple(Size(f"N{axis}") for axis in axes)
-        self.here = {axis: Place(index=f"i{axis}") for axis in axes}
-        self.used: dict[str, tuple[tuple[Size, ...], Any]] = {}
-        self.accesses: dict[Symbol, Access] = {}
+        self.sizes = tuple(Array.size(f"N{axis}") for axis in axes)
+        self.here = {axis: Array.place(index=f"i{axis}") for axis in axes}
+        self.used: dict[str, tuple[tuple[Any, ...], Any]] = {}
+        self.accesses: dict[Symbol, Any] = {}
 
     def result(self, discretisation: Mapping[str, Any]) -> MeshSystem:
         """Return the semi-discrete system of the density on the tensor product of the axes."""
@@ -73,7 +71,7 @@ class Assembly:
         summed = [*self.kinetic(), *self.in_space(), *self.at_places()]
         texts: dict[str, Any] = {"coordinates": [*map(str, coordinates)], "momenta": [*map(str, momenta)]}
         texts |= {function: "\n+ ".join(map(text_of, summed))}
-        forces: list[ArrayForce] = []
+        forces: list[Any] = []
         if system.dissipation != 0:
             damped = self.over_points(system.dissipation, lambda part: [self.at_points(part, system.rates)])
             velocities = {Array(coordinate.name + DOT, coordinate.axes): coordinate for coordinate in coordinates}
@@ -84,7 +82,7 @@ class Assembly:
         texts |= {"tables": [*map(str, tables)]}
         mesh = self.mesh(discretisation)
         values = {name: entries for name, (_, entries) in self.used.items()}
-        assembled = (ArrayHamiltonian if momenta else ArrayLagrangian)(
+        assembled = ArraySystem.assembled(
             name=system.name,
             coordinates=coordinates,
             momenta=momenta,
@@ -100,7 +98,6 @@ class Assembly:
             data=values | {table.name: rows for table, rows in tables.items()},
             mesh=Mesh(**mesh),
         )
-        assembled.warn_of_mistakes()
         return MeshSystem(system=assembled, **mesh)
 
     def tables(self) -> dict[Array, NDArray[np.int64]]:
@@ -109,7 +106,7 @@ class Assembly:
         tables = [(f"nodes_{x}", f"E{x}", axis.table) for x, axis in self.axes.items()]
         tables += [(f"edges_{x}", f"F{x}", axis.edges.table) for x, axis in self.axes.items() if axis.edges]
         return {
-            Array(name, (Size(rows), Size("", entries.shape[1]))): entries
+            Array(name, (Array.size(rows), Array.size("", entries.shape[1]))): entries
             for name, rows, entries in tables
             if name in used and entries is not None
         }
@@ -126,36 +123,36 @@ class Assembly:
             "discretisation": discretisation,
         }
 
-    def terms(self, summed: Sequence[Summed]) -> tuple[ArrayTerm, ...]:
+    def terms(self, summed: Sequence[Summed]) -> tuple[Any, ...]:
         """Return one term for each tuple of loops, with all sums over the points of a cell carried out."""
-        by_loops: dict[tuple[Loop, ...], list[Expr]] = {}
+        by_loops: dict[tuple[Any, ...], list[Expr]] = {}
         for loops, formula in sorted(summed, key=lambda pair: not pair[0]):
             by_loops.setdefault(loops, []).append(formula.doit())
-        return tuple(term_of(loops, Add(*parts), self.accesses) for loops, parts in by_loops.items())
+        return tuple(ArraySystem.term(loops, Add(*parts), self.accesses) for loops, parts in by_loops.items())
 
-    def entry(self, name: str, sizes: tuple[Size, ...], places: Sequence[Place | Slot], *sums: Convolution) -> Symbol:
+    def entry(self, name: str, sizes: tuple[Any, ...], places: Sequence[Any], *sums: Any) -> Symbol:
         """Return the symbol of an entry of an array, or of convolutions of it."""
-        indices = (place if isinstance(place, Place) else place_of(place) for place in places)
-        access = Access(array=Array(name, sizes), places=tuple(indices), sums=sums)
+        indices = (place_of(place) if isinstance(place, str | int) else place for place in places)
+        access = Array(name, sizes).at(*indices, sums=sums)
         slot = symbol(str(access))
         self.accesses[slot] = access
         return slot
 
-    def value(self, name: str, sizes: tuple[Size, ...], values: Any, *places: Place | Slot) -> Symbol:
+    def value(self, name: str, sizes: tuple[Any, ...], values: Any, *places: Any) -> Symbol:
         """Return the symbol of an entry of an array of numbers."""
         self.used[name] = (sizes, values)
         return self.entry(name, sizes, places)
 
-    def common(self, name: str, size: str, values: Any, place: Place) -> Expr:
+    def common(self, name: str, size: str, values: Any, place: Any) -> Expr:
         """Return an entry of an array, or its number if all entries are equal."""
         number = same(values)
-        return self.value(name, (Size(size),), values, place) if number is None else rational(number)
+        return self.value(name, (Array.size(size),), values, place) if number is None else rational(number)
 
     def weight(self, axis: str) -> Expr:
         """Return the weight of a point along an axis."""
         return self.common(f"weight_{axis}", f"N{axis}", self.axes[axis].weights, self.here[axis])
 
-    def at(self, name: str, places: Mapping[str, Place], *sums: Convolution) -> Expr:
+    def at(self, name: str, places: Mapping[str, Any], *sums: Any) -> Expr:
         """Return a field at a point; a momentum is divided by the weight of the point."""
         entry = self.entry(name, self.sizes, [*places.values()], *sums)
         if name not in self.system.momenta:
@@ -179,7 +176,7 @@ class Assembly:
 
     def coordinate(self, axis: str) -> Expr:
         """Return the coordinate of a point along an axis."""
-        return self.value(f"{axis}_points", (Size(f"N{axis}"),), self.axes[axis].points, self.here[axis])
+        return self.value(f"{axis}_points", (Array.size(f"N{axis}"),), self.axes[axis].points, self.here[axis])
 
     def kinetic(self) -> Iterator[Summed]:
         """Yield the kinetic energy of each field: the density is m u_t^2/2 with m = d^2 L/du_t^2."""
@@ -243,7 +240,9 @@ class Assembly:
     def beside(self, axis: str, kind: str, side: int) -> Symbol:
         """Return the coordinate or the weight of a point within the element to the left, 0, or to the right, 1."""
         values = getattr(self.axes[axis].one_sided, kind)[side]
-        return self.value(f"{axis}_{kind}_{('left', 'right')[side]}", (Size(f"N{axis}"),), values, self.here[axis])
+        return self.value(
+            f"{axis}_{kind}_{('left', 'right')[side]}", (Array.size(f"N{axis}"),), values, self.here[axis]
+        )
 
     def in_space(self) -> Iterator[Summed]:
         """Yield the sums of the terms without velocities, grouped by the axes of their derivatives."""
@@ -275,11 +274,13 @@ class Assembly:
             ((axis, order),) = orders.items()
             rest -= factor * symbol(name) ** 2 / 2
             values, i, j = self.axes[axis].pairs[order - 1], f"i{axis}", f"j{axis}"
-            pair = (Place(index=i), Place(index=j)) if values.ndim == 2 else (Place(index=j, minus=i),)
+            pair = (
+                (Array.place(index=i), Array.place(index=j)) if values.ndim == 2 else (Array.place(index=j, minus=i),)
+            )
             others = [a for a in self.axes if a != axis]
             loops = (*(span(f"i{a}", f"N{a}") for a in others), span(i, f"N{axis}"))
-            matrix = self.value(f"pairs{order}_{axis}", (Size(f"N{axis}"),) * values.ndim, values, *pair)
-            difference = self.at(field, self.here) - self.at(field, self.here | {axis: Place(index=j)})
+            matrix = self.value(f"pairs{order}_{axis}", (Array.size(f"N{axis}"),) * values.ndim, values, *pair)
+            difference = self.at(field, self.here) - self.at(field, self.here | {axis: Array.place(index=j)})
             factors = [factor, *map(self.weight, others), matrix, difference**2, Rational(1, 2)]
             yield (*loops, replace(span(j, f"N{axis}"), behind=i)), reduce(mul, factors)
         if sympy.expand(rest) != 0:
@@ -297,27 +298,27 @@ class Assembly:
             discretised = self.axes[axis]
             count = len(self.axes[axis].points)
             if order and discretised.pairs[0].ndim == 1:
-                array = Array(f"derivative_{axis}", (Size(f"N{axis}"),))
+                array = Array(f"derivative_{axis}", (Array.size(f"N{axis}"),))
                 self.used[array.name] = (array.axes, discretised.rates)
-                sums += [Convolution(position, array, f"{letter}{axis}") for letter in "jk"[:order]]
-            elif order and count > MAX_UNROLLED_TERMS:
+                sums += [array.convolution(position, f"{letter}{axis}") for letter in "jk"[:order]]
+            elif order and count > (most := ArraySystem.MAX_UNROLLED_TERMS):
                 raise SystemDefinitionError(
-                    f"derivative=\"dense\" of more than {MAX_UNROLLED_TERMS} points of '{axis}' needs densities "
+                    f"derivative=\"dense\" of more than {most} points of '{axis}' needs densities "
                     "that are quadratic in derivatives along one axis with constant factors, not "
                     f'{sympy.expand(term)}: use derivative="fft"'
                 )
             elif order:
                 dense[axis] = np.linalg.matrix_power(discretised.differentiated(np.eye(count), 0), order)
 
-        def value(places: Mapping[str, Place], left: Sequence[str]) -> Expr:
+        def value(places: Mapping[str, Any], left: Sequence[str]) -> Expr:
             """Return the sums over the axes that are left, the last one outermost."""
             if not left:
                 return self.at(field, places, *sums)
             *others, axis = left
-            name, size = f"derivatives{orders[axis]}_{axis}", Size("", len(dense[axis]))
+            name, size = f"derivatives{orders[axis]}_{axis}", Array.size("", len(dense[axis]))
 
             def summand(k: Slot) -> Expr:
-                factor = self.value(name, (size, size), dense[axis], Place(index=f"i{axis}"), k)
+                factor = self.value(name, (size, size), dense[axis], Array.place(index=f"i{axis}"), k)
                 return factor * value({**places, axis: place_of(k)}, others)
 
             return total(f"j{axis}", size.number, summand)
@@ -404,7 +405,7 @@ class Assembly:
             inverse = sympy.S.Zero
             for side, text in enumerate(("left", "right")):
                 place, share = (
-                    self.value(f"{axis}_{kind}_{text}_of_edges", (Size(f"F{axis}"),), values[side], cells.index)
+                    self.value(f"{axis}_{kind}_{text}_of_edges", (Array.size(f"F{axis}"),), values[side], cells.index)
                     for kind, values in (("points", edges.sides), ("shares", edges.shares))
                 )
                 jumps = {jump: jump.xreplace({symbol(axis): place}) for jump in self.system.jumps_in(factor)}
@@ -416,11 +417,11 @@ class Assembly:
         """Return the coordinate of a quadrature point of a cell, slightly ``inside`` of its ends, or of an edge."""
         discretised = self.axes[axis]
         if inside and discretised.one_sided:
-            sizes = (Size(self.extent(axis)), Size("", len(discretised.quadrature)))
+            sizes = (Array.size(self.extent(axis)), Array.size("", len(discretised.quadrature)))
             return self.value(f"{axis}_inside_cells", sizes, discretised.one_sided.cells, cells.index, k)
         if cells.edge and discretised.edges:
-            return self.value(f"{axis}_at_edges", (Size(f"F{axis}"),), discretised.edges.points, cells.index)
-        sizes = (Size(self.extent(axis)), Size("", len(discretised.quadrature)))
+            return self.value(f"{axis}_at_edges", (Array.size(f"F{axis}"),), discretised.edges.points, cells.index)
+        sizes = (Array.size(self.extent(axis)), Array.size("", len(discretised.quadrature)))
         return self.value(f"{axis}_in_cells", sizes, discretised.cell_points, cells.index, k)
 
     def coefficient(self, order: int | None, axis: str, index: tuple[Slot, ...], cells: Cells) -> Expr:
@@ -451,7 +452,7 @@ class Assembly:
             terms = [
                 self.value(f"edge_rows{order}_{axis}", sizes_of(rows), rows, side, b) * x for b, x in enumerate(part)
             ]
-            factors = (Size(f"F{axis}"), Size("", 2)), scales, cells.index, side
+            factors = (Array.size(f"F{axis}"), Array.size("", 2)), scales, cells.index, side
             sides.append(self.value(f"edge_factors{order}_{axis}", *factors) * Add(*terms))
         return Add(*sides)
 
@@ -508,8 +509,8 @@ class Assembly:
         places = {**self.here}
         for axis, cells in cells_of.items():
             if cells.table:
-                places[axis] = Place(index=cells.index.index, table=cells.table, column=slots[axis])
-            elif isinstance(place := cells.places[slots[axis]], Place):
+                places[axis] = Array.place(index=cells.index.index, table=cells.table, column=slots[axis])
+            elif not isinstance(place := cells.places[slots[axis]], int):
                 places[axis] = place
             else:
                 prescribed: Expr = self.system.boundary[axis][place][field]
@@ -522,14 +523,14 @@ def total(index: str, count: int, summand: Callable[[Slot], Expr]) -> Expr:
     return InnerSum(symbol(index), summand(index), *map(summand, range(count)))
 
 
-def place_of(slot: Slot) -> Place:
+def place_of(slot: Slot) -> Any:
     """Return a number or an index as an index expression."""
-    return Place(index=slot) if isinstance(slot, str) else fixed_place(slot)
+    return Array.place(index=slot) if isinstance(slot, str) else fixed_place(slot)
 
 
-def sizes_of(values: Any) -> tuple[Size, ...]:
+def sizes_of(values: Any) -> tuple[Any, ...]:
     """Return the shape of an array."""
-    return tuple(Size("", n) for n in values.shape)
+    return tuple(Array.size("", n) for n in values.shape)
 
 
 def text_of(summed: Summed) -> str:
@@ -537,7 +538,7 @@ def text_of(summed: Summed) -> str:
     loops, formula = summed
     numbers = {x: Float(x, 25) for x in formula.atoms(Rational) if x.q > SHOWN_DENOMINATOR}
     behind = {loop.behind for loop in loops}
-    text = array_text(formula.xreplace(numbers))
+    text = ArraySystem.formula_text(formula.xreplace(numbers))
     if not loops:
         return f"({text})"
     # An index that others begin behind, i < j, is printed with these.

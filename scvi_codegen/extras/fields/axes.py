@@ -36,13 +36,11 @@ from numpy.typing import NDArray
 from sympy import Expr, Rational
 
 from scvi_codegen.api.checks import checked_count
-from scvi_codegen.api.formulas import Number, Vector, mp, symbol
-from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.api.formulas import Array as Indexed
+from scvi_codegen.api.formulas import Number, mp, symbol
+from scvi_codegen.common.errors import MethodError, SystemDefinitionError
 from scvi_codegen.extras.fields.density import Density
-from scvi_codegen.methods.tables.basis import differentiation_matrix, identity_matrix, matrix_product
-from scvi_codegen.methods.tables.nodes import point_count
 from scvi_codegen.methods.tables.quadrature import Quadrature, gauss_lobatto
-from scvi_codegen.systems.formulas.indices import Loop, Place, Size
 
 Array = NDArray[np.float64]
 INWARD = 1e-6
@@ -66,13 +64,13 @@ class Cells:
         weight: factor of its quadrature weight.
     """
 
-    loop: Loop | None
-    index: Place
-    places: tuple[Place | int, ...]
+    loop: Any
+    index: Any
+    places: tuple[Any, ...]
     table: str | None = None
     interior: bool = False
     edge: bool = False
-    operators: tuple[tuple[Vector, ...], ...] = ()
+    operators: tuple[tuple[tuple[Number, ...], ...], ...] = ()
     weight: float = 1.0
 
 
@@ -165,8 +163,8 @@ class Axis(ABC):
     points: Array
     weights: Array
     length: float
-    quadrature: Vector = ()
-    operators: tuple[tuple[Vector, ...], ...] = ()
+    quadrature: tuple[Number, ...] = ()
+    operators: tuple[tuple[tuple[Number, ...], ...], ...] = ()
     cells: tuple[Cells, ...] = ()
     jacobians: Array = field(default_factory=lambda: np.zeros(0))
     cell_points: Array = field(default_factory=lambda: np.zeros((0, 0)))
@@ -230,14 +228,14 @@ class Axis(ABC):
         return np.moveaxis(np.moveaxis(result, 0, -1) / self.weights, -1, along)
 
 
-def span(index: str, size: str, first: int = 0, last: int = 0, *, periodic: bool = False) -> Loop:
+def span(index: str, size: str, first: int = 0, last: int = 0, *, periodic: bool = False) -> Any:
     """Return the loop of an index from ``first`` to ``size - 1 - last``."""
-    return Loop(index=index, first=Size("", first), end=Size(size, -last), periodic=periodic)
+    return Indexed.loop(index=index, first=Indexed.size("", first), end=Indexed.size(size, -last), periodic=periodic)
 
 
-def fixed_place(number: int, size: str = "") -> Place:
+def fixed_place(number: int, size: str = "") -> Any:
     """Return the index ``number`` or ``size + number``."""
-    return Place(base=Size(size, number))
+    return Indexed.place(base=Indexed.size(size, number))
 
 
 def held_ends(boundary: Any) -> tuple[bool, bool] | None:
@@ -280,7 +278,7 @@ def rational(value: Number) -> Expr:
 class SpectralElements(Axis):
     """Elements between ascending ends, with the points ``reference`` on [-1, 1]."""
 
-    reference: Vector
+    reference: tuple[Number, ...]
 
     @staticmethod
     def rule(count: int) -> Quadrature:
@@ -309,9 +307,11 @@ class SpectralElements(Axis):
         """Return the axis of a density with (E + 1,) ascending ends of the elements."""
         fixed = held_ends(system.boundary[name])
         clamped = clamped_ends(system.boundary[name], f"{system.fields[0]}_{name}")
-        p = point_count(degree, "the degree of the elements", least=1)
+        p = checked_count(degree, "the degree of the elements", least=1, error=MethodError)
         rule = cls.rule(p + 1)
-        derivative = differentiation_matrix(rule.points)
+        derivative = differentiation(rule.points)
+        identity = tuple(tuple(mp.mpf(int(i == j)) for j in range(p + 1)) for i in range(p + 1))
+        twice = tuple(tuple(mp.fdot(row, column) for column in zip(*derivative, strict=True)) for row in derivative)
         half = np.diff(breaks) / 2
         elements = len(half)
         offsets = np.array([float(1 + point) for point in rule.points])
@@ -340,7 +340,7 @@ class SpectralElements(Axis):
             length=float(breaks[-1] - breaks[0]),
             periodic=fixed is None,
             quadrature=rule.weights,
-            operators=(identity_matrix(p + 1), derivative, matrix_product(derivative, derivative)),
+            operators=(identity, derivative, twice),
             stiffness=(largest, largest**2),
             edges=_edges(name, places, (local, inner), (weights, matrix), fixed, clamped),
             one_sided=_one_sided(inner, quadrature, places, unknown),
@@ -391,8 +391,8 @@ def _element_cells(name: str, elements: int, degree: int, *, left: int, right: i
         return (Cells(None, fixed_place(0), (0, *inside, 1)),)
     kinds = []
     if elements > left + right:
-        unknown = tuple(Place(index=index, table=nodes, column=b) for b in range(degree + 1))
-        kinds.append(Cells(span(index, size, left, right), Place(index=index), unknown, nodes))
+        unknown = tuple(Indexed.place(index=index, table=nodes, column=b) for b in range(degree + 1))
+        kinds.append(Cells(span(index, size, left, right), Indexed.place(index=index), unknown, nodes))
     if left:
         kinds.append(Cells(None, fixed_place(0), (0, *(fixed_place(b) for b in range(degree)))))
     if right:
@@ -454,9 +454,9 @@ def _edges(
     prescribed = by_end[0] | by_end[1]
     lower, upper = (int(at_end.any(1).sum()) for at_end in by_end)
     index = f"f{name}"
-    slots = tuple(Place(index=index, table=f"edges_{name}", column=b) for b in range(2 * size))
+    slots = tuple(Indexed.place(index=index, table=f"edges_{name}", column=b) for b in range(2 * size))
     loop = span(index, f"F{name}", lower, upper)
-    kinds = [] if prescribed.any(1).all() else [Cells(loop, Place(index=index), slots, edge=True)]
+    kinds = [] if prescribed.any(1).all() else [Cells(loop, Indexed.place(index=index), slots, edge=True)]
     for f in np.flatnonzero(prescribed.any(1)):
         single = zip(table[f].tolist(), prescribed[f].tolist(), strict=True)
         points = tuple(int(n > 0) if end else fixed_place(n - left) for n, end in single)
@@ -504,15 +504,15 @@ class FiniteDifferences(Axis):
         nodes: Array = bounds[0] + h * np.arange(count, dtype=np.float64)
         rows = _coefficients([mp.mpf(2 * k + 1) / 2 for k in range(-m, m)], 2 + second)
         stiffness = [float(sum(map(abs, row))) ** 2 / h ** (2 * k) for k, row in enumerate(rows)]
-        places = tuple(Place(index=index, base=Size("", k)) for k in range(1 - m, m + 1))
-        cells = [Cells(span(index, f"N{name}", periodic=True), Place(index=index), places)]
+        places = tuple(Indexed.place(index=index, base=Indexed.size("", k)) for k in range(1 - m, m + 1))
+        cells = [Cells(span(index, f"N{name}", periodic=True), Indexed.place(index=index), places)]
         masses, inner, closed = np.full(count, h), slice(None), None
         if fixed is not None:
             end_rows, midpoints, ends, largest = _end_rows(np.array([float(x) for x in rows[1]]))
             masses[: len(ends)], masses[-len(ends) :] = h * ends, h * ends[::-1]
             left, right = map(int, fixed)
             within = span(index, f"N{name}", order - left, order + 1 - right)  # the unknown to the left of each cell
-            inner_cells = Cells(within, Place(index=index, base=Size("", left)), places)
+            inner_cells = Cells(within, Indexed.place(index=index, base=Indexed.size("", left)), places)
             cells = [inner_cells, *_end_cells(name, end_rows, midpoints, fixed)]
             inner = slice(left, count - right)
             closed = _closed(nodes, masses, order, inner)
@@ -547,7 +547,14 @@ class FiniteDifferences(Axis):
         return Axis.modes(self, values)
 
 
-def _coefficients(offsets: Sequence[Number], count: int) -> list[Vector]:
+def differentiation(points: Sequence[Number]) -> tuple[tuple[Number, ...], ...]:
+    """Return the derivatives l_j'(x_i) of the cardinal functions on points, in 60 digits."""
+    with mp.workdps(mp.dps + 20 + len(points)):
+        rows = [_coefficients([x - point for x in points], 2)[1] for point in points]
+    return tuple(tuple(+x for x in row) for row in rows)
+
+
+def _coefficients(offsets: Sequence[Number], count: int) -> list[tuple[Number, ...]]:
     """Return the coefficients of derivatives of order 0, 1, .. at 0 of the interpolant of values at offsets."""
     # sum_i c_i x_i^r = k! [r = k]: exact for all polynomials up to the degree of the interpolant.
     powers = mp.matrix([[x**r for x in offsets] for r in range(len(offsets))])
@@ -593,7 +600,7 @@ def _end_cells(name: str, rows: Array, weights: Array, fixed: tuple[bool, bool])
         for end, prescribed in enumerate(fixed):
             at_left = [fixed_place(i - prescribed) for i in range(rows.shape[1])]
             at_right = [fixed_place(prescribed - i - 1, f"N{name}") for i in range(rows.shape[1])]
-            places: list[Place | int] = [*(at_right if end else at_left)]
+            places: list[Any] = [*(at_right if end else at_left)]
             if prescribed:
                 places[0] = end
             operators = tuple((tuple(map(mp.mpf, coefficients)),) for coefficients in (value, -row if end else row))

@@ -8,12 +8,9 @@ from typing import Any
 import sympy
 from sympy import Add, Expr, S, Symbol
 
-from scvi_codegen.api.formulas import TIME, symbol
+from scvi_codegen.api.formulas import TIME, jacobian, parse_expression, symbol
 from scvi_codegen.api.text import summary
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.systems.checks.continuity import kink_in_velocities, velocity_message
-from scvi_codegen.systems.formulas.expressions import evaluated, hessian
-from scvi_codegen.systems.formulas.kinks import rint, unit_step
 
 Boundary = Mapping[str, Any]
 
@@ -61,9 +58,14 @@ class Density:
     def _check_regular(self) -> None:
         """Raise an error unless the kinetic part is a sum of m u_t^2/2 with m > 0 of position and parameters."""
         rates = self.rates
-        if kink := kink_in_velocities(self.density, rates):
-            raise SystemDefinitionError(velocity_message(f"the density of '{self.name}'", *kink))
-        masses = hessian(self.density, rates)
+        for step in self.density.atoms(sympy.Function):
+            if type(step).__name__ == "unit_step" and not step.free_symbols.isdisjoint(rates):
+                raise SystemDefinitionError(
+                    f"the density of '{self.name}' has a kink in velocities where {step.args[0]} = 0: its momenta do "
+                    "not determine the velocities there. Put friction and drag, such as -c*v*abs(v), into dissipation "
+                    "(Rayleigh's function)"
+                )
+        masses = self._masses()
         for (i, j), entry in masses.items():
             if i != j:
                 raise SystemDefinitionError(
@@ -93,7 +95,8 @@ class Density:
         """Return the functions of a formula that jump at places: ``unit_step`` and ``rint`` of axes and parameters."""
         places = {symbol(axis) for axis in self.space}
         moving = {*map(symbol, (*self.variables, *self.scalars, *self.derivatives, TIME)), *self.rates}
-        jumps = [jump for jump in formula.atoms(unit_step, rint) if jump.free_symbols & places]
+        steps = (part for part in formula.atoms(sympy.Function) if type(part).__name__ in ("unit_step", "rint"))
+        jumps = [jump for jump in steps if jump.free_symbols & places]
         return [jump for jump in jumps if not jump.free_symbols & moving]
 
     def second_derivatives(self, formula: Expr, axis: str) -> list[Symbol]:
@@ -120,16 +123,21 @@ class Density:
         """Names of the fields and momenta."""
         return (*self.fields, *self.momenta)
 
+    def _masses(self) -> dict[tuple[int, int], Expr]:
+        """Return the second derivatives by velocities that are not 0."""
+        momenta = {k: slope for (_, k), slope in jacobian([self.density], self.rates).items()}
+        return jacobian(momenta, self.rates, symmetric=True)
+
     @property
     def kinetic(self) -> Expr:
         """Kinetic part of the density."""
-        masses = hessian(self.density, self.rates)
+        masses = self._masses()
         return Add(*(masses[i, i] * rate**2 / 2 for i, rate in enumerate(self.rates)))
 
     @property
     def potential(self) -> Expr:
         """Density at zero velocities, minus the density of the potential energy."""
-        return evaluated(self.density, dict.fromkeys(self.rates, S.Zero))
+        return parse_expression(self.density, dict.fromkeys(self.rates, S.Zero))
 
 
 def derivatives_of(fields: Sequence[str], axes: Sequence[str]) -> dict[str, tuple[str, dict[str, int]]]:

@@ -27,13 +27,12 @@ from numpy.typing import NDArray
 from sympy import Add, Derivative, Eq, Expr, Function, S, Symbol
 from sympy.core.function import AppliedUndef
 
-from scvi_codegen.api.formulas import TIME, symbol
+from scvi_codegen.api.formulas import TIME, Tape, symbol
+from scvi_codegen.api.systems import MechanicalSystem
 from scvi_codegen.api.text import summary
 from scvi_codegen.common.errors import AccuracyWarning, StateError, StepFailedError, closest, warn
 from scvi_codegen.extras.fields.axes import NATURAL, PERIODIC, Axis
 from scvi_codegen.extras.fields.density import Density, place_text
-from scvi_codegen.systems.formulas.expressions import sums_to_zero
-from scvi_codegen.systems.formulas.translation import format_expression
 
 Variation = dict[str, Expr]
 
@@ -218,7 +217,7 @@ def shorter(formula: Expr) -> Expr:
 def vanishes(formula: Expr) -> bool:
     """Return whether an expression in functions and their derivatives is zero identically, by evaluation."""
     plain = sympy.expand(formula).xreplace(names_of(formula))
-    return sums_to_zero(Add.make_args(plain))
+    return Tape.cancels(Add.make_args(plain))
 
 
 def names_of(formula: Expr) -> dict[Expr, Symbol]:
@@ -426,9 +425,9 @@ class FieldDerivation:
 
     def _lines(self) -> Iterator[str]:
         letter, title = ("H", "Hamilton") if self.field_system.momenta else ("L", "Euler-Lagrange")
-        yield f"{self.field_system.name}: {letter} = {format_expression(self.field_system.density)}"
+        yield f"{self.field_system.name}: {letter} = {MechanicalSystem.formula_text(self.field_system.density)}"
         for place, formula in self.field_system.point_lagrangians:
-            yield f"  at {place_text(place)}: {format_expression(formula)}"
+            yield f"  at {place_text(place)}: {MechanicalSystem.formula_text(formula)}"
         yield ""
         yield f"{title} equations"
         for equation in self.equations.values():
@@ -479,4 +478,4 @@ def _semidiscrete(assembled: Any) -> dict[str, str]:
 
 
 def _written(formula: Expr) -> str:
-    return format_expression(formula.xreplace(names_of(formula)))
+    return MechanicalSystem.formula_text(formula.xreplace(names_of(formula)))

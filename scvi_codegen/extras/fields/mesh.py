@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import sympy
@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.api.formulas import TIME, symbol
 from scvi_codegen.api.methods import Method
+from scvi_codegen.api.program import Derivation
+from scvi_codegen.api.systems import ArraySystem
 from scvi_codegen.api.text import summary
-from scvi_codegen.codegen.lowering.arrays import one_coordinate
-from scvi_codegen.codegen.pipeline import program_of
 from scvi_codegen.common.errors import StateError, closest
 from scvi_codegen.extras.fields.axes import NATURAL, PERIODIC, Axis
 from scvi_codegen.extras.fields.density import Density
@@ -25,7 +25,8 @@ from scvi_codegen.extras.fields.laws import (
     local_law,
 )
 from scvi_codegen.methods import as_method
-from scvi_codegen.systems.formulas.array_statements import array_text
+from scvi_codegen.systems.hamiltonian import HamiltonianSystem
+from scvi_codegen.systems.lagrangian import LagrangianSystem
 
 Array = NDArray[np.float64]
 
@@ -77,7 +78,7 @@ class Mesh:
         density = self.field_system
 
         def end_text(end: Any) -> Any:
-            return NATURAL if end == NATURAL else {name: array_text(value) for name, value in end.items()}
+            return NATURAL if end == NATURAL else {name: ArraySystem.formula_text(value) for name, value in end.items()}
 
         boundary = {
             axis: PERIODIC if ends == PERIODIC else [*map(end_text, ends)] for axis, ends in density.boundary.items()
@@ -85,11 +86,14 @@ class Mesh:
         section: dict[str, Any] = {"name": density.name, "fields": [*density.fields]}
         section |= {"momenta": [*density.momenta]} if density.momenta else {}
         section |= {"space": {axis: [*ends] for axis, ends in density.space.items()}, "boundary": boundary}
-        section["hamiltonian" if density.momenta else "density"] = array_text(density.density)
-        section |= {} if density.dissipation == 0 else {"dissipation": array_text(density.dissipation)}
+        section["hamiltonian" if density.momenta else "density"] = ArraySystem.formula_text(density.density)
+        section |= {} if density.dissipation == 0 else {"dissipation": ArraySystem.formula_text(density.dissipation)}
         if density.point_lagrangians:
             section["scalars"] = [*density.scalars]
-            places = [{**place, "lagrangian": array_text(formula)} for place, formula in density.point_lagrangians]
+            places = [
+                {**place, "lagrangian": ArraySystem.formula_text(formula)}
+                for place, formula in density.point_lagrangians
+            ]
             section["point_lagrangians"] = places
         return {**section, "discretisation": _plain(self.discretisation)}
 
@@ -244,8 +248,10 @@ class Mesh:
             method: the method in time, or its name.
             parameters: as of :meth:`highest_frequency`.
         """
-        oscillator = one_coordinate(cast(Any, self.field_system))
-        program = program_of(oscillator, as_method(method, oscillator))
+        oscillator: Any = LagrangianSystem.from_text("oscillator", ["x"], "x_dot**2/2 - x**2/2")
+        if self.field_system.momenta:  # of no special form
+            oscillator = HamiltonianSystem.from_text("oscillator", ["x"], "(x**2 + p_x**2)**2")
+        program = Derivation(oscillator, as_method(method, oscillator)).program
         if program.splitting:
             phase = _stability_limit(*(program.splitting.numbers[name] for name in ("KICK", "DRIFT")))
         else:

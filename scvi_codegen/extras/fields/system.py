@@ -13,7 +13,8 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.api.checks import checks_arguments
-from scvi_codegen.api.formulas import TIME, parse_expression, symbol
+from scvi_codegen.api.formulas import TIME, check_names, parse_expression, symbol
+from scvi_codegen.api.systems import ArraySystem
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.extras.fields.assembly import Assembly
 from scvi_codegen.extras.fields.axes import NATURAL, PERIODIC, Axis, FiniteDifferences, Fourier, SpectralElements
@@ -21,8 +22,6 @@ from scvi_codegen.extras.fields.density import Density, derivatives_of
 from scvi_codegen.extras.fields.jumps import warn_of_jumps
 from scvi_codegen.extras.fields.laws import FieldDerivation, derivation_of
 from scvi_codegen.extras.fields.mesh import MeshSystem
-from scvi_codegen.systems.formulas.array_statements import array_text
-from scvi_codegen.systems.formulas.symbols import check_names, number
 
 CLAMPED = "clamped"
 MOST_AXES = 3
@@ -92,7 +91,7 @@ class FieldSystem(Density):
             raise SystemDefinitionError("give exactly one of density and hamiltonian")
         variables = (*fields, *momenta)
         _check_derivatives(text, variables, space, parameters or {})
-        values = {key: number(key, value) for key, value in (parameters or {}).items()}
+        values = {key: ArraySystem.parameter_value(key, value) for key, value in (parameters or {}).items()}
         _check_counts(space, fields, momenta, first_order=hamiltonian is not None)
         rates = [f"{field}_{TIME}" for field in fields if hamiltonian is None]
         derivatives = [*rates, *derivatives_of(variables, [*space])]
@@ -164,7 +163,7 @@ class FieldSystem(Density):
                 orders = {str(axis): int(order) for axis, order in derivative.variable_count}
                 letters = "".join(axis * orders.get(axis, 0) for axis in (*space, TIME))
                 names[derivative] = symbol(f"{derivative.expr.func}_{letters}")
-            return array_text(formula.xreplace(names))
+            return ArraySystem.formula_text(formula.xreplace(names))
 
         return cls.from_text(
             name,

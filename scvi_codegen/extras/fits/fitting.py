@@ -16,14 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.api.checks import checked_count, checks_arguments
-from scvi_codegen.api.runs import STEPPER
 from scvi_codegen.api.states import Array, real_array
 from scvi_codegen.api.text import summary
 from scvi_codegen.common.errors import AccuracyWarning, FitError, StateError, StepFailedError, closest, warn
 from scvi_codegen.extras.fits.measurements import Measurements, distinct, state_names
 from scvi_codegen.extras.fits.multiple_shooting import LOOSE, TIGHT, Chain, Limits, chained, joined
-from scvi_codegen.runs.driver.segments import checked_inputs
-from scvi_codegen.runs.states.validation import columns_of_inputs
 from scvi_codegen.runs.stepper import Stepper
 
 if TYPE_CHECKING:
@@ -109,7 +106,7 @@ class Fit:
         return ResidualPlot(self.t, self.residuals, self.deviations, self.observed)
 
 
-@checks_arguments(StateError, stepper=STEPPER)
+@checks_arguments(StateError, stepper=Stepper.KIND)
 def fit(
     stepper: Stepper,
     t: ArrayLike,
@@ -165,9 +162,7 @@ def fit(
     """
     stepper = stepper.bind(q, parameters)[0]._known_with_events
     q, p, velocity = stepper._states.start(q, p, velocity)
-    measurements = Measurements.checked(
-        stepper, t, measured, observed, deviations, start, h, checked_inputs(stepper.interface, inputs)
-    )
+    measurements = Measurements.checked(stepper, t, measured, observed, deviations, start, h, stepper.inputs_of(inputs))
     model = _Model.checked(measurements, q, p, velocity, parameters, unknown, fit_initial_state=fit_initial_state)
     if measurements.used.sum() < len(model.names):
         raise FitError(f"{int(measurements.used.sum())} measurements do not determine {len(model.names)} unknowns")
@@ -231,7 +226,7 @@ class _Model:
     ) -> _Model:
         """Construct from validated arguments of :func:`fit`."""
         stepper, m = measurements.stepper, measurements.stepper.dimension
-        fixed = columns_of_inputs(stepper.interface)
+        fixed = stepper.input_columns
         estimable = [name for k, name in enumerate(stepper.parameters) if k not in fixed]
         estimated = tuple(estimable) if unknown is None else distinct(unknown, "unknown")
         for name in estimated:

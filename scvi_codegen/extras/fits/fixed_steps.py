@@ -7,10 +7,6 @@ import numpy as np
 from scvi_codegen.api.states import Array, Fixed, Starts
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import EventError
-from scvi_codegen.runs.derivatives.gradients import forward
-from scvi_codegen.runs.results.recomputation import SAME_STEP_SIZE
-from scvi_codegen.runs.states.layout import InitialData
-from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.stepper import Stepper
 
 
@@ -47,20 +43,20 @@ def tangents_along(
         return np.concatenate([starts.q, starts.p], axis=1), vectors[..., :size], vectors[-1]
     states, vectors = np.empty((count + 1, size)), np.empty((count + 1, len(tangents), size))
     states[0], vectors[0] = state, tangents[:, :size]
-    others = np.flatnonzero(np.abs(np.diff(h)) > SAME_STEP_SIZE * np.abs(h[1:])) + 1
+    others = np.flatnonzero(np.abs(np.diff(h)) > Fixed.SAME * np.abs(h[1:])) + 1
     for first, last in pairwise([0, *others.tolist(), count]):
         length, start = float(h[first]), states[first]
         if size_variations is not None:
             tangents = np.concatenate([tangents[:, :-1], size_variations[first][:, np.newaxis]], axis=1)
-        initial = InitialData(start[:m], start[m:], None, float(t[first]), parameters, options)
-        run = stepper._started(initial, Fixed(length))
+        plan = Fixed(length)
+        run = stepper.run_by(plan, start[:m], start[m:], t=float(t[first]), parameters=parameters, options=options)
         trajectory = run._recorded(last - first)
-        ends = times_after(float(t[first]), length, np.arange(1, last - first + 1))[0]
+        ends = plan.times(float(t[first]), np.arange(1, last - first + 1))
         if trajectory.t[-1] < ends[-1] - 0.5 * length:
             raise EventError(f"events end the run at t = {trajectory.t[-1]:g}, before its last time {ends[-1]:g}")
-        rows = np.searchsorted(trajectory.t, ends + SAME_STEP_SIZE * length, side="right") - 1
+        rows = np.searchsorted(trajectory.t, ends + Fixed.SAME * length, side="right") - 1
         states[first + 1 : last + 1] = np.concatenate([trajectory.q, trajectory.p], axis=1)[rows]
         if len(tangents):  # derivatives of changes of the state are dear
-            part, tangents = forward(trajectory, tangents)
+            part, tangents = trajectory.tangents_at(tangents)
             vectors[first + 1 : last + 1] = part[rows].transpose(0, 2, 1)
     return states, vectors, tangents

@@ -9,17 +9,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.api.states import Array, checked_number, checked_step, real_array, require
+from scvi_codegen.api.states import Array, Fixed, checked_number, real_array
 from scvi_codegen.common.errors import StateError, closest
 from scvi_codegen.extras.fits.fixed_steps import tangents_along
-from scvi_codegen.runs.driver.segments import Input, parameters_of
-from scvi_codegen.runs.results.dense_output import checked_times
-from scvi_codegen.runs.states.rotation_quantities import observable_derivatives, observable_names, observables
-from scvi_codegen.runs.states.times import steps_within
 from scvi_codegen.runs.stepper import Stepper
 
 
@@ -41,7 +38,7 @@ class Measurements:
     observed: tuple[str, ...]
     columns: NDArray[np.intp]
     deviations: Array
-    inputs: Mapping[str, Input]
+    inputs: Mapping[str, Any]
     pieces: tuple[tuple[Array, Array], ...]
     step_numbers: NDArray[np.intp]
 
@@ -55,11 +52,13 @@ class Measurements:
         deviations: ArrayLike | None,
         start: float | None,
         h: float,
-        inputs: Mapping[str, Input],
+        inputs: Mapping[str, Any],
     ) -> Measurements:
         """Construct from validated arguments of :func:`~scvi_codegen.fit`."""
-        require(stepper, "fit")
-        times, values = checked_times(t, "t"), real_array(measured, "measured")
+        stepper.require("fit")
+        times, values = real_array(t, "t"), real_array(measured, "measured")
+        for time in times[~np.isfinite(times)]:
+            checked_number(float(time), "a value in t")
         if times.ndim != 1 or not len(times) or (np.diff(times) <= 0.0).any():
             raise StateError("t must be a one-dimensional array of ascending times")
         names = distinct(observed or stepper.coordinates, "observed")
@@ -77,7 +76,7 @@ class Measurements:
         first = float(times[0]) if start is None else checked_number(start, "the time start")
         if first > times[0]:
             raise StateError(f"start = {first:g} must not be after the first measurement, at t = {times[0]:g}")
-        pieces, step_numbers = _steps(first, times, checked_step(h), inputs)
+        pieces, step_numbers = _steps(first, times, Fixed.checked(h).h, inputs)
         columns = np.array([_column(stepper, name) for name in names])
         sizes = np.broadcast_to(sizes, (len(names),)).copy()
         return cls(stepper, times, first, values, names, columns, sizes, inputs, pieces, step_numbers)
@@ -122,7 +121,7 @@ class Measurements:
         values, derivatives = self._observed(state[np.newaxis], tangents[np.newaxis])  # where no step follows
         values, derivatives = np.tile(values, (len(self.t), 1)), np.tile(derivatives, (len(self.t), 1, 1))
         for t, h in self.pieces:
-            at = parameters_of(self.stepper, parameters, self.inputs)(float(t[0]) + 0.5 * float(h[0]))
+            at = self.stepper.parameters_at(float(t[0]) + 0.5 * float(h[0]), parameters, self.inputs)
             states, vectors, tangents = tangents_along(self.stepper, state, t, h, tangents, at)
             here = np.flatnonzero((self.step_numbers >= done) & (self.step_numbers <= done + len(h)))
             rows = self.step_numbers[here] - done
@@ -134,23 +133,21 @@ class Measurements:
         """Return the (n, c) measured quantities of states (n, 2m), and their (n, c, k) derivatives by vectors."""
         interface, size = self.stepper.interface, states.shape[1]
         if interface.rotations:
-            states, by_states = (
-                np.concatenate([states, observables(interface, states)], axis=1),
-                observable_derivatives(interface, states),
-            )
+            observed, by_states = self.stepper.observables(states)
+            states = np.concatenate([states, observed], axis=1)
             vectors = np.concatenate([vectors[..., :size], vectors[..., :size] @ by_states.swapaxes(1, 2)], axis=2)
         return states[:, self.columns], vectors[:, :, self.columns].transpose(0, 2, 1)
 
 
 def _steps(
-    start: float, t: Array, h: float, inputs: Mapping[str, Input]
+    start: float, t: Array, h: float, inputs: Mapping[str, Any]
 ) -> tuple[tuple[tuple[Array, Array], ...], NDArray[np.intp]]:
     """Return the steps to all times, split at breakpoints of inputs, and the number of steps up to each time."""
     breaks = np.concatenate([np.empty(0), *(data.breakpoints for data in inputs.values())])
     breaks = np.unique(breaks[(breaks > start) & (breaks < t[-1])])
     nodes = np.unique(np.concatenate([[start], t, breaks]))
     spans = np.diff(nodes)
-    counts = steps_within(spans, h)
+    counts = Fixed(h).number_in(spans)
     ends = np.concatenate([[0], np.cumsum(counts)])
     within = np.arange(ends[-1]) - np.repeat(ends[:-1], counts)
     lengths = np.repeat(spans / counts, counts)
@@ -174,7 +171,7 @@ def distinct(names: Sequence[str], kind: str) -> tuple[str, ...]:
 
 
 def _column(stepper: Stepper, name: str) -> int:
-    names = (*state_names(stepper), *observable_names(stepper.interface))
+    names = (*state_names(stepper), *stepper.observable_names)
     if name not in names:
         raise StateError(f"'{name}' cannot be observed{closest(name, names)} Possible: {', '.join(names[:99])}")
     return names.index(name)

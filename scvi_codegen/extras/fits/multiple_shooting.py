@@ -13,10 +13,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.api.states import Array, Reduction
+from scvi_codegen.api.states import Array
 from scvi_codegen.common.errors import EventError, FitError, StepFailedError
 from scvi_codegen.extras.fits.measurements import Measurements
-from scvi_codegen.runs.driver.segments import parameters_at
 
 LOOSE, TIGHT = 0.1, 1e-9
 """Jumps, relative to the size of states, that weigh as much as a measurement residual: initially, and finally."""
@@ -140,7 +139,7 @@ class Chain:
         if not stepper.interface.rotations or size - 1 not in self.unknown_indices:
             return np.zeros(0), np.zeros((0, len(x)))
         weight = GAUGE / min(float(part.deviations.min()) for part in self.parts)
-        values, rows = Reduction(stepper.interface).gauge(self.values(x)[:size], self.prior[:size])
+        values, rows = stepper.reduction.gauge(self.values(x)[:size], self.prior[:size])
         by_all = np.zeros((len(values), len(self.prior)))
         by_all[:, :size] = rows
         jacobian = np.zeros((len(values), len(x)))
@@ -180,7 +179,7 @@ def _node_states_from_measurements(whole: Measurements, parts: Sequence[Measurem
         return _node_states_from_guess(parts, prior)
     states = []
     for part in parts[1:]:
-        values = parameters_at(whole.stepper.interface.parameters, prior[2 * m :], whole.inputs, part.start)
+        values = whole.stepper.parameters_at(part.start, prior[2 * m :], whole.inputs)
         parabolas = [_parabola(whole, int(columns[0]), part.start) for columns in measured_columns]
         q, v = np.array(parabolas).T
         states.append(np.concatenate([q, whole.stepper.momentum(q, v, part.start, values)]))

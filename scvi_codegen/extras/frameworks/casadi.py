@@ -9,6 +9,7 @@ v and p, are CasADi functions, too.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,21 +21,15 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.api.checks import Kind, checked_count, checks_arguments
-from scvi_codegen.api.formulas import input_parameters, parse_expression, symbol
-from scvi_codegen.api.methods import Discretisation, Method, StageGroup, StageSystem
+from scvi_codegen.api.formulas import Intermediate, input_parameters, parse_expression, symbol
+from scvi_codegen.api.methods import Discretisation, Method, StageSystem
 from scvi_codegen.api.systems import MechanicalSystem, forms_of
-from scvi_codegen.codegen.native import building
 from scvi_codegen.common.errors import ArgumentError, MethodError, StateError, imported
 from scvi_codegen.extras.frameworks.flow import Flow
 from scvi_codegen.extras.frameworks.sources import casadi_name, with_casadi_flow
 from scvi_codegen.methods import as_method
-from scvi_codegen.methods.stage_system import Table, straight
+from scvi_codegen.methods.stage_system import Table
 from scvi_codegen.runs.stepper import Stepper
-from scvi_codegen.runs.stepping.features import warn_of_formulas
-from scvi_codegen.systems.formulas.expressions import CONSTANTS, FUNCTIONS
-from scvi_codegen.systems.formulas.intermediates import written_out
-from scvi_codegen.systems.formulas.symbols import PARTS
-from scvi_codegen.systems.system import SYSTEM
 
 FLOW_ARGUMENTS = ("q", "p", "parameters", "t", "h")
 
@@ -71,7 +66,7 @@ def casadi_flow(stepper: Stepper, *, steps: int, save_every: int | None = None, 
     ca = imported("casadi", "casadi")
     derivatives = flow.second_derivatives if hessian else flow.derivatives
     source = with_casadi_flow(derivatives, flow.steps, flow.spacing, second=hessian)
-    library = building.load(source, flags=stepper.flags)
+    library = stepper.library(source)
     name, m = casadi_name(source.prefix), stepper.dimension
     sizes = (m, m, len(stepper.interface.parameters), 1, 1)
     arguments = [ca.MX.sym(word, size) for word, size in zip(FLOW_ARGUMENTS, sizes, strict=True)]
@@ -160,26 +155,27 @@ def read(texts: Sequence[str], symbols: Sequence[Symbol]) -> list[Expr]:
 
 def numeric(ca: Any, expressions: Sequence[Expr], symbols: Sequence[Symbol]) -> Callable[..., list[Any]]:
     """Return expressions as a function of CasADi's symbols, with common subexpressions shared."""
-    names = {name: getattr(ca, name) for name in FUNCTIONS if hasattr(ca, name)}
+    applied = {type(part).__name__ for formula in expressions for part in formula.atoms(sympy.Function)}
+    names = {name: getattr(ca, name) for name in (*applied, "sqrt", "exp") if hasattr(ca, name)}
     names |= {"rint": lambda x: ca.floor(x + 0.5), "unit_step": lambda x: x >= 0}
-    constants = {name: float(value) for name, value in CONSTANTS.items()} | {"e": float(sympy.E)}
+    constants = {"pi": math.pi, "e": math.e}
     arguments: dict[str, Any] = {
         "modules": [names | constants],
         "cse": True,
         "dummify": True,
     }  # a symbol may be called e
-    plain = list(map(written_out, expressions))
+    plain = list(map(Intermediate.written_out, expressions))
     function: Callable[..., list[Any]] = sympy.lambdify(symbols, plain, **arguments)
     return function
 
 
 ARGUMENTS = ("q", "p", "stages", "inputs", "parameters", "t", "h")
 RESULTS = ("q1", "p1", "residual", "along", "integrals")
-HIGHEST = len(PARTS) - 2
+HIGHEST = 3
 """Highest degree of inputs within a step; compiled steps have cubics."""
 
 
-@checks_arguments(ArgumentError, system=SYSTEM, along=Kind.TEXTS)
+@checks_arguments(ArgumentError, system=MechanicalSystem.KIND, along=Kind.TEXTS)
 def casadi_step(
     system: MechanicalSystem, method: Method | str, *, degree: int = 0, along: Sequence[str] = (), solved: bool = False
 ) -> Any:
@@ -217,7 +213,7 @@ def casadi_step(
         raise MethodError(f"'{system.name}' is in transformed time: pass the original system")
     if checked_count(degree, "degree", least=0) > HIGHEST:
         raise MethodError(f"degree must be at most {HIGHEST} (polynomial inputs), not {degree}")
-    warn_of_formulas(system, "casadi_step or optimal_control")
+    Discretisation.warn_of_kinks(system, "casadi_step or optimal_control")
     stages = Discretisation(system, as_method(method, system)).equations
     written = _StageExpressions(ca, system, stages, degree)
     *rows, p1 = written.rows()
@@ -234,7 +230,7 @@ def _solved(ca: Any, ends: EndConditions, stages: StageSystem, step: Any) -> Any
     equations = {"x": unknowns, "p": ca.veccat(*symbols.values()), "g": step(**symbols, stages=unknowns)["residual"]}
     symbols_of = {name: ca.MX.sym(name, *argument.shape) for name, argument in symbols.items()}
     q, p, t, h, parameters = (symbols_of[name] for name in ("q", "p", "t", "h", "parameters"))
-    guess = ca.veccat(*straight(stages, q, ends.velocity(q, p, t, parameters), p, h))
+    guess = ca.veccat(*stages.straight(q, ends.velocity(q, p, t, parameters), p, h))
     solution = ca.rootfinder("stages", "newton", equations)(guess, ca.veccat(*symbols_of.values()))
     results = step(**symbols_of, stages=solution)
     names = [name for name in RESULTS if name != "residual"]
@@ -305,13 +301,13 @@ class _StageExpressions:
                 weights.append(float(weight))
         return self.ca.horzcat(*columns), self.ca.SX(weights)
 
-    def _kernel(self, group: StageGroup) -> Callable[..., list[Any]]:
+    def _kernel(self, group: Any) -> Callable[..., list[Any]]:
         """Return results as a function of arguments, time and parameters, inputs expanded at the point's time."""
         from_here = {symbol(f"{name}_t"): self.system.time for name in self.system.inputs}
         results = [result.xreplace(from_here) for result in group.results]
         return numeric(self.ca, results, (*group.arguments, self.system.time, *self.system.parameters))
 
-    def _arguments(self, group: StageGroup, n: int) -> list[Any]:
+    def _arguments(self, group: Any, n: int) -> list[Any]:
         parts = [self._gathered(g.table, n, power=g.power, scale=float(g.scale)) for g in group.gathers]
         return list(self.ca.vertsplit(self.ca.vertcat(*parts)))
 
@@ -332,7 +328,7 @@ class _StageExpressions:
         time = self._time(abscissa)
         values = dict(zip(own_parameters(self.system), self.ca.vertsplit(self.parameters), strict=True))
         for name, parts in zip(self.system.inputs, self._input_parts(float(abscissa)), strict=True):
-            values |= dict(zip((symbol(f"{name}_{part}") for part in PARTS), (*parts, time), strict=True))
+            values |= dict(zip(map(symbol, input_parameters([name])), (*parts, time), strict=True))
         return [time, *(values[name] for name in self.system.parameters)]
 
     def _input_parts(self, c: float) -> list[list[Any]]:

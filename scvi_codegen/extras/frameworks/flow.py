@@ -10,19 +10,15 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from textwrap import shorten
 from typing import Any, Self
 
 import numpy as np
 
 from scvi_codegen.api.checks import Kind, checked_count, checks_arguments
 from scvi_codegen.api.program import Source
-from scvi_codegen.api.states import check_inputs_given, require
-from scvi_codegen.api.text import clipped
-from scvi_codegen.codegen.native import building
-from scvi_codegen.codegen.native.binding import Binding
 from scvi_codegen.common.errors import StateError, imported
 from scvi_codegen.extras.frameworks.sources import XLA_PARTS, XLA_SECOND_ORDER, with_flow_of_rows, with_xla_flow
-from scvi_codegen.runs.states.validation import parameter_index
 from scvi_codegen.runs.stepper import Stepper
 
 
@@ -44,7 +40,7 @@ class Flow:
     @classmethod
     def checked(cls, stepper: Stepper, steps: int, save_every: int | None) -> Self:
         """Return a flow; MethodError without derivatives or fixed steps, StateError for invalid numbers of steps."""
-        require(stepper, "flow")
+        stepper.require("flow")
         stepper = stepper.known
         steps = checked_count(steps, "steps", least=1)
         if save_every is not None and steps % (save_every := checked_count(save_every, "save_every", least=1)):
@@ -57,7 +53,7 @@ class Flow:
         return (type(self), (self.stepper, self.steps, self.save_every))  # without cached libraries
 
     def __repr__(self) -> str:
-        return clipped(f"<{type(self).__name__} of {self.steps} steps: {self.stepper.title}>")
+        return shorten(f"<{type(self).__name__} of {self.steps} steps: {self.stepper.title}>", 100, placeholder="..")
 
     @property
     def spacing(self) -> int:
@@ -87,12 +83,12 @@ class Flow:
     def parameter_values(self, parameters: Any) -> Any:
         """Return all parameters in order as a list, or, unless passed by name, unchanged."""
         interface = self.stepper.interface
-        check_inputs_given(interface, parameters)
+        self.stepper.check_given(parameters)
         if parameters is not None and not isinstance(parameters, Mapping):
             return parameters
         values: list[Any] = list(interface.defaults)
         for name, value in (parameters or {}).items():
-            values[parameter_index(interface, name)] = value
+            values[interface.parameter_index(name)] = value
         return values
 
 
@@ -162,16 +158,16 @@ class FlowOfRows(Flow):
     """Flow with its compiled C functions."""
 
     @cached_property
-    def library(self) -> Binding:
+    def library(self) -> Any:
         """Values and derivatives, compiled on first use."""
         source = with_flow_of_rows(self.derivatives)
-        return Binding(building.load(source, flags=self.stepper.flags), source.prefix)
+        return self.stepper.compiled(source)
 
     @cached_property
-    def second_library(self) -> Binding:
+    def second_library(self) -> Any:
         """Values and derivatives up to second order, compiled on first use."""
         source = with_flow_of_rows(self.second_derivatives, second=True)
-        return Binding(building.load(source, flags=self.stepper.flags), source.prefix)
+        return self.stepper.compiled(source)
 
 
 _registered: set[str] = set()
@@ -235,10 +231,10 @@ class JaxFlow(ArrayFlow):
     def _registered(self, source: Source, parts: Sequence[str]) -> str:
         import jax
 
-        flags = (*self.stepper.flags, f"-I{jax.ffi.include_dir()}")
-        name = f"scvi_{building.fingerprint(source, flags=flags)}"
+        flags = [f"-I{jax.ffi.include_dir()}"]
+        name = f"scvi_{self.stepper.fingerprint(source, flags)}"
         if name not in _registered:
-            library = building.load(source, flags=flags)
+            library = self.stepper.library(source, flags)
             for part in parts:
                 function = getattr(library.lib, f"{source.prefix}_xla_{part}")
                 address = int(library.ffi.cast("uintptr_t", function))

@@ -21,8 +21,6 @@ from scvi_codegen.api.systems import MechanicalSystem
 from scvi_codegen.common.errors import ControlError, MethodError, StateError, closest, imported
 from scvi_codegen.extras.frameworks.casadi import EndConditions, casadi_step, own_parameters
 from scvi_codegen.methods import as_method
-from scvi_codegen.methods.stage_system import straight
-from scvi_codegen.systems.system import SYSTEM
 
 if TYPE_CHECKING:
     from scipy.interpolate import PPoly
@@ -236,7 +234,7 @@ class Task:
         stages = Discretisation(system, self.method).equations
         return {
             "states": np.concatenate([q, p]),
-            "stages": np.concatenate(straight(stages, q[:, :-1], np.diff(q) * n / duration, p[:, :-1], duration / n)),
+            "stages": np.concatenate(stages.straight(q[:, :-1], np.diff(q) * n / duration, p[:, :-1], duration / n)),
             "inputs": np.array([_resampled(name, guess.get(name, 0.0), spots / n) for name in system.inputs]),
             "velocities": v[:, [0, -1]],
             "duration": duration,
@@ -308,7 +306,7 @@ def _resampled(name: str, values: Any, times: Array) -> Array:
     )
 
 
-@checks_arguments(StateError, system=SYSTEM, start=Kind.MAPPING, end=Kind.MAPPING, bounds=Kind.MAPPING)
+@checks_arguments(StateError, system=MechanicalSystem.KIND, start=Kind.MAPPING, end=Kind.MAPPING, bounds=Kind.MAPPING)
 def optimal_control(
     system: MechanicalSystem,
     method: Method | str,

@@ -12,7 +12,6 @@ from typing import Any
 
 import torch
 
-from scvi_codegen.codegen.native.options import step_failure
 from scvi_codegen.common.errors import MethodError
 from scvi_codegen.extras.frameworks.flow import FlowOfRows
 
@@ -33,7 +32,7 @@ def _call(
         if status == NO_MEMORY:
             raise MemoryError("not enough memory for the states of a flow")
         if status:
-            raise step_failure(status, report, step=int(report.steps), h=0.0)
+            raise binding.failure(status, report, step=int(report.steps), h=0.0)
     return result
 
 

@@ -7,31 +7,28 @@ from typing import Any
 import click
 import numpy as np
 
-from scvi_codegen.api.commands import check_writable, model_arguments, read_model, reporting, tell, with_known_sizes
+from scvi_codegen.api.commands import check_writable, model_arguments, part, progress_bar, read_model, reporting, tell
 from scvi_codegen.api.text import counted
 from scvi_codegen.common.errors import ModelFileError
-from scvi_codegen.common.registry import part
 from scvi_codegen.extras.orbits import family as families
 from scvi_codegen.extras.orbits.continuation import Formula
 from scvi_codegen.extras.orbits.equilibrium import Equilibrium, equilibrium
 from scvi_codegen.extras.orbits.solver import PeriodicOrbit, periodic_orbit
 from scvi_codegen.extras.pictures.services import check_picture
-from scvi_codegen.interfaces.cli.recording import check_resumed
-from scvi_codegen.interfaces.cli.supervision import progress_bar
 from scvi_codegen.interfaces.models.model import Model
-from scvi_codegen.interfaces.models.model_files.document import document_of
-from scvi_codegen.interfaces.models.options import options_of
 from scvi_codegen.runs.stepper import Stepper
 
-OWN = tuple(option.name for option in options_of("family"))
 NAMES, COUNT = {"vary": "parameter", "stride": "step"}, 50
 """Arguments of the function with other names here, and the largest number of orbits."""
-OF_START = {"parameter", "q", "p", "velocity", "keyframe", "time", *OWN} - {"count", "until"}
+OF_START = (
+    *("parameter", "q", "p", "velocity", "keyframe", "time"),
+    *("amplitude", "mode", "period", "vary", "fixed", "reversor", "backward", "stride"),
+)
 """Options of the first orbit, which the file of a family contains."""
 
 
 @click.command()
-@model_arguments("solver", *OWN)
+@model_arguments("solver", "family")
 @click.option("--resume", type=click.Path(), metavar="FILE", help="Continue a family that -o wrote.")
 @click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Orbits: .npz.")
 @click.option("--plot", type=click.Path(), metavar="FILE", help="Plot (.png, .svg, .pdf).")
@@ -49,8 +46,7 @@ def family(model_name: str, resume: str | None, output: str | None, plot: str | 
       scvi-codegen family henon-heiles --q 0,0.9 --amplitude 0.01 --until 'energy > 0.2' -o family.npz
     """
     if resume is not None:
-        context = click.get_current_context()
-        check_resumed(context, {*context.params} - OF_START, "the file defines the family; give --count or --until")
+        _check_resumed(click.get_current_context())
     page = choices.pop("page")
     for target in (output, plot, page):
         if target is not None:
@@ -59,17 +55,24 @@ def family(model_name: str, resume: str | None, output: str | None, plot: str | 
         raise ModelFileError(f"orbits of a family are saved as .npz, not as '{output}'")
     if plot is not None:
         check_picture(plot)
-    model = with_known_sizes(read_model(model_name, choices), "family")
+    model = read_model(model_name, choices).with_known_sizes("family")
     with progress_bar(model.family.get("count", COUNT), "orbits") as progress:
         members = _members(model, resume, progress)
     tell(_described(members), **_numbers(members))
-    moving = part("services", "page_of")(model, document_of(model), {"family": members}) if page else members
+    moving = part("services", "page")(model, family=members) if page else members
     for target, write in ((output, members.save), (plot, members.plot), (page, moving.save)):
         if target is not None:
             write(target)
             tell(f"wrote {target}")
     if written := [target for target in (output, plot, page) if target]:
         tell(written=written)
+
+
+def _check_resumed(context: click.Context) -> None:
+    for name in OF_START:
+        if context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT:
+            defines = "the file defines the family; give --count or --until"
+            raise click.UsageError(f"--{name.replace('_', '-')} is not allowed with --resume: {defines}")
 
 
 def _members(model: Model, resume: str | None, progress: Callable[[int], None]) -> families.Family:

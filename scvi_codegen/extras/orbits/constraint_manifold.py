@@ -12,26 +12,25 @@ import numpy as np
 
 from scvi_codegen.api.states import Array, Reduction
 from scvi_codegen.common.errors import OrbitError, StateError
-from scvi_codegen.runs.stepping.integrator import Integrator
-from scvi_codegen.runs.stepping.projection import linearised, projected
+from scvi_codegen.runs.stepper import Stepper
 
 MOMENT = 2.0**-30
 """Part of a period in which a motion changes by rounding errors of its derivatives."""
 
 
-def reduction_of(stepper: Integrator, t: float, parameters: Array) -> Reduction:
+def reduction_of(stepper: Stepper, t: float, parameters: Array) -> Reduction:
     """Return the maps to the tangent spaces of a system without gauge directions and on its constraints."""
     if len(stepper.interface.constraints) == stepper.interface.masked:
-        return Reduction(stepper.interface)
+        return stepper.reduction
     return ConstraintManifold(stepper, t, parameters)
 
 
 class ConstraintManifold(Reduction):
     """Maps between tangent vectors of (q, p) and those of the constraint manifold at a time."""
 
-    def __init__(self, stepper: Integrator, t: float, parameters: Array) -> None:
+    def __init__(self, stepper: Stepper, t: float, parameters: Array) -> None:
         super().__init__(stepper.interface)
-        self.stepper, self.t, self.parameters, self.free = stepper, t, parameters, Reduction(stepper.interface)
+        self.stepper, self.t, self.parameters, self.free = stepper, t, parameters, stepper.reduction
         self.count = len(stepper.interface.constraints) - stepper.interface.masked
         self.size -= 2 * self.count
 
@@ -52,7 +51,7 @@ class ConstraintManifold(Reduction):
     def normalised(self, q: Array, p: Array) -> tuple[Array, Array]:
         """Return the nearest state on the constraints."""
         try:
-            return projected(self.stepper, *self.free.normalised(q, p), self.t, self.parameters)[:2]
+            return self.stepper.project(*self.free.normalised(q, p), t=self.t, parameters=self.parameters)
         except StateError as error:
             raise OrbitError(str(error)) from error
 
@@ -67,7 +66,7 @@ class ConstraintManifold(Reduction):
 
     def _jacobian(self, q: Array) -> Array:
         """Return G."""
-        return linearised(self.stepper, self.t, self.parameters)(q)[1][: self.count]
+        return self.stepper.constraint_jacobian(q, self.t, self.parameters)[: self.count]
 
     def _basis(self, q: Array, p: Array) -> Array:
         """Return the orthonormal basis B."""

@@ -31,9 +31,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.api.formulas import parse_expression, symbol
+from scvi_codegen.api.formulas import Tape, mp, parse_expression, symbol
 from scvi_codegen.api.runs import without_accuracy_warnings
-from scvi_codegen.api.states import RESOLVED, Array, roundoff
+from scvi_codegen.api.states import Array
 from scvi_codegen.common.errors import EventError, OrbitError, StepFailedError
 from scvi_codegen.extras.orbits.equilibrium import Equilibrium
 from scvi_codegen.extras.orbits.solver import (
@@ -50,7 +50,8 @@ from scvi_codegen.extras.orbits.solver import (
     block_diagonal,
 )
 from scvi_codegen.extras.orbits.step_sequence import StepSequence
-from scvi_codegen.systems.formulas.expressions import evaluate
+from scvi_codegen.extras.paths.size import ROUNDOFF
+from scvi_codegen.runs.stepper import Stepper
 
 MOST_CORRECTIONS, FEW_CORRECTIONS, CONTRACTION = 10, 4, 0.7
 """Newton iterations after which a prediction was too far, those up to which the next one may be farther, and the factor
@@ -105,7 +106,8 @@ class Formula:
 
     def __call__(self, values: Mapping[str, float]) -> float:
         """Return its value."""
-        return float(evaluate(self.expression, {self.symbols[name]: values[name] for name in self.symbols}).real)
+        numbers = [mp.mpf(values[name]) for name in self.symbols]
+        return float(Tape([self.expression], [*self.symbols.values()])(numbers)[0])
 
     def derivative(self, name: str) -> Formula:
         """Return its derivative by one of the names."""
@@ -579,9 +581,9 @@ class Continuation:
         effect = float(np.linalg.norm(column))
         if self.period_of is not None:
             effect += abs(self._period(search)[1]) * 2.0 * math.pi / float(z[-1])
-        if effect * abs(y[-1]) <= RESOLVED * roundoff(1):  # the orbit may stay, but not its multipliers
+        if effect * abs(y[-1]) <= Stepper.RESOLVED * ROUNDOFF:  # the orbit may stay, but not its multipliers
             unit = self._unit_of_multipliers(search, y, closing, effect)
-            effect = effect if effect * unit > RESOLVED * roundoff(1) else 1.0 / unit
+            effect = effect if effect * unit > Stepper.RESOLVED * ROUNDOFF else 1.0 / unit
         return replace(self, parameter_unit=1.0 / effect)
 
     def _unit_of_multipliers(self, search: OrbitSearch, y: Array, closing: ClosingEquations, effect: float) -> float:

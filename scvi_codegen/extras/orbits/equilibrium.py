@@ -15,14 +15,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.api.checks import checks_arguments
-from scvi_codegen.api.runs import STEPPER
-from scvi_codegen.api.states import RESOLVED, Array, Parameters, Reduction, require, roundoff
+from scvi_codegen.api.states import Array, Parameters, Reduction
 from scvi_codegen.api.text import summary
 from scvi_codegen.common.errors import OrbitError, StateError, StepFailedError
 from scvi_codegen.extras.fits.fixed_steps import tangents_along
 from scvi_codegen.extras.orbits.constraint_manifold import reduction_of
-from scvi_codegen.runs.events.saltation import check_sides
-from scvi_codegen.runs.states.validation import check_step_given
+from scvi_codegen.extras.paths.size import ROUNDOFF
 from scvi_codegen.runs.stepper import Stepper
 
 LEAST_CHANGE = 0.1
@@ -86,7 +84,7 @@ class Equilibrium:
         return bool((self.eigenvalues.real <= OSCILLATES * np.abs(self.eigenvalues).max()).all())
 
 
-@checks_arguments(StateError, stepper=STEPPER)
+@checks_arguments(StateError, stepper=Stepper.KIND)
 def equilibrium(stepper: Stepper, q: ArrayLike, *, t: float = 0.0, parameters: Parameters = None) -> Equilibrium:
     """Find the equilibrium near given positions by Newton's method, with the frequencies of its small oscillations.
 
@@ -101,8 +99,8 @@ def equilibrium(stepper: Stepper, q: ArrayLike, *, t: float = 0.0, parameters: P
         StateError: if a shape, name or number is invalid, or the equilibrium is at a kink, beside which motions differ.
     """
     stepper = stepper.bind(q, parameters)[0]._known_with_events
-    require(stepper, "periodic_orbit")
-    check_step_given(stepper.interface, parameters)
+    stepper.require("periodic_orbit")
+    stepper.check_given(parameters, step=True)
     values, rest = stepper._parameters(parameters), np.zeros(stepper.dimension)
     positions, _, velocity = stepper._states.start(q, None, rest)
     momenta = stepper._initial_momenta(positions, None, velocity, t, values)
@@ -123,14 +121,14 @@ def equilibrium(stepper: Stepper, q: ArrayLike, *, t: float = 0.0, parameters: P
         force = np.abs(balanced @ (change / units) + defect / units).max()  # in directions in which the system is free
         largest = max(largest, np.abs(defect / units).max())
         sizes = np.abs(reduction.outward(*np.split(state, 2))) @ np.abs(state) / units
-        at_rest = force <= max(SAME * largest, RESOLVED * roundoff(1) * sizes.max())
+        at_rest = force <= max(SAME * largest, Stepper.RESOLVED * ROUNDOFF * sizes.max())
         state = np.ravel(reduction.normalised(*np.split(state + reduction.inward(*np.split(state, 2)) @ change, 2)))
         # The derivative of the step, which the change of the state hardly changes, gives the scale of a small change.
         strength = np.abs(factors - 1).max()
         begun = begun or strength
         converged = np.abs(np.sort(factors) - np.sort(former)).max() <= SAME * strength
         if converged and at_rest and strength >= FLAT * begun:
-            check_sides(stepper, np.array([guess, state]), (t, t), motion.h, values)
+            stepper.check_sides(np.array([guess, state]), (t, t), motion.h, values)
             return motion.at_rest(state)
     raise OrbitError(
         f"no equilibrium of '{stepper.title}' was found near q = {np.asarray(q)}: {MOST_ITERATIONS} iterations did not "

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.api.checks import Kind, checked_count, checks_arguments
-from scvi_codegen.api.runs import STEPPER
-from scvi_codegen.api.states import Array, checked_number, require
+from scvi_codegen.api.runs import warnings_wanted
+from scvi_codegen.api.states import Array, checked_number
 from scvi_codegen.api.text import counted, summary, write_atomically
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import (
@@ -40,7 +40,6 @@ from scvi_codegen.extras.orbits.solver import (
     indices_of,
 )
 from scvi_codegen.extras.orbits.step_sequence import StepSequence
-from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runs.stepper import Stepper
 
 SAME_ORBIT = 1e-6
@@ -296,7 +295,7 @@ START = Kind.of("a periodic orbit or an equilibrium", PeriodicOrbit, Equilibrium
 UNTIL = Kind("a condition as text, or a function", lambda value: isinstance(value, str) or callable(value))
 
 
-@checks_arguments(StateError, stepper=STEPPER, start=START, mode=Kind.WHOLE)
+@checks_arguments(StateError, stepper=Stepper.KIND, start=START, mode=Kind.WHOLE)
 def family(
     stepper: Stepper,
     start: PeriodicOrbit | Equilibrium,
@@ -347,7 +346,7 @@ def family(
             orbit is found next to it.
         StateError: if a name or number is invalid.
     """
-    require(stepper, "periodic_orbit")
+    stepper.require("periodic_orbit")
     if start.stepper.interface != stepper.interface:
         raise StateError(f"the start is one of '{start.stepper.title}', not of '{stepper.title}'")
     if parameter is not None and parameter not in stepper.parameters:

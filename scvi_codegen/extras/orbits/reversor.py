@@ -11,14 +11,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import islice, product
+from itertools import chain, islice, product
 
 import numpy as np
 
-from scvi_codegen.api.formulas import parse_expression, symbol
+from scvi_codegen.api.formulas import Tape, mp, parse_expression, symbol
 from scvi_codegen.api.states import Array
 from scvi_codegen.common.errors import ScviCodegenError, StateError
-from scvi_codegen.systems.formulas.expressions import evaluate
 
 AT_ZERO = 1e-6
 """Positions and momenta, relative to the largest ones, below which they are those of a crossing of the fixed set, by
@@ -39,12 +38,12 @@ class Reversor:
         if len(texts) != len(coordinates):
             raise StateError(f"reversor has {len(texts)} formulas, not one of each coordinate {', '.join(coordinates)}")
         symbols = {name: symbol(name) for name in coordinates}
-        zero = dict.fromkeys(symbols.values(), 0.0)
         try:
             formulas = [parse_expression(text, symbols) for text in texts]
             slopes = [[formula.diff(symbols[name]) for name in coordinates] for formula in formulas]
-            shift = np.array([float(evaluate(formula, zero).real) for formula in formulas])
-            matrix = np.array([[float(evaluate(slope, zero).real) for slope in row] for row in slopes])
+            m, tape = len(formulas), Tape([*formulas, *chain.from_iterable(slopes)], [*symbols.values()])
+            values = np.array(tape([mp.zero] * m), float)
+            shift, matrix = values[:m], values[m:].reshape(m, m)
         except (ArithmeticError, ScviCodegenError) as error:
             raise StateError(f"reversor={list(texts)}: {error}") from error
         affine = not any(slope.free_symbols for row in slopes for slope in row)

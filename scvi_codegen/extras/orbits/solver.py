@@ -30,19 +30,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.api.checks import checked_count, checks_arguments
-from scvi_codegen.api.runs import STEPPER, without_accuracy_warnings
-from scvi_codegen.api.states import (
-    RESOLVED,
-    Array,
-    Fixed,
-    Parameters,
-    Reduction,
-    check_inputs_given,
-    checked_number,
-    checked_step,
-    require,
-    roundoff,
-)
+from scvi_codegen.api.runs import warnings_wanted, without_accuracy_warnings
+from scvi_codegen.api.states import Array, Fixed, Parameters, Reduction, checked_number
 from scvi_codegen.api.text import summary
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import (
@@ -60,13 +49,8 @@ from scvi_codegen.extras.fits.measurements import state_names
 from scvi_codegen.extras.orbits.constraint_manifold import reduction_of
 from scvi_codegen.extras.orbits.reversor import Reversor
 from scvi_codegen.extras.orbits.step_sequence import StepSequence
-from scvi_codegen.extras.paths.size import SizeOfMotion
-from scvi_codegen.runs.accuracy.run_error import LOST, finer_of, with_uncertainty
-from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
-from scvi_codegen.runs.states.layout import InitialData
-from scvi_codegen.runs.states.times import steps_within
+from scvi_codegen.extras.paths.size import ROUNDOFF, SizeOfMotion
 from scvi_codegen.runs.stepper import Stepper
-from scvi_codegen.runs.stepping.step_plan import ErrorControl
 from scvi_codegen.runs.trajectory import Trajectory
 
 SYMPLECTIC = 1e-9
@@ -127,7 +111,7 @@ class PeriodicOrbit:
         """Return start and period, with the uncertain digits in parentheses."""
         names, values = [*state_names(self.stepper), "period"], [*self.q, *self.p, self.period]
         rows = zip(names, values, self.errors.bounds, strict=True)
-        lines = [f"{name} = {with_uncertainty(value, bound)}" for name, value, bound in rows]
+        lines = [f"{name} = {Stepper.with_uncertainty(value, bound)}" for name, value, bound in rows]
         return "\n".join([*lines, f"relative error {self.error:.1e}", *filter(None, [self.errors.reason])])
 
     def run(self, *, save_every: int = 1) -> Trajectory:
@@ -160,7 +144,7 @@ class PeriodicOrbit:
         Raises:
             MethodError: if the stepper has no finer method (it was loaded without its system).
         """
-        finer = finer_of(self.stepper).with_events(self.stepper.events if self.stepper.changes_states else ())
+        finer = self.stepper.finer.with_events(self.stepper.events if self.stepper.changes_states else ())
         rest: dict[str, Any] = {"sequence": self.sequence, "fixed_indices": (), "energy": None, "options": self.options}
         exact = np.concatenate([self.q, self.p, [self.period]]) - np.nan_to_num(self.errors.signed)
         z, none = exact[:-1], np.zeros(len(self.q))
@@ -203,7 +187,7 @@ class PeriodicOrbit:
 
         matrix, (scales, _) = matrix_balance(self.monodromy, permute=False, separate=True)
         change = self.monodromy_error / scales[:, np.newaxis] * scales
-        epsilon = np.linalg.norm(change, 2) + len(self.sequence) * roundoff(1) * np.linalg.norm(matrix, 2)
+        epsilon = np.linalg.norm(change, 2) + len(self.sequence) * ROUNDOFF * np.linalg.norm(matrix, 2)
         circle = np.exp(2j * np.pi * np.arange(CIRCLE) / CIRCLE)[:, np.newaxis, np.newaxis] * np.eye(len(matrix))
 
         def radius(value: complex) -> float:
@@ -349,7 +333,7 @@ EQUILIBRIUM_MOTION = 1e-6
 """Ranges over a period, relative to the distance from the guess, below which an orbit counts as an equilibrium."""
 
 
-@checks_arguments(StateError, stepper=STEPPER)
+@checks_arguments(StateError, stepper=Stepper.KIND)
 def periodic_orbit(
     stepper: Stepper,
     q: ArrayLike,
@@ -415,17 +399,17 @@ def periodic_orbit(
     """
     stepper = stepper.bind(q, parameters)[0]._known_with_events
     q, p, velocity = stepper._states.start(q, p, velocity)
-    require(stepper, "periodic_orbit")
-    check_inputs_given(stepper.interface, parameters)
+    stepper.require("periodic_orbit")
+    stepper.check_given(parameters)
     if energy is not None:
-        require(stepper, "energy")
+        stepper.require("energy")
     if (period := checked_number(period, "the period")) <= 0.0:
         raise StateError(f"the period must be positive, not {period:g}")
-    sequence, limits = _equal_steps(period, steps, h), ErrorControl(max_step=max_step).checked()
-    if sequence is not None and limits:
+    sequence, largest = _equal_steps(period, steps, h), stepper.largest_step(max_step)
+    if sequence is not None and largest < math.inf:
         raise StateError(f"max_step={max_step:g} requires adaptive steps: omit it, or steps and h")
     if sequence is None:
-        require(stepper, "adaptive")
+        stepper.require("adaptive")
     t, values = checked_number(t, "the time t"), stepper._parameters(parameters)
     momenta = stepper._initial_momenta(q, p, velocity, t, values)
     start = np.concatenate(stepper._states.pair(q, momenta))
@@ -434,7 +418,7 @@ def periodic_orbit(
         start[: stepper.dimension],
         period=period,
         sequence=sequence,
-        max_step=limits.get("max_step", math.inf),
+        max_step=largest,
         fixed_indices=indices_of(stepper, fixed, fixed_period=fixed_period),
         energy=None if energy is None else checked_number(energy, "the energy"),
         **gains_of(stepper, gain),
@@ -492,7 +476,7 @@ def _equal_steps(period: float, steps: int | None, h: float | None) -> StepSeque
         )
     if steps is not None:
         return StepSequence.equal(checked_count(steps, "steps", least=1))
-    return None if h is None else StepSequence.equal(int(steps_within(period, checked_step(h))))
+    return None if h is None else StepSequence.equal(int(Fixed.checked(h).number_in(period)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -645,7 +629,7 @@ class OrbitSearch:
         """Return the orbit at the end of the iteration, after all checks; raise OrbitError if there is none."""
         m, motion, steps = self.stepper.dimension, equations.motion, self.of_reversor(None).steps
         sizes, reduced = equations.sizes, self.reduced_sizes(equations.sizes)
-        rounding = RESOLVED * roundoff(1) * float((np.abs(z[:-1]) / sizes).max())
+        rounding = Stepper.RESOLVED * ROUNDOFF * float((np.abs(z[:-1]) / sizes).max())
         scaled_norm = float(np.linalg.norm(equations.monodromy / reduced[:, np.newaxis] * reduced, 2))
         allowed = (CLOSED + rounding) * max(1.0, scaled_norm)
         if OPEN < equations.relative_error <= allowed:
@@ -686,7 +670,7 @@ class OrbitSearch:
         ranges, distances = (
             sizes.reshape(2, m).max(axis=1) for sizes in (np.ptp(motion.states, axis=0), abs(z - guess)[:-1])
         )
-        rounding = RESOLVED * roundoff(1) * np.abs(z[:m]).max()
+        rounding = Stepper.RESOLVED * ROUNDOFF * np.abs(z[:m]).max()
         at_rest = (ranges < EQUILIBRIUM_MOTION * distances).any() and not self.gain.any()  # momenta may be constant
         if at_rest or ranges[0] <= rounding:
             raise OrbitError(
@@ -770,8 +754,8 @@ class OrbitSearch:
         q, p = np.split(start, 2)
         forward_only = self.stepper.interface.contacts or any(event.changes for event in self.stepper.events)
         if self.steps.tolerance is None and not forward_only:
-            initial = InitialData(q, p, None, self.t, self.parameters, self.options)
-            run = self.stepper._started(initial, plan)
+            settings: dict[str, Any] = {"t": self.t, "parameters": self.parameters, "options": self.options}
+            run = self.stepper.run_by(plan, q, p, **settings)
             with suppress(EventError, StepFailedError):
                 motion, ends = run._recorded(steps), self.t + plan.h * np.arange(1, steps + 1)
                 rows = np.searchsorted(-motion.t, -ends + 0.5**30 * period, side="right") - 1
@@ -796,7 +780,7 @@ class OrbitSearch:
         if self.energy is None:
             return
         away, row = float(equations.defects[-1]), float(self.row_units(equations)[-1])
-        if not abs(away) <= allowed * row + RESOLVED * roundoff(1) * abs(self.energy):
+        if not abs(away) <= allowed * row + Stepper.RESOLVED * ROUNDOFF * abs(self.energy):
             raise OrbitError(
                 f"the periodic orbit near the guess has the energy {self.energy + away:.10g}, not {self.energy:.10g}: "
                 "fix fewer entries of the state, or give a better initial guess"
@@ -904,7 +888,7 @@ class OrbitSearch:
     def sizes_of(self, states: Array) -> Array:
         """Return the (2m,) sizes of positions and momenta along states, at least their rounding errors."""
         size = self._size_of(states)
-        least = (RESOLVED * rounding or LEAST_SIZE for rounding in size.rounding)
+        least = (Stepper.RESOLVED * rounding or LEAST_SIZE for rounding in size.rounding)
         return np.repeat(list(map(max, (size.position, size.momentum), least)), self.stepper.dimension)
 
     def closing_equations(self, z: Array) -> ClosingEquations:
@@ -1012,7 +996,7 @@ class OrbitSearch:
             run = self.stepper.integrate(*np.split(z[:-1], 2), **plan)
             error = run.error
         end, own = (np.concatenate([part.q[-1], part.p[-1]]) for part in (run, error))
-        if not (np.isfinite(own).all() and error.relative[-1] < LOST):
+        if not (np.isfinite(own).all() and error.lost is None):
             raise StateError(error.reason or "the run of a period has no meaningful digits at its end: take more steps")
         widths = np.concatenate([bounds[-1] for bounds in error.bounds]) - (np.abs(own) if error.signed else 0.0)
         return np.hstack([run.q, run.p]), end - own if error.signed else end, widths
@@ -1038,7 +1022,7 @@ class OrbitSearch:
             rounding = float(np.linalg.norm((defects[1:] - defects[0]) / size))
             growth = float(np.linalg.norm(equations.monodromy / size[:, np.newaxis] * size, 2))
             second = np.zeros(len(z))
-            if length * growth > math.sqrt(roundoff(1)):  # terms of the order of its square
+            if length * growth > math.sqrt(ROUNDOFF):  # terms of the order of its square
                 moved = self.moved(z, -errors)
                 remainder = closing(self._exact_end(moved)[1], moved)
                 left = float(np.linalg.norm(remainder / size))
@@ -1052,7 +1036,7 @@ class OrbitSearch:
             return math.inf, ErrorsOfOrbit.unknown(m, str(failure))
         bounds = np.abs(errors) + np.abs(second) + np.linalg.norm(changes - errors, axis=0)
         errors = errors + second
-        bounds += np.where(bounds > 0.0, roundoff(1) * np.abs(z), 0.0)  # fixed entries are exact
+        bounds += np.where(bounds > 0.0, ROUNDOFF * np.abs(z), 0.0)  # fixed entries are exact
         q, p = (float(part.max()) for part in np.split(bounds[:-1], 2))
         relative = max(float(bounds[-1]) / float(z[-1]), self._size_of(self._whole(states)).error(q, p))
         return relative, ErrorsOfOrbit(signed=errors, bounds=bounds)
@@ -1099,7 +1083,7 @@ class OrbitSearch:
             states = np.vstack([state + np.diag(widths), state - np.diag(widths)])
             values = self._integrals(states, np.full(2 * size, t))
             differences = values[:size] - values[size:]
-            rounding = roundoff(1) * np.abs(values).max(axis=0)
+            rounding = ROUNDOFF * np.abs(values).max(axis=0)
             if (CONSERVED * np.abs(differences).max(axis=0) >= rounding).all():
                 break
         return np.asarray(differences.T / (2.0 * widths))

@@ -6,10 +6,13 @@ from typing import Any
 import click
 
 from scvi_codegen.api.commands import check_writable, model_arguments, read_model, reporting, tell
-from scvi_codegen.extras.pages.page import page_of
-from scvi_codegen.interfaces.cli.model_options import sections_of
-from scvi_codegen.interfaces.models.model_files.document import document_of
-from scvi_codegen.interfaces.models.model_files.model_file import document_in
+from scvi_codegen.extras.pages.page import as_written, page_of, sections_of
+
+OF_FORMULAS = (
+    *("q", "p", "velocity", "time", "time_transformation"),
+    *("limits", "friction", "contacts", "actuators", "keyframe"),
+)
+"""Options that change the system and the initial state of a file."""
 
 
 @click.command()
@@ -38,7 +41,7 @@ def page(model_name: str, output: str, ranges: tuple[tuple[str, float, float], .
     """
     check_writable(Path(output), "'-o'")
     model = read_model(model_name, choices)
-    own = Path(model_name).is_file() and not {"initial", "system", "field"} & sections_of(choices).keys()
-    document = document_in(model_name) if own else document_of(model)
+    changed = any(choices.get(name) is not None for name in OF_FORMULAS)
+    document = as_written(model_name) if Path(model_name).is_file() and not changed else sections_of(model)
     page_of(model, document, {"ranges": {name: (low, high) for name, low, high in ranges}}).save(output)
     tell(f"wrote {output}", system=model.system.name, method=model.method.name, written=[output])

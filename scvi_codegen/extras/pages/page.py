@@ -12,6 +12,7 @@ import math
 import os
 import re
 import tempfile
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -23,14 +24,11 @@ import sympy
 
 from scvi_codegen.api.checks import Kind, checks_arguments
 from scvi_codegen.api.formulas import Rotation, RotationNames, input_parameters, parse_expression, symbol
-from scvi_codegen.api.program import Interface, Source
-from scvi_codegen.api.systems import SYSTEM_OR_ARRAYS, ArraySystem
-from scvi_codegen.api.text import summary, write_text
-from scvi_codegen.codegen.rendering.environment import template_environment
-from scvi_codegen.common.display.mathml import mathml_terms
+from scvi_codegen.api.program import Interface, Source, checked_integrator
+from scvi_codegen.api.systems import ArraySystem, MechanicalSystem
+from scvi_codegen.api.text import Typeset, summary, write_text
 from scvi_codegen.common.errors import ArgumentError, ExpressionError, MethodError, StateError, closest
-from scvi_codegen.common.validation import keyword_hint
-from scvi_codegen.extras.derivation.writing import mathematics_font
+from scvi_codegen.extras.derivation.writing import mathematics_font, plain_template
 from scvi_codegen.extras.orbits.family import Family
 from scvi_codegen.extras.orbits.picture import sizes_of
 from scvi_codegen.extras.orbits.solver import ERROR, PeriodicOrbit
@@ -38,15 +36,8 @@ from scvi_codegen.extras.pages.section import check_page, check_picture, drawn_s
 from scvi_codegen.extras.pages.webassembly import LICENCES, check_compiler, webassembly
 from scvi_codegen.extras.pictures.recognition import shape_of
 from scvi_codegen.extras.pictures.shape import DrawnSystem, shape_of_picture
-from scvi_codegen.interfaces.models.model import DEFAULT_METHOD, Model
-from scvi_codegen.interfaces.models.model_files.document import document_of
-from scvi_codegen.interfaces.models.model_files.model_file import document_in, load_model
-from scvi_codegen.interfaces.models.options import FURTHER
-from scvi_codegen.interfaces.models.packages.example import absolute_tolerances_of, check_example
-from scvi_codegen.interfaces.models.packages.package import integrator_of
-from scvi_codegen.runs.stepping.array_interface import read_arrays
-from scvi_codegen.runs.stepping.noise import Noise
-from scvi_codegen.systems.formulas.rotations import Spin
+from scvi_codegen.interfaces.models.model import Model
+from scvi_codegen.interfaces.models.model_files.model_file import load_model
 from scvi_codegen.version import __version__
 
 CAUSES = (
@@ -86,7 +77,7 @@ WHOLE = 24
 FAMILY = Kind.of("a family of periodic orbits, of scvi_codegen.family", Family)
 MODEL = Kind(
     "a Model, a system or the path of a model file",
-    lambda value: isinstance(value, Model | str | os.PathLike) or SYSTEM_OR_ARRAYS.accepts(value),
+    lambda value: isinstance(value, Model | str | os.PathLike) or MechanicalSystem.OR_ARRAYS.accepts(value),
 )
 
 
@@ -138,30 +129,41 @@ def page(
     """
     arguments = {"ranges": ranges, "speed": speed, "plots": plots, "picture": picture, "family": family}
     settings = {name: value for name, value in arguments.items() if value is not None}
-    if SYSTEM_OR_ARRAYS.accepts(model):
+    if MechanicalSystem.OR_ARRAYS.accepts(model):
         if family is not None:
             _check_names(model)
         model = _model_of(model, motion if family is None else {"q": family[0].q, "p": family[0].p, **motion})
     elif motion:
         raise ArgumentError(f"page() takes {', '.join(motion)} for a system alone: change them in the model")
     if isinstance(model, Model):
-        return page_of(model, document_of(model), settings)
-    return page_of(load_model(model), document_in(model), settings)
+        return page_of(model, sections_of(model), settings)
+    return page_of(load_model(model), as_written(model), settings)
+
+
+def sections_of(model: Model) -> Mapping[str, Any]:
+    """Return the sections of a model file with the density, or with L or H as the system was read from."""
+    if model.system.mesh is not None:
+        return {"field": model.system.mesh.to_section()}
+    system = model.system.clock.plain if model.system.clock and model.system.clock.plain else model.system
+    kind = "hamiltonian" if system.auxiliaries else "lagrangian"
+    return {"system": {kind: system.definition.get(kind) or system.text_of(system.formula)}}
+
+
+def as_written(path: str | os.PathLike[str]) -> Mapping[str, Any]:
+    """Return the sections of a model file that was read before; none of a robot's file."""
+    is_robot = Path(path).suffix.lower() in (".urdf", ".xml", ".mjcf")
+    return {} if is_robot else tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
 
 
 def _model_of(system: Any, motion: Mapping[str, Any]) -> Model:
     """Return the model of a system with the arguments of its motion."""
-    accepted = [name for name in Model.__dataclass_fields__ if name not in ("system", *FURTHER)]
-    for name in motion:
-        if name not in accepted:
-            raise ArgumentError(f"page() takes no {name!r}{keyword_hint(name, accepted)}")
     if "q" not in motion:
         raise ArgumentError(f"a page of the system {system.name} requires its initial state: give q, and velocity or p")
-    arguments: dict[str, Any] = {"system": system, "method": DEFAULT_METHOD, **motion}
+    arguments = dict(motion)
     if "steps" not in motion:
         h = abs(motion.get("h") or 1.0)
         arguments.setdefault("span", float(SECONDS) if 1e-3 <= h <= 1.0 else STEPS * h)
-    return Model(**arguments)
+    return Model.of_arguments("page", system, arguments)
 
 
 def page_of(model: Model, document: Mapping[str, Any], settings: Mapping[str, Any]) -> Page:
@@ -169,7 +171,7 @@ def page_of(model: Model, document: Mapping[str, Any], settings: Mapping[str, An
 
     Args:
         model: with the settings of its file.
-        document: sections of the file.
+        document: sections of the file, or of :func:`sections_of`.
         settings: ranges, speed, plots and the picture, which replace those of the file, and the family of orbits.
     """
     settings = dict(settings)
@@ -285,7 +287,7 @@ class Page:
         if model.array_system is not None:  # entries have no names
             interface = replace(interface, coordinates=(), conserves_energy=not model.array_system.changes_energy)
         description = _description(self, interface, initial=bool(initial))
-        text = template_environment().get_template("page/page.html.jinja").render(
+        text = plain_template("page/page.html.jinja").render(
             title=html.escape(interface.system), method=html.escape(interface.title.split(": ", 1)[-1]),
             version=__version__, licences=LICENCES, lagrangian=_lagrangian(document, model), font=mathematics_font(),
             description=json.dumps(description, separators=(",", ":")).replace("<", "\\u003c"), wasm=code,
@@ -306,9 +308,7 @@ class Page:
 
 def _integrator(model: Model) -> tuple[Source, Interface]:
     """Return the C of the integrator, and its interface; of arrays without conserved quantities."""
-    source, interface = integrator_of(model, PREFIX)
-    source = source.readable()
-    check_example(model, controlled="advance_to" in source.contents.functions)
+    source, interface = checked_integrator(model, PREFIX)
     if model.array_system is not None:
         interface = replace(interface, momentum_names=(), map_names=(), constraints=())
     return source, interface
@@ -320,27 +320,27 @@ def _entry(model: Model, interface: Interface, initial: Sequence[str], adaptive:
     numbers = [*_values(model, interface).values()]
     sizes, tables = list[int](), dict[str, list[int]]()
     if model.array_system is not None:
-        arrays = read_arrays(interface, model.q, model.fields, model.tables)
+        arrays = model.arrays(interface)
         sizes = [arrays.sizes[name] for name in interface.layout.sizes]
         numbers += [x for values in arrays.fields.values() for x in values.ravel().tolist()]
         tables = {name: places.ravel().tolist() for name, places in arrays.places.items()}
+    if model.system.bath:
+        model.start()  # checks the seed and the rule of Metropolis
     events = interface.searched(model.events)
     axes = {name: np.ravel(nodes).tolist() for name, nodes in model.mesh.points.items()} if model.mesh else {}
     return (
-        template_environment()
-        .get_template("page/entry.c.jinja")
-        .render(
+        plain_template("page/entry.c.jinja").render(
             array=model.array_system is not None, m=size, capacity=256 if size < 64 else 16,
             maps=len(interface.map_names), values=map(repr, numbers), sizes=sizes, tables=tables,
             constraints=interface.constraints, adaptive=adaptive, initial=initial,
             transformed=model.time_transformation is not None,
             max_step=model.max_step or abs(float(model.end - model.t)),
             first_step=model.first_step,
-            absolute_tolerances=absolute_tolerances_of(model, interface), events=events,
+            absolute_tolerances=model.absolute_tolerances(interface), events=events,
             acting=any(event.changes_state for event in events), contacts=interface.contacts, modes=interface.modes,
             velocities=not starts_from_momenta(model),
             level=interface.energy_index if interface.in_tau else None,
-            noise=Noise.checked(model.stepper(), model.seed, model.metropolis) if model.system.bath else None,
+            noise=model if model.system.bath else None,
             axes={f"at_{name}": nodes for name, nodes in axes.items()},
             names={f"at_{name}": k for k, name in enumerate(interface.parameters)},
         )
@@ -387,7 +387,7 @@ def _lagrangian(document: Mapping[str, Any], model: Model) -> list[str]:
     except ExpressionError:
         return []
     name = sympy.Symbol("H" if "hamiltonian" in source else "L")
-    return [] if LONG_NUMBER.search(str(density)) else list(mathml_terms(density, name))
+    return [] if LONG_NUMBER.search(str(density)) else list(Typeset.terms(density, name))
 
 
 def _flat(state: Any) -> list[float]:
@@ -497,7 +497,7 @@ def _rotations(interface: Interface) -> list[dict[str, Any]]:
             "rates": [rate.name for rate in member.rates] if isinstance(member, Rotation) else [],
         }
         for member in RotationNames.members_of(interface.rotations)
-        if isinstance(member, Rotation | Spin)
+        if not member.declaration.startswith("direction")
     ]
 
 

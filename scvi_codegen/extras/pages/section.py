@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from scvi_codegen.api.commands import ModelSection
 from scvi_codegen.common.errors import ModelFileError
 from scvi_codegen.extras.pictures.shape import MARKS, DrawnSystem, entry_names, shape_of_picture
 from scvi_codegen.interfaces.models.model import Model
-from scvi_codegen.interfaces.models.model_files.sections import ModelSection, Section, check_keys
-from scvi_codegen.interfaces.models.options import real
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
 
 PAGE_KEYS = ("ranges", "speed", "plots")
@@ -39,25 +39,25 @@ def slider_names(model: Model) -> list[str]:
     return [*names, *free, *(f"{name}_dot" for name in free)]
 
 
-def check_page(section: Section, model: Model, where: str = "[page]") -> None:
+def check_page(section: Mapping[str, Any], model: Model, where: str = "[page]") -> None:
     """Raise ModelFileError for unknown keys and sliders, and values of the wrong form.
 
     A range need not contain the value of its parameter, which options of the command line change, and names of plots
     are known when the page is made: see :func:`scvi_codegen.page`.
     """
-    check_keys(section, PAGE_KEYS, "key", where)
+    ModelSection.check_keys(section, PAGE_KEYS, "key", where)
     ranges = section.get("ranges", {})
     if not isinstance(ranges, dict):
         raise ModelFileError(f"{where} ranges must be a table, {{ v = [0.1, 0.9] }}, not {ranges!r}")
-    check_keys(ranges, slider_names(model), "slider", f"{where} ranges")
+    ModelSection.check_keys(ranges, slider_names(model), "slider", f"{where} ranges")
     for name, limits in ranges.items():
         place = f"{where} ranges {name}"
         if not isinstance(limits, list | tuple) or len(limits) != 2:
             raise ModelFileError(f"{place} must be two numbers, [lowest, highest], not {limits!r}")
-        low, high = (real(limit, place) for limit in limits)
+        low, high = (ModelSection.real(limit, place) for limit in limits)
         if not low < high:
             raise ModelFileError(f"{place} is {low:g} .. {high:g}: the first number must be less than the second")
-    if real(section.get("speed", 1.0), f"{where} speed") <= 0:
+    if ModelSection.real(section.get("speed", 1.0), f"{where} speed") <= 0:
         raise ModelFileError(f"{where} speed is {section['speed']:g}: it must be positive")
     plots: Any = section.get("plots", [])
     if not isinstance(plots, list | tuple) or not all(map(_is_pair_of_names, plots)):

@@ -6,12 +6,12 @@ import base64
 import gzip
 import importlib.metadata
 import importlib.util
+import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
-from scvi_codegen.api.text import announced
-from scvi_codegen.codegen.native.building import run_compiler
-from scvi_codegen.common.cache import cached_source
+from scvi_codegen.api.text import announced, cached_source
 from scvi_codegen.common.errors import BuildError
 
 FLAGS = (
@@ -51,6 +51,14 @@ def check_compiler() -> None:
     """Raise ``BuildError`` without the extra ``compiler``."""
     if importlib.util.find_spec("ziglang") is None:
         raise BuildError("a page requires a compiler to WebAssembly: pip install 'scvi-codegen[compiler]' (ziglang)")
+
+
+def run_compiler(command: Sequence[str], folder: Path) -> None:
+    """Run a compiler in a folder; raise ``BuildError`` with its first messages if it fails."""
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    if done.returncode:
+        lines = "\n".join(done.stderr.splitlines()[:30])
+        raise BuildError(f"the compiler to WebAssembly rejected the source\n{' '.join(command)}\n{lines}")
 
 
 def webassembly(folder: Path, sources: tuple[str, ...]) -> str:

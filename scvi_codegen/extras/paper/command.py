@@ -1,6 +1,5 @@
 """Command ``scvi-codegen reproduce``: run experiments of the paper, write their files and print the verdicts."""
 
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
@@ -9,12 +8,11 @@ from typing import Any, TypeAlias
 
 import click
 
-from scvi_codegen.api.commands import check_writable, reporting, tell
+from scvi_codegen.api.commands import check_writable, progress_bar, reporting, tell
 from scvi_codegen.api.text import counted, write_text
 from scvi_codegen.extras.paper.experiment import Experiment, Result, report_html, tally, write_result
 from scvi_codegen.extras.paper.runner import CATALOGUE, Failure, Watch, catalogue, run_experiments, with_needs
 from scvi_codegen.extras.pictures.canvas import check_plot_path
-from scvi_codegen.interfaces.cli.command_group import INTERRUPTED, CommandFailure, is_quiet
 
 EVERYTHING = "all"
 Report: TypeAlias = Callable[[str], None]
@@ -60,9 +58,9 @@ def reproduce(names: tuple[str, ...], output: str, html: str | None, jobs: int |
     done = reproduce_experiments(names, folder, Path(html) if html is not None else None, jobs, report=tell)
     tell(f"\n{done.summary()}" if done.files else "", **done.numbers())
     if done.interrupted:
-        raise CommandFailure("interrupted; files written before remain", INTERRUPTED)
+        raise KeyboardInterrupt("interrupted; files written before remain")
     if done.failures:
-        raise CommandFailure(done.failed())
+        raise click.ClickException(done.failed())
 
 
 @dataclass(kw_only=True)
@@ -168,21 +166,20 @@ def _add(done: Reproduction, outcome: Result | Failure, folder: Path) -> str:
 @contextmanager
 def _progress(length: int, report: Report) -> Iterator[tuple[Watch, Report]]:
     """Show a bar on stderr if that is a terminal; yield functions that show names, and print a line above it."""
-    if not sys.stderr.isatty() or not length or is_quiet():
-        yield lambda names: None, report
-        return
+    done = 0
 
     def show(names: Sequence[str]) -> None:
         text = ", ".join(names)
-        bar.current_item = text if len(text) <= SHOWN_NAMES else text[: SHOWN_NAMES - 2] + ".."
-        bar.render_progress()
+        bar(done, text if len(text) <= SHOWN_NAMES else text[: SHOWN_NAMES - 2] + "..")
 
     def report_above(line: str) -> None:
-        click.echo("\r\x1b[K", nl=False, err=True)
+        nonlocal done
+        if is_shown:
+            click.echo("\r\x1b[K", nl=False, err=True)
         report(line)
-        bar.update(1)
+        done += 1
+        bar(done)
 
-    with click.progressbar(
-        length=length, label="reproducing", show_eta=False, item_show_func=lambda item: item, file=sys.stderr
-    ) as bar:
+    with progress_bar(length, "reproducing") as bar:
+        is_shown = bar(0)
         yield show, report_above

@@ -8,7 +8,7 @@ import numpy as np
 import sympy
 
 from scvi_codegen.api.methods import Method
-from scvi_codegen.common.display.tables import TableBlock
+from scvi_codegen.api.text import TableBlock
 from scvi_codegen.extras.derivation.equations import derive
 from scvi_codegen.extras.paper.experiment import Comparison, Experiment, Panel, Picture, Result, Series, comparison
 from scvi_codegen.extras.paper.runs import KEPLER, ROUNDOFF, MeasuredRun, RunSetting, Scheme, exact_kepler, largest

@@ -12,6 +12,7 @@ import csv
 import io
 import re
 import textwrap
+import tomllib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,9 +24,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.api.text import write_atomically
-from scvi_codegen.common.display.tables import TableBlock
-from scvi_codegen.common.toml_text import package_table
+from scvi_codegen.api.text import TableBlock, write_atomically
 from scvi_codegen.extras.derivation.writing import SPACE, page_template, style_sheet
 from scvi_codegen.extras.pictures.canvas import STYLE as TRAJECTORY_STYLE
 from scvi_codegen.extras.pictures.canvas import write_figure
@@ -134,7 +133,13 @@ class Experiment:
         return replace(result, name=self.name, title=result.title or self.title)
 
 
-CLAIMS: Mapping[str, str] = package_table("extras/paper/paper.toml")["claims"]
+def package_table(name: str) -> dict[str, Any]:
+    """Return the document in a file of this folder."""
+    table: dict[str, Any] = tomllib.loads(Path(__file__).with_name(name).read_text(encoding="utf-8"))
+    return table
+
+
+CLAIMS: Mapping[str, str] = package_table("paper.toml")["claims"]
 """Claims by the keys that checks name in ``bears_on``."""
 
 EVIDENCE = ("figure-1", *(f"figure-{k}" for k in range(3, 31)), "table-8", "table-9", "correction")

@@ -13,19 +13,18 @@ from functools import lru_cache, partial
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from scipy.interpolate import BarycentricInterpolator
 
-from scvi_codegen.common.display.tables import TableBlock
-from scvi_codegen.common.toml_text import package_table
-from scvi_codegen.extras.paper.experiment import Array, Comparison, Experiment, Result, comparison
+from scvi_codegen.api.text import TableBlock
+from scvi_codegen.extras.paper.experiment import Array, Comparison, Experiment, Result, comparison, package_table
 from scvi_codegen.extras.paper.runs import SECTION_3, perihelion
-from scvi_codegen.methods.tables.basis import cardinal_derivatives, cardinal_values, differentiation_matrix
 from scvi_codegen.methods.tables.nodes import chebyshev_lobatto
 from scvi_codegen.methods.tables.quadrature import gauss_legendre
 
 SPAN = 100.0
 ECCENTRICITY: Mapping[int, float] = {8: 0.2, 9: 0.5}
 COLUMNS = tuple((n, scheme) for n in (2, 5, 10, 15, 20) for scheme in ("SC", "SVI"))
-PRINTED: Mapping[str, Mapping[str, str]] = package_table("extras/paper/paper.toml")["iterations"]
+PRINTED: Mapping[str, Mapping[str, str]] = package_table("paper.toml")["iterations"]
 """Counts by table and h: max/total for each of :data:`COLUMNS`; a dash where the paper has none."""
 AS_PRINTED = 0.9
 """Least share of cells that converge or fail as printed for a table to count as reproduced."""
@@ -54,12 +53,14 @@ class Equations:
 def equations_of(scheme: str, degree: int, points: int) -> Equations:
     """Return (18), A^2 Q = F(Q) - a0 v0 - (A a0) q0, or (30), the first s rows of the stiffness (29) solved for Q."""
     nodes, rule = chebyshev_lobatto(degree).points, gauss_legendre(points)
-    c = (_array([nodes])[0, 1:] + 1.0) / 2.0
+    points_of_nodes, points = _array([nodes])[0], _array([rule.points])[0]
+    at = BarycentricInterpolator(points_of_nodes, np.eye(degree + 1))  # cardinal functions
+    c = (points_of_nodes[1:] + 1.0) / 2.0
     if scheme == "SC":
-        inverse = np.linalg.inv(2.0 * _array(differentiation_matrix(nodes))[1:, 1:])
+        inverse = np.linalg.inv(2.0 * at.derivative(points_of_nodes)[1:, 1:])
         return Equations(c, np.eye(degree + 1)[1:], inverse @ inverse, inverse[-1])
     weights = _array([rule.weights])[0] / 2.0
-    values, derivatives = (_array(table(nodes, rule.points)) for table in (cardinal_values, cardinal_derivatives))
+    values, derivatives = at(points), at.derivative(points)
     stiffness = 4.0 * (derivatives.T * weights) @ derivatives
     return Equations(c, values, -np.linalg.solve(stiffness[:-1, 1:], (values.T * weights)[:-1]), weights)
 

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from scvi_codegen.api.formulas import Number, mp
 from scvi_codegen.api.methods import Method
 from scvi_codegen.api.systems import MechanicalSystem
-from scvi_codegen.common.display.tables import Cell, TableBlock
+from scvi_codegen.api.text import TableBlock
 from scvi_codegen.common.errors import StepFailedError
-from scvi_codegen.common.toml_text import package_table
 from scvi_codegen.extras.exact.step import derived_step
 from scvi_codegen.extras.paper.experiment import (
     Array,
@@ -31,6 +30,7 @@ from scvi_codegen.extras.paper.experiment import (
     Result,
     Series,
     comparison,
+    package_table,
 )
 from scvi_codegen.extras.paper.runs import KEPLER, ROUNDOFF, stepper_of, system_of
 from scvi_codegen.methods import SVI, SpectralCollocation
@@ -232,7 +232,7 @@ def refinement(name: str, title: str, study: Study) -> Experiment:
         curves = study.curves()
         checks = _point_checks(study, curves) if study.degrees else _step_checks(study, curves)
         picture = Picture(panels=tuple(_panels(study, curves)), columns=len(study.cases), size=(4.5, 4.0))
-        none, rows = (None, None), list[tuple[Cell, ...]]()
+        none, rows = (None, None), list[tuple[Any, ...]]()
         for c in curves:
             rows.append((c.case.title, c.scheme, c.n, c.what, *(c.law or none), *(study.printed(c) or none)))
         table = TableBlock(columns=COLUMNS, rows=tuple(rows), formats=dict.fromkeys(COLUMNS[4:], ".2g"))
@@ -402,5 +402,5 @@ def _figure(name: str, title: str, study: str, **changes: Any) -> Experiment:
     return refinement(name, title, _study(study, **changes))
 
 
-_TABLES = package_table("extras/paper/refinement.toml")
+_TABLES = package_table("refinement.toml")
 EXPERIMENTS = tuple(_figure(name, **table) for name, table in _TABLES.items() if name != "studies")

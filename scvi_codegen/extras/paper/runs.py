@@ -19,13 +19,11 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.api.methods import Method, method_from_specification
+from scvi_codegen.api.methods import Method
 from scvi_codegen.api.systems import MechanicalSystem
-from scvi_codegen.codegen.native.building import PORTABLE_FLAGS
+from scvi_codegen.api.text import TableBlock
 from scvi_codegen.codegen.native.options import SolverOptions
-from scvi_codegen.common.display.tables import TableBlock
 from scvi_codegen.common.errors import MethodWarning, StepFailedError
-from scvi_codegen.common.toml_text import package_table
 from scvi_codegen.extras.paper.experiment import (
     Array,
     Comparison,
@@ -36,6 +34,7 @@ from scvi_codegen.extras.paper.experiment import (
     Series,
     comparison,
     largest_in_bins,
+    package_table,
     thinned,
 )
 from scvi_codegen.interfaces.models.problems import problem
@@ -51,6 +50,9 @@ NO_DRIFT = 1e-12
 """Largest error that counts as round-off."""
 PERIOD = 2.0 * math.pi
 """Period of Kepler's problem with semi-major axis 1."""
+
+PORTABLE_FLAGS = ("-O2", "-ffp-contract=off")
+"""Flags of code that gives the same bits on every IEEE 754 machine with the same libm."""
 
 
 @lru_cache
@@ -464,7 +466,7 @@ def _settings(tables: Mapping[str, Mapping[str, Any]]) -> dict[str, RunSetting]:
 
 
 def _scheme(label: str, method: str | dict[str, Any], color: str, h: float | None = None) -> Scheme:
-    return Scheme(label, as_method(method) if isinstance(method, str) else method_from_specification(method), color, h)
+    return Scheme(label, as_method(method), color, h)
 
 
 def _figure(
@@ -476,6 +478,6 @@ def _figure(
 
 
 VIEWS: Mapping[str, Callable[..., Iterable[Panel]]] = {"plane": plane, "over time": over_time}
-_TABLES = package_table("extras/paper/figures.toml")
+_TABLES = package_table("figures.toml")
 SETTINGS = _settings(_TABLES.pop("settings"))
 EXPERIMENTS = tuple(_figure(name, **table) for name, table in _TABLES.items())

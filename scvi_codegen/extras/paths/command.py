@@ -9,25 +9,21 @@ from typing import Any
 import click
 import numpy as np
 
-from scvi_codegen.api.commands import check_writable, model_arguments, read_model, reporting, tell, with_known_sizes
+from scvi_codegen.api.commands import check_writable, model_arguments, read_model, reporting, tell
 from scvi_codegen.api.text import counted
 from scvi_codegen.common.errors import MethodError, ModelFileError
 from scvi_codegen.extras.paths.path import Path, different_paths
 from scvi_codegen.extras.pictures.services import check_picture
-from scvi_codegen.interfaces.cli.recording import check_output
 from scvi_codegen.interfaces.models.model import Model
-from scvi_codegen.interfaces.models.options import options_of
-from scvi_codegen.runs.results.export import FORMATS
 from scvi_codegen.runs.trajectory import Trajectory
 
-OWN = tuple(option.name for option in options_of("path"))
 MOST_SHOWN = 6
 """Largest number of coordinates whose initial momenta are printed."""
 
 
 @click.command()
-@model_arguments("solver", *OWN)
-@click.option("-o", "--output", type=click.Path(), metavar="FILE", help=f"States of the first path: {FORMATS}.")
+@model_arguments("solver", "path")
+@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="States of the first path, as of 'run'.")
 @click.option("--plot", type=click.Path(), metavar="FILE", help="Plot of the first path (.png, .svg, .pdf).")
 @reporting
 def path(model_name: str, output: str | None, plot: str | None, **choices: Any) -> None:
@@ -48,11 +44,11 @@ def path(model_name: str, output: str | None, plot: str | None, **choices: Any) 
       scvi-codegen path planar-pendulum --closed=-q --q 0 --velocity 1.5 --span 4 --step 0.2
     """
     if output is not None:
-        check_output(output)
+        check_writable(FilePath(output), "'-o'", states=True)
     if plot is not None:
         check_writable(FilePath(plot), "'--plot'")
         check_picture(plot)
-    model = with_known_sizes(read_model(model_name, choices), "path")
+    model = read_model(model_name, choices).with_known_sizes("path")
     paths = _paths(model)
     title = f"{model.system.name}\n{model.method.title}; {counted(len(paths), 'path')}"
     tell("\n".join([title, *map(_described, paths)]), **_numbers(model, paths))

@@ -14,12 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.api.states import Array
-from scvi_codegen.codegen.native.options import SolverOptions, step_failure
+from scvi_codegen.api.states import Array, Starts
+from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import PathError, StateError
 from scvi_codegen.extras.paths.size import size_for_updates
-from scvi_codegen.runs.accuracy.run_error import finer_of
-from scvi_codegen.runs.states.rotations import members_of
 
 CONVERGED, MOST_ITERATIONS = 1e-13, 20
 """Largest miss, relative to the range of the path, of a step that is solved by shooting, and most Newton iterations."""
@@ -130,7 +128,7 @@ class Intervals:
         options = binding.options(self.options)
         status = binding.function(function)(len(h), *arguments, stride, options, *results, report, binding.workspace())
         if status:
-            raise step_failure(status, report, step=int(report.steps), h=float(h[report.steps]))
+            raise binding.failure(status, report, step=int(report.steps), h=float(h[report.steps]))
 
     def finer_ends(self, q: Array, p0: Array) -> tuple[Array, Array]:
         """Return the (N, m) positions and momenta at the ends of all intervals by the finer method of ``run.error``.
@@ -140,7 +138,7 @@ class Intervals:
             MethodError: if the stepper has no finer method (it was loaded without its system).
         """
         finer = copy(self)
-        finer.stepper = finer_of(self.stepper)
+        finer.stepper = self.stepper.finer
         finer.binding = finer.stepper.tangent
         return finer._stepped(self.t, self.h, np.ascontiguousarray(q[:-1]), np.ascontiguousarray(p0))
 
@@ -221,8 +219,7 @@ class ReducedIntervals(Intervals):
 
     def __init__(self, stepper: Any, t: Array, h: Array, parameters: Array, options: SolverOptions | None) -> None:
         super().__init__(stepper, t, h, parameters, options)
-        interface = stepper.interface
-        self.members = members_of(stepper.dimension, interface.rotations) if interface.rotations else ()
+        self.members = stepper.members
         self._bases: list[Array] = []
 
     def _parameters_of(self, k: int) -> Array:
@@ -384,8 +381,5 @@ class ReducedIntervals(Intervals):
             return np.zeros(basis.shape[1])
 
     def _action(self, q: Array, p: Array, step: dict[str, Any]) -> float:
-        from scvi_codegen.api.states import Starts
-        from scvi_codegen.runs.derivatives.actions import actions_of_steps
-
         rows = Starts(np.array([step["t"]]), np.array([step["h"]]), q[np.newaxis].copy(), p[np.newaxis].copy())
-        return float(actions_of_steps(self.stepper, rows, step["parameters"], self.options)[0][0])
+        return float(self.stepper.actions(rows, step["parameters"], self.options)[0])

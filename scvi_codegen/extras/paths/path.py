@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.api.checks import checked_count
-from scvi_codegen.api.states import Array, Parameters, States, checked_number, real_array, require
+from scvi_codegen.api.runs import warnings_wanted
+from scvi_codegen.api.states import Array, Parameters, States, checked_number, real_array
 from scvi_codegen.api.text import summary
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import AccuracyWarning, MethodError, PathError, StateError, warn
@@ -22,9 +23,6 @@ from scvi_codegen.extras.paths.equations import Band, condensed_hessian, hessian
 from scvi_codegen.extras.paths.intervals import Intervals, ManyCoordinates, ReducedIntervals
 from scvi_codegen.extras.paths.size import largest_range, size_for_updates
 from scvi_codegen.extras.paths.starts import curves_around, curves_at_random
-from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
-from scvi_codegen.runs.states.layout import StateLayout
-from scvi_codegen.runs.states.validation import columns_of_inputs
 
 if TYPE_CHECKING:
     from scvi_codegen.runs.trajectory import Trajectory
@@ -184,7 +182,7 @@ def path_of(
     options: SolverOptions | None,
 ) -> Path:
     """Return the path of :meth:`scvi_codegen.Stepper.path`."""
-    require(stepper, "path")
+    stepper.require("path")
     count = checked_count(steps, "steps", least=2)
     duration, begin = _checked_duration(T), checked_number(t, "the time t")
     kind = _kind_of_intervals(stepper, closed=closed is not None, energy=energy is not None)
@@ -462,21 +460,18 @@ def _described(
 
 def _parameters_of_steps(stepper: Any, parameters: Parameters, inputs: Mapping[str, Any] | None, times: Array) -> Array:
     """Return the (k,) parameters of all steps, or (N, k) with inputs, those of the piece in the middle of each step."""
-    from scvi_codegen.api.states import check_inputs_given
-    from scvi_codegen.runs.driver.segments import checked_inputs
-
     if inputs is None:
-        check_inputs_given(stepper.interface, parameters)
+        stepper.check_given(parameters)
         return np.ascontiguousarray(stepper._parameters(parameters))
-    functions = checked_inputs(stepper.interface, inputs)
+    functions = stepper.inputs_of(inputs)
     values = np.tile(stepper._parameters(parameters), (len(times), 1))
-    columns = columns_of_inputs(stepper.interface)
+    columns = stepper.input_columns
     for k, time in enumerate(times.tolist()):
         values[k, columns] = np.concatenate([functions[name].parameters(time) for name in stepper.interface.inputs])
     return values
 
 
-def _nodes_of_start(states: StateLayout, start: Any, t: float, duration: float, count: int) -> Array | None:
+def _nodes_of_start(states: Any, start: Any, t: float, duration: float, count: int) -> Array | None:
     """Return the nodes of a start, an array or a function of time; ``None`` without one."""
     if start is None:
         return None

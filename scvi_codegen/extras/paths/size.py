@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scvi_codegen.api.states import Array, roundoff
-from scvi_codegen.runs.accuracy.size import relative
+from scvi_codegen.api.states import Array
 
+ROUNDOFF = 2.0**-53
+"""Largest relative rounding error of a number."""
 UPDATE_ROUNDING = 4.0
 """Newton updates of so many roundings of the largest value cannot be reduced."""
 
@@ -33,7 +34,7 @@ class SizeOfMotion:
     @classmethod
     def of(cls, q: Array, p: Array, at_rest: Array | float = 0.0) -> "SizeOfMotion":
         """Return the sizes of (n, m) states; ``at_rest``: (m,) momenta without velocity, of the gauge of L."""
-        of_q, of_p = (roundoff(1) * float(np.abs(vectors).max(initial=0.0)) for vectors in (q, p))
+        of_q, of_p = (ROUNDOFF * float(np.abs(vectors).max(initial=0.0)) for vectors in (q, p))
         return cls(largest_range(q), float(np.abs(p - at_rest).max(initial=0.0)), (of_q, of_p))
 
     def error(self, position: float, momentum: float) -> float:
@@ -42,8 +43,10 @@ class SizeOfMotion:
         Those of a motion at rest, which has no size, are relative to its largest position and momentum.
         """
         rounding, sizes = np.array(self.rounding), np.array([self.position, self.momentum])
-        sizes = np.where(sizes > 0.0, sizes, rounding / roundoff(1))
-        return float(relative(np.array([position, momentum]) + rounding, sizes).max())
+        sizes = np.where(sizes > 0.0, sizes, rounding / ROUNDOFF)
+        errors = np.array([position, momentum]) + rounding
+        with np.errstate(all="ignore"):
+            return float(np.where(errors == 0.0, 0.0, errors / sizes).max())
 
 
 def size_for_updates(q: Array, settled: float, least: float = 0.0) -> float:
@@ -51,5 +54,5 @@ def size_for_updates(q: Array, settled: float, least: float = 0.0) -> float:
 
     It is the largest range, or ``least``, or what makes ``settled`` some roundings of the positions.
     """
-    rounding = UPDATE_ROUNDING * roundoff(1) * float(np.abs(q).max(initial=0.0))
+    rounding = UPDATE_ROUNDING * ROUNDOFF * float(np.abs(q).max(initial=0.0))
     return max(largest_range(q), least, rounding / settled)

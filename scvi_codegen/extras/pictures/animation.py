@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,8 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scvi_codegen.api.checks import Kind, checks_arguments
-from scvi_codegen.api.text import summary
-from scvi_codegen.common.atomic import replaced
+from scvi_codegen.api.text import summary, write_atomically
 from scvi_codegen.common.errors import PlotError, StateError
 from scvi_codegen.extras.pictures.canvas import (
     MOTIONS,
@@ -31,7 +31,6 @@ from scvi_codegen.extras.pictures.canvas import (
 )
 from scvi_codegen.extras.pictures.recognition import shape_of
 from scvi_codegen.extras.pictures.shape import DrawnSystem, MovingShape, entry_names, shape_of_picture
-from scvi_codegen.runs.stepping.step_plan import FixedSteps
 from scvi_codegen.runs.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -173,7 +172,7 @@ class Film:
         motions = several(self.trajectory)
         longest = max(motions, key=lambda motion: abs(float(motion.t[-1] - motion.t[0])))
         common = all(len(motion.t) == len(longest.t) and (motion.t == longest.t).all() for motion in motions)
-        if common and all(isinstance(motion.plan, FixedSteps) for motion in motions):
+        if common and all(motion.has_fixed_steps for motion in motions):
             return tuple(motions)
         count = max(1, round(self.seconds * FRAMES_PER_SECOND) - 1) * STATES_PER_FRAME + 1
         times = np.linspace(longest.t[0], longest.t[-1], count)
@@ -219,11 +218,13 @@ class Film:
         kind = Path(path).suffix.lower()
         if kind == ".mp4" and not writers.is_available("ffmpeg"):
             raise PlotError(".mp4 animations need ffmpeg, which is not installed; use .gif or .html")
-        with style(), replaced(path) as new:
+        with style(), tempfile.TemporaryDirectory() as folder:
+            new = Path(folder) / f"new{kind}"
             if kind == ".html":
                 new.write_text(self.animation.to_jshtml(), encoding="utf-8")
             else:
                 self.animation.save(new, writer="pillow" if kind == ".gif" else "ffmpeg")
+            write_atomically(path, lambda file: file.write(new.read_bytes()))
 
     def _repr_html_(self) -> str:
         with style():

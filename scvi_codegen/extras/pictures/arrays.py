@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scvi_codegen.api.checks import Kind, checks_arguments
 from scvi_codegen.common.errors import StateError, closest
 from scvi_codegen.extras.pictures.canvas import color, panel, plain
-from scvi_codegen.runs.states.words import NamedState
 from scvi_codegen.runs.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -21,7 +20,7 @@ IN_SPACE = (2, 3)
 """Lengths of the last axis of arrays of positions in space."""
 
 
-ARRAYS = Kind("a trajectory of arrays", lambda value: isinstance(value, Trajectory) and isinstance(value.q, NamedState))
+ARRAYS = Kind("a trajectory of arrays", lambda value: isinstance(value, Trajectory) and hasattr(value.q, "items"))
 
 
 def mesh_of(motion: Trajectory) -> Any:

@@ -16,7 +16,6 @@ from scvi_codegen.api.checks import Kind
 from scvi_codegen.api.text import write_atomically
 from scvi_codegen.common.errors import PlotError, StateError, StepFailedError
 from scvi_codegen.runs.recording import RecordedRun
-from scvi_codegen.runs.stepping.step_plan import FixedSteps
 from scvi_codegen.runs.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -153,7 +152,7 @@ MOST_NUMBERS = 4_000_000
 
 def smooth(motion: Trajectory) -> Trajectory:
     """Return a trajectory of adaptive steps with states between its saved ones, by dense output; others as they are."""
-    n, equidistant = len(motion.t), isinstance(motion.plan, FixedSteps) and motion.tau is None
+    n, equidistant = len(motion.t), motion.has_fixed_steps and motion.tau is None
     if equidistant or motion.observed is not None or n < 2:
         return motion
     parts = min(64, SMOOTH // (n - 1), MOST_NUMBERS // motion.q.size)

@@ -11,7 +11,6 @@ import numpy as np
 from scvi_codegen.api.checks import Kind, checks_arguments
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.extras.pictures.canvas import MOTIONS, Array, Motions, color, panel, plain, several
-from scvi_codegen.runs.results.energy import energy_account
 from scvi_codegen.runs.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -69,7 +68,7 @@ def plot_energy(trajectories: Motions, path: str | os.PathLike[str] | None = Non
     with panel(path, ax) as axes:
         draw_energy_error(axes, several(trajectories)[0])
         for number, motion in enumerate(several(trajectories)[1:], 1):
-            account = energy_account(motion, limited=True)
+            account = motion.energy_account(limited=True)
             _draw_error(axes, motion.t, np.abs(account.values) / account.scale, number)
     return axes
 
@@ -104,7 +103,7 @@ def plot_momentum_maps(
 
 def draw_energy_error(axes: Axes, motion: Trajectory) -> None:
     """Draw the energy error, balance or change of one trajectory, with the title."""
-    account = energy_account(motion, limited=True)
+    account = motion.energy_account(limited=True)
     _draw_error(axes, motion.t, np.abs(account.values) / account.scale, 0)
     axes.set(xlabel="t", title=account.title)
 

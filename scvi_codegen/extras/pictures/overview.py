@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scvi_codegen.api.checks import Kind, checks_arguments
+from scvi_codegen.api.program import Interface
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.extras.pictures.animation import drawn_shape, positions_of
 from scvi_codegen.extras.pictures.arrays import plot_arrays, plot_spectrum
@@ -40,7 +41,6 @@ from scvi_codegen.extras.pictures.canvas import (
 )
 from scvi_codegen.extras.pictures.conserved import plot_energy, plot_momentum_maps
 from scvi_codegen.runs.trajectory import Trajectory
-from scvi_codegen.systems.symmetry.sampling import AXES, bodies
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -106,7 +106,7 @@ def plot_trajectory(
         else:
             draw_paths(axes[:-1], motions)
         plot_energy(motions, ax=axes[-1])
-        named = 0 if error else len(bodies(interface.coordinates))
+        named = 0 if error else len(Interface.bodies(interface.coordinates))
         if 1 < named <= len(COLORS) and len(motions) == 1:
             figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=named)
         figure.suptitle(plain(interface.title), fontsize=11)
@@ -308,7 +308,7 @@ def path_panels(motion: Trajectory) -> int:
         return 1
     if motion.stepper.interface.rotations:
         return 2
-    result = bodies(coordinates)
+    result = Interface.bodies(coordinates)
     spatial = result and len(result[0].columns) == 3
     planes = not result and not _is_drawn_in_time(motion) and 3 <= len(coordinates) <= MAX_CURVES
     return 2 if spatial or planes else 1
@@ -318,7 +318,9 @@ def _is_drawn_in_time(motion: Trajectory) -> bool:
     """Return whether the coordinates are drawn over time: one, or those of a driven or damped system without bodies."""
     interface = motion.stepper.interface
     m = len(interface.coordinates)
-    return m == 1 or (m <= MAX_CURVES and bool(interface.changes_energy) and not bodies(interface.coordinates))
+    return m == 1 or (
+        m <= MAX_CURVES and bool(interface.changes_energy) and not Interface.bodies(interface.coordinates)
+    )
 
 
 def draw_paths(panels: Sequence[Axes], motions: Sequence[Trajectory]) -> None:
@@ -336,7 +338,7 @@ def draw_paths(panels: Sequence[Axes], motions: Sequence[Trajectory]) -> None:
 def _draw_path(panels: Sequence[Axes], motion: Trajectory, which: int | None) -> None:
     """Draw one path, in one colour if it is one of several (``which``)."""
     coordinates = motion.stepper.interface.coordinates
-    result, m, first = bodies(coordinates), len(coordinates), which or 0
+    result, m, first = Interface.bodies(coordinates), len(coordinates), which or 0
     if links_of(motion):
         draw_robot(panels[0], motion, first)
     elif motion.stepper.interface.rotations:
@@ -349,7 +351,7 @@ def _draw_path(panels: Sequence[Axes], motion: Trajectory, which: int | None) ->
             for number, body in enumerate(result):
                 x, y = (motion.q[:, body.columns[index]] for index in plane)
                 _draw_curve(axes, x, y, color(number if which is None else which), body.name or None)
-            axes.set(xlabel=AXES[plane[0]], ylabel=AXES[plane[1]], title="orbits" if len(result) > 1 else "orbit")
+            axes.set(xlabel="xyz"[plane[0]], ylabel="xyz"[plane[1]], title="orbits" if len(result) > 1 else "orbit")
             axes.set_aspect("equal", adjustable="datalim")
     elif m <= MAX_CURVES:
         for axes, plane in zip(panels, combinations(range(m), 2), strict=False):

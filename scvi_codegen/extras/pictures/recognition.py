@@ -12,11 +12,10 @@ import numpy as np
 import sympy
 from sympy import Expr, Matrix
 
-from scvi_codegen.api.formulas import Rotation, RotationNames, parse_expression, symbol
+from scvi_codegen.api.formulas import Intermediate, Rotation, RotationNames, parse_expression, symbol
+from scvi_codegen.api.program import Interface
 from scvi_codegen.common.errors import ExpressionError, StateError
 from scvi_codegen.extras.pictures.shape import DrawnSystem, MovingShape, PointProgram, graph_of
-from scvi_codegen.systems.formulas.intermediates import intermediate
-from scvi_codegen.systems.symmetry.sampling import bodies
 
 NUMBERED = re.compile(r"(.*?)_?(\d+)")
 LENGTHS = ("l", "L", "length")
@@ -43,7 +42,7 @@ def shape_of(system: DrawnSystem) -> MovingShape:
         return graph_of(system.nodes, system.mesh.field_system.fields)
     if system.rotations:
         return _solids(system)
-    if body_columns := bodies(names) or bodies([*names, *system.momenta]):
+    if body_columns := Interface.bodies(names) or Interface.bodies([*names, *system.momenta]):
         return _bodies(system, body_columns)
     if (sign := hanging(system)) is not None:
         return _pendulum(system, sign)
@@ -134,7 +133,9 @@ def _pendulum(system: DrawnSystem, sign: float) -> MovingShape:
     for k, (name, number) in enumerate(zip(names, numbers, strict=True), 1):
         length, q = _formula(system.parameter(LENGTHS, number)), symbol(name)
         x, y = ends[-1]
-        ends.append((intermediate(x + length * sympy.sin(q)), intermediate(y - sign * length * sympy.cos(q))))
+        ends.append(
+            (Intermediate.named(x + length * sympy.sin(q)), Intermediate.named(y - sign * length * sympy.cos(q)))
+        )
         marks.append({"kind": "bob", "points": [k], "mass": system.parameter(("m",), number)})
     numbered = list(range(1, len(ends)))
     rod = {"kind": "rod", "points": [0, *numbered]}
@@ -277,7 +278,7 @@ def _solids(system: DrawnSystem) -> MovingShape:
             marks.append({"kind": "body", "points": [first + 2], "mass": 0.1, "color": number + 1})
         else:
             vector = Matrix([values[entry] for entry in member.entries])
-            length = intermediate(sympy.sqrt(sympy.Add(*(component**2 for component in vector))))
+            length = Intermediate.named(sympy.sqrt(sympy.Add(*(component**2 for component in vector))))
             points.append(program.point(centre + vector / length))
             marks.append({"kind": "arrow", "points": [place, first], "color": number})
         trails.append(len(points) - 1)
@@ -299,8 +300,8 @@ def _robot(system: DrawnSystem) -> MovingShape:
         if link.parent >= 0:
             origin = origins[link.parent] + turns[link.parent] * origin
             turn = turns[link.parent] * turn
-        origins.append(origin.applyfunc(intermediate))
-        turns.append(turn.applyfunc(intermediate))
+        origins.append(origin.applyfunc(Intermediate.named))
+        turns.append(turn.applyfunc(Intermediate.named))
     program = PointProgram(system.names)
     points = [program.point(origin) for origin in origins]
     based = [i for i, link in enumerate(links) if link.parent < 0 and link.kind != "free" and any(origins[i])]

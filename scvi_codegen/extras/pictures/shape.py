@@ -20,12 +20,9 @@ import sympy
 from numpy.typing import NDArray
 from sympy import Expr
 
-from scvi_codegen.api.formulas import DOT, TIME, Array, RotationNames, symbol
+from scvi_codegen.api.formulas import DOT, TIME, Array, Intermediate, RotationNames, symbol
+from scvi_codegen.api.systems import ArraySystem
 from scvi_codegen.common.errors import ExpressionError, ModelFileError, SystemDefinitionError, closest
-from scvi_codegen.systems.formulas.array_statements import formula_of_entries, is_indexed
-from scvi_codegen.systems.formulas.expressions import PIECEWISE_CONSTANT
-from scvi_codegen.systems.formulas.indices import Size
-from scvi_codegen.systems.formulas.intermediates import Intermediate, intermediates
 
 Values = NDArray[np.float64]
 
@@ -38,7 +35,8 @@ OPERATIONS: Mapping[str, Callable[..., Any]] = {
     "add": lambda *terms: sum(terms),
     "mul": lambda *factors: math.prod(factors),
     "pow": np.power,
-    **{name: function for name, (_, function) in PIECEWISE_CONSTANT.items()},
+    "rint": np.rint,
+    "unit_step": lambda x: np.heaviside(x, 1.0),
     **{name: getattr(np, name) for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log")},
     **{name: getattr(np, f"arc{name[1:]}") for name in ("asin", "acos", "atan", "atan2", "asinh", "acosh", "atanh")},
 }
@@ -124,7 +122,7 @@ class PointProgram:
     def point(self, components: Sequence[Any]) -> list[int]:
         """Return the registers of a point, whose components are expressions or numbers."""
         formulas = [sympy.sympify(component) for component in components]
-        for intermediate in intermediates(*formulas):
+        for intermediate in Intermediate.within(*formulas):
             self._place(intermediate)
         return [self._place(formula) for formula in formulas]
 
@@ -302,11 +300,11 @@ def _reader(system: DrawnSystem) -> Callable[[str], Expr]:
     velocities = {symbol(f"{name}{DOT}") for name in names.coordinates}
     turning = {entry.name: entry for entry, value in names.values.items() if not value.free_symbols & velocities}
     symbols = turning | {name: symbol(name) for name in system.names}
-    arrays = [Array(name, tuple(Size("", n) for n in shape)) for name, shape in system.shapes.items()]
+    arrays = [Array.of_shape(name, shape) for name, shape in system.shapes.items()]
 
     def read(text: str) -> Expr:
-        if system.shapes and is_indexed(text):
-            return formula_of_entries(text, arrays, symbols)
+        if system.shapes and ArraySystem.is_indexed(text):
+            return ArraySystem.formula_of_entries(text, arrays, symbols)
         return names.in_coordinates(names.read(text, symbols))
 
     return read

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
-from scvi_codegen.common.atomic import naming_folders
 from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, warn
 from scvi_codegen.extras.robots.trees.closures import conditions_of
 from scvi_codegen.extras.robots.trees.contacts import contacts_of
@@ -42,13 +41,11 @@ def of_mjcf(
     *,
     parts: Mapping[str, str],
     actuators: bool,
-    folders: Iterable[str | PathLike[str]],
     name: str | None,
     **how: Any,
 ) -> LagrangianSystem:
     """Return the system of an MJCF file, see :meth:`LagrangianSystem.from_mjcf`; ``parts``: what is read or ignored."""
-    with naming_folders(folders):
-        model, links, gravity, *others = links_of_mjcf(path, [*_read(parts), *["actuators"] * actuators])
+    model, links, gravity, *others = links_of_mjcf(path, [*_read(parts), *["actuators"] * actuators])
     return _of_tree(kind, path, name or model, links, gravity, *others, **how)
 
 

@@ -26,17 +26,18 @@ Identities are tested probabilistically: expressions are evaluated at random poi
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import sympy
 from sympy import Add, Dummy, Expr, Matrix, Pow, Symbol
 from sympy.integrals.manualintegrate import manualintegrate
 
-from scvi_codegen.api.formulas import RotationNames, jacobian
+from scvi_codegen.api.formulas import RotationNames, Tape, jacobian, mp
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.extras.robots.variables import Variables
-from scvi_codegen.systems.formulas.expressions import NEGLIGIBLE, samples, unsupported_part
 
 if TYPE_CHECKING:
     from sympy.physics.mechanics import Particle, ReferenceFrame, RigidBody
@@ -47,14 +48,10 @@ POINTS = 2
 def are_zero(expressions: Iterable[Expr]) -> bool:
     """Return whether all expressions are zero at two random points; false if fewer points of definition are found."""
     unlike = [expression for expression in expressions if expression != 0]
-    if any(map(unsupported_part, unlike)):
-        return False
-    for tested, values in enumerate(samples(unlike), 1):
-        if any(abs(value) > NEGLIGIBLE for value in values):
-            return False
-        if tested == POINTS:
-            return True
-    return not unlike
+    with suppress(SystemDefinitionError):
+        values = list(islice(Tape.samples(unlike), POINTS))
+        return len(values) == POINTS and all(abs(value) <= mp.sqrt(mp.eps) for at in values for value in at)
+    return False
 
 
 def potential_of(forces: Sequence[Expr], coordinates: Sequence[Symbol]) -> Expr | None:

@@ -11,13 +11,11 @@ import sympy
 from numpy.typing import NDArray
 from sympy import Dummy, Expr, Matrix, Symbol
 from sympy.core.function import AppliedUndef
+from sympy.utilities.iterables import connected_components
 
-from scvi_codegen.api.formulas import Rotation, jacobian
+from scvi_codegen.api.formulas import Rotation, Tape, jacobian, parse_expression
+from scvi_codegen.api.systems import tangent_space
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.common.tangent_space import tangent_space
-from scvi_codegen.systems.derived_expressions import coupled_blocks, dense, inverse_by_minors
-from scvi_codegen.systems.formulas.expressions import evaluated, gradient, samples, unsupported_part
-from scvi_codegen.systems.rotations.points import torque_of
 
 MOST_COUPLED = 6
 """Largest number of generalised speeds that equations with variable coefficients couple."""
@@ -79,7 +77,7 @@ class Variables:
         for function in sorted(others, key=str):
             self._plain[function] = _symbol(function)
             self._written[self._plain[function]] = function
-        return evaluated(expression, self._plain)
+        return parse_expression(expression, self._plain)
 
     def write(self, expression: Expr) -> Expr:
         """Return an expression in the user's functions of time."""
@@ -88,7 +86,7 @@ class Variables:
     def rate(self, function: Expr) -> Expr:
         """Return d/dt of a function of coordinates, rotations and time."""
         terms = (derivative * self.rates[j] for (_, j), derivative in self.pulls([function]).items())
-        return sympy.Add(*terms, *gradient(function, (self.time,)).values())
+        return sympy.Add(*terms, *jacobian([function], [self.time]).values())
 
     def pulls(self, functions: Sequence[Expr]) -> dict[tuple[int, int], Expr]:
         """Return the derivatives with respect to coordinates, and about the axes of rotations, by row and rate."""
@@ -103,7 +101,7 @@ class Variables:
         """Return derivatives about the axes of rotations from those with respect to their entries."""
         torques: list[Expr] = []
         for k, rotation in enumerate(self.rotations):
-            torques += torque_of(Matrix(3, 3, rotation.entries), Matrix(3, 3, derivatives[9 * k : 9 * k + 9]))
+            torques += rotation.torque(derivatives[9 * k : 9 * k + 9])
         return torques
 
     def projected(self, forces: Sequence[Expr]) -> tuple[Expr, ...]:
@@ -127,12 +125,14 @@ def solved_for_speeds(equations: Sequence[Expr], variables: Variables) -> dict[S
     rows, u = Matrix(equations), variables.u
     matrix, right = rows.jacobian(u), -rows.xreplace(dict.fromkeys(u, sympy.S.Zero))
     solution: dict[Symbol, Expr] = {}
-    for block in coupled_blocks({(i, len(u) + j): entry for (i, j), entry in matrix.todok().items()}, 2 * len(u)):
+    edges = [(i, len(u) + j) for i, j in matrix.todok()]
+    for block in map(sorted, connected_components((range(2 * len(u)), edges))):
         lines = [i for i in block if i < len(u)]
         unknowns = [j - len(u) for j in block if j >= len(u)]
         if matrix.has(*u) or len(lines) != len(unknowns) or (len(lines) > MOST_COUPLED and matrix.free_symbols):
             break
-        part = inverse_by_minors(matrix.extract(lines, unknowns)) * right.extract(lines, [0])
+        own = matrix.extract(lines, unknowns)
+        part = own.adjugate() / own.det(method="berkowitz") * right.extract(lines, [0])  # without pivots that vanish
         solution |= {
             u[j]: value for j, value in zip(unknowns, part, strict=True) if not value.has(sympy.nan, sympy.zoo)
         }
@@ -165,15 +165,24 @@ def independent_of(earlier: Sequence[Expr], asked: Sequence[Expr], rates: Sequen
     return tuple(independent)
 
 
+def matrix_of(entries: Mapping[tuple[int, int], Any], values: Sequence[Any], shape: tuple[int, int]) -> Any:
+    """Return the matrix of double precision with values at the places of entries, 0 elsewhere."""
+    matrix = np.zeros(shape)
+    for place, value in zip(entries, values, strict=True):
+        matrix[place] = float(value)
+    return matrix
+
+
 def _values(expressions: Sequence[Expr], rates: Sequence[Symbol]) -> NDArray[np.float64]:
     """Return the coefficients of the rates and the remainder without rates, row by row, at a random point."""
     entries = dict(jacobian(expressions, rates))
     resting = dict.fromkeys(rates, sympy.S.Zero)
     entries |= {(k, len(rates)): expression.xreplace(resting) for k, expression in enumerate(expressions)}
-    if problem := next(filter(None, map(unsupported_part, entries.values())), None):
-        raise SystemDefinitionError(f"in the constraints: {problem}")
-    for values in samples([*entries.values()]):
-        return dense(entries, values, (len(expressions), len(rates) + 1))
+    try:
+        for values in Tape.samples([*entries.values()]):
+            return np.asarray(matrix_of(entries, values, (len(expressions), len(rates) + 1)))
+    except SystemDefinitionError as error:
+        raise SystemDefinitionError(f"in the constraints: {error}") from error
     raise SystemDefinitionError(
         "the constraints have no finite value at any of the sampled points: check their domains"
     )

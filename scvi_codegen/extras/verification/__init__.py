@@ -21,10 +21,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.api.checks import checks_arguments
-from scvi_codegen.api.methods import Discretisation, Method
-from scvi_codegen.api.runs import STEPPER, without_accuracy_warnings
-from scvi_codegen.api.states import Array, checked_number, checked_step
-from scvi_codegen.api.systems import SYSTEM_OR_ARRAYS, ArraySystem, MechanicalSystem
+from scvi_codegen.api.methods import Method
+from scvi_codegen.api.program import Derivation
+from scvi_codegen.api.runs import without_accuracy_warnings
+from scvi_codegen.api.states import Array, Fixed, checked_number
+from scvi_codegen.api.systems import ArraySystem, MechanicalSystem
 from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.extras.verification.arrays import state_of_fields, verify_arrays
 from scvi_codegen.extras.verification.certificate import Certificate, Check, Outcome, issued
@@ -36,12 +37,9 @@ from scvi_codegen.extras.verification.stepping import predictor_checks, step_che
 from scvi_codegen.extras.verification.structure import largest_step, structure_checks
 from scvi_codegen.extras.verification.system_under_test import EPSILON, SHORT_RUN, State, SystemUnderTest
 from scvi_codegen.extras.verification.variable_steps import VariableSteps, at_fixed_energy, variable_step_checks
-from scvi_codegen.methods import as_method, sliding
+from scvi_codegen.methods import as_method
 from scvi_codegen.runs.compiler import compile_stepper
-from scvi_codegen.runs.results.saved_states import parameters_on_sides
 from scvi_codegen.runs.stepper import Stepper
-from scvi_codegen.systems.contacts.modes import in_all_modes
-from scvi_codegen.systems.kinks import located_kinks
 
 __all__ = ["Certificate", "Check", "Outcome", "verify"]
 
@@ -52,7 +50,7 @@ PART = 0.1
 """Largest change of the state per step relative to its size."""
 
 
-@checks_arguments(system=SYSTEM_OR_ARRAYS, stepper=STEPPER)
+@checks_arguments(system=MechanicalSystem.OR_ARRAYS, stepper=Stepper.KIND)
 @without_accuracy_warnings()
 def verify(
     system: MechanicalSystem,
@@ -101,7 +99,7 @@ def verify(
     if isinstance(system, ArraySystem) and system.mesh is not None and q is None and p is None:
         q, p, h = state_of_fields(system.mesh, method, h)
     _check_arguments(system, stepper, q, h, of_run)
-    t, h = checked_number(t, "the time t"), None if h is None else checked_step(h)
+    t, h = checked_number(t, "the time t"), None if h is None else Fixed.checked(h).h
     began, method = time.perf_counter(), as_method(method, system)
     if isinstance(system, ArraySystem):
         stepper = stepper or compile_stepper(system, method, solver=solver)
@@ -109,9 +107,9 @@ def verify(
         of_run |= {"of_known_sizes": of_known_sizes, "tolerance": tolerance}
         return verify_arrays(system, method, stepper, (q, p, cast(float, h), t), began, **of_run)
     if stepper is None or stepper.interface.contacts:
-        system = sliding(system, method)
-    form = Discretisation(in_all_modes(system), method).form
-    located, _ = located_kinks(form)
+        system = Derivation(system, method).with_friction.system
+    derivation = Derivation(system, method)
+    form, located = derivation.form, derivation.located
     stepper = stepper or compile_stepper(system, method, solver=solver)
     if stepper.interface.masked != len(form.reactions):
         raise StateError(f"'{system.name}' has other contacts than {stepper!r}: pass a system with them, contacts=")
@@ -151,7 +149,7 @@ def _certificate(
     flags, with_events, stepper = stepper.flags, stepper, stepper.with_events(())
     run = run_of(stepper, start, start.h, steps=10 * SHORT_RUN) if stepper.interface.mode_names else None
     if run:
-        system = system.with_parameters(**stepper.parameters_by_name(parameters_on_sides(run, start.t)))
+        system = system.with_parameters(**stepper.parameters_by_name(run.parameters_on_sides(start.t)))
     steps, single = stepper, at_fixed_energy(system, stepper.energy(start.q, start.p, start.t))
     if single is not system or stepper.interface.time_transformation is not None:
         steps = compile_stepper(single, method, solver=solver, flags=flags)

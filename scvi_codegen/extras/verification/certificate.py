@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any, NamedTuple
 
-from scvi_codegen.api.text import Html, announced, card, grid, plain, summary, write_text
+from scvi_codegen.api.text import Html, announced, summary, write_text
 from scvi_codegen.common.errors import EventError, MethodError, StateError, StepFailedError, SystemDefinitionError
 from scvi_codegen.extras.verification.system_under_test import State
 from scvi_codegen.runs.stepper import Stepper
@@ -166,12 +166,12 @@ class Certificate:
 
     def _repr_html_(self) -> str:
         facts = (
-            ("verdict", plain(self.verdict)),
-            ("C source", plain(f"sha256 {self.checksum}")),
-            ("step", plain(f"{self.h:g}")),
+            ("verdict", Html.plain(self.verdict)),
+            ("C source", Html.plain(f"sha256 {self.checksum}")),
+            ("step", Html.plain(f"{self.h:g}")),
         )
         head = ("", "outcome", "measured", "bound", "property")
-        return card(self.title, facts, grid(map(_row, self.checks), head=head))
+        return Html.card(self.title, facts, Html.grid(map(_row, self.checks), head=head))
 
     def to_json(self) -> str:
         """Return all attributes as JSON; numbers that are not finite are strings."""
@@ -201,12 +201,12 @@ def issued(stepper: Stepper, state: State, *, began: float, **attributes: Any) -
 
 def _row(check: Check) -> tuple[Html, ...]:
     """Return a row of the table in a notebook; violations are bold."""
-    outcome = plain(check.outcome.value)
+    outcome = Html.plain(check.outcome.value)
     if check.outcome is Outcome.VIOLATED:
         outcome = Html(f"<strong>{outcome}</strong>")
     numbers = ["" if number is None else f"{number:.3g}" for number in (check.measured, check.bound)]
     words = "; ".join(filter(None, (check.statement, check.remark)))
-    return plain(check.name), outcome, *map(plain, numbers), plain(words)
+    return Html.plain(check.name), outcome, *map(Html.plain, numbers), Html.plain(words)
 
 
 def _finite(value: Any) -> Any:

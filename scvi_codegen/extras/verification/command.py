@@ -1,24 +1,24 @@
 """Command ``scvi-codegen verify``: the certificate of a model, or of the C code in a generated folder."""
 
 import json
+from collections.abc import Mapping
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
 
-from scvi_codegen.api.commands import check_writable, model_arguments, read_model, reporting, tell, with_known_sizes
+from scvi_codegen.api.commands import check_writable, model_arguments, note, read_model, reporting, tell
 from scvi_codegen.common.errors import PackageError
-from scvi_codegen.extras import verification
 from scvi_codegen.extras.verification import Certificate
-from scvi_codegen.interfaces.cli.command_group import CommandFailure, note
-from scvi_codegen.interfaces.cli.model_options import Choices, sections_of
-from scvi_codegen.interfaces.models.model import DEFAULT_METHOD, Model
-from scvi_codegen.interfaces.models.model_files.model_file import load_model
-from scvi_codegen.interfaces.models.options import METHOD_KEYS
-from scvi_codegen.interfaces.models.packages.package import CERTIFICATE_FILE, MODEL_FILE, load_package
-from scvi_codegen.methods import SVI
+from scvi_codegen.extras.verification import verify as measured
+from scvi_codegen.interfaces.models.model import Model
+from scvi_codegen.interfaces.models.packages.package import load_package
 from scvi_codegen.runs.stepper import Stepper
+
+MODEL_FILE, CERTIFICATE_FILE = "model.toml", "certificate.json"
+"""Files of a generated folder."""
 
 
 @click.command()
@@ -51,27 +51,27 @@ def verify(model_name: str, output: str | None, **choices: Any) -> None:
         certificate.save(path)
         note(f"wrote {path}")
     if not certificate.passed:
-        raise CommandFailure(f"violated: {', '.join(check.name for check in certificate.violated)}")
+        raise click.ClickException(f"violated: {', '.join(check.name for check in certificate.violated)}")
 
 
-def _verified(name: str, choices: Choices) -> Certificate:
+def _verified(name: str, choices: Mapping[str, Any]) -> Certificate:
     """Return the certificate of a model file, a system of the catalogue or a generated folder."""
     folder = Path(name)
     if not folder.is_dir():
         model = read_model(name, choices)
         if model.array_system is not None and (model.h is None or model.array_system.constraints):
-            model = with_known_sizes(model, "verify (adaptive steps, constraints)")
+            model = model.with_known_sizes("verify (adaptive steps, constraints)")
         model._check_double("a certificate")
-        if model.method is DEFAULT_METHOD:  # of this one
-            model = replace(model, method=SVI(8))
+        model = replace(model, method=copy(model.method))  # named, so that runs with a tolerance have it, too
         return _certificate(model, model.stepper())
-    if choices["solver"] != "auto" or any(choices[choice] is not None for choice in METHOD_KEYS):
-        raise click.UsageError(f"'{name}' is a generated folder: its method and solver are those it was generated with")
     if not (folder / MODEL_FILE).is_file():
         raise PackageError(
             f"{folder} has no {MODEL_FILE}, which defines its guaranteed properties: generate it from a model"
         )
-    return _certificate(load_model(folder / MODEL_FILE, sections_of(choices)), load_package(folder))
+    model, own = (read_model(str(folder / MODEL_FILE), options) for options in (choices, {}))
+    if (model.method, model.solver) != (own.method, own.solver):
+        raise click.UsageError(f"'{name}' is a generated folder: its method and solver are those it was generated with")
+    return _certificate(model, load_package(folder))
 
 
 def _certificate(model: Model, stepper: Stepper) -> Certificate:
@@ -80,7 +80,7 @@ def _certificate(model: Model, stepper: Stepper) -> Certificate:
         arguments: dict[str, Any] = {"h": model.step, "parameters": model.fields}
     else:
         arguments = {"h": model.first_step_size(stepper), "tolerance": model.allowed_error, "solver": model.solver}
-    return verification.verify(model.system, model.method, **state, **arguments, stepper=stepper)
+    return measured(model.system, model.method, **state, **arguments, stepper=stepper)
 
 
 def _certificate_path(name: str) -> Path | None:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from scvi_codegen.api.formulas import Number, mp
-from scvi_codegen.api.methods import Method, method_from_specification
+from scvi_codegen.api.methods import Method
 from scvi_codegen.api.systems import MechanicalSystem, forms_of
 from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.extras.exact.solution import exact_motion, numbers
@@ -31,6 +31,7 @@ from scvi_codegen.methods import (
     RungeKutta,
     SpectralCollocation,
     StoermerVerlet,
+    as_method,
 )
 from scvi_codegen.methods.tables.quadrature import (
     Quadrature,
@@ -149,7 +150,7 @@ def _of_size(specification: Mapping[str, Any], key: str, size: int) -> Method | 
     if colon and count.isdigit():
         changed["quadrature"] = f"{family}:{int(count) + size - int(specification[key])}"
     try:
-        return method_from_specification(changed)
+        return as_method(changed)
     except MethodError:
         return None
 

@@ -13,7 +13,6 @@ import sympy
 from scvi_codegen.api.formulas import TIME, Tape, mp, symbol
 from scvi_codegen.api.methods import Discretisation
 from scvi_codegen.api.states import Array
-from scvi_codegen.codegen.rendering.events import EventFormulas
 from scvi_codegen.common.errors import EventWarning, StateError
 from scvi_codegen.extras.exact.solution import ExactMotion, Numbers, exact_motion, numbers, solved
 from scvi_codegen.extras.verification.certificate import Check, Finding, checked
@@ -35,12 +34,9 @@ from scvi_codegen.extras.verification.system_under_test import (
     canonical_form,
     linearised,
 )
-from scvi_codegen.runs.results.recomputation import changes_by_events
-from scvi_codegen.runs.results.saved_states import parameters_on_sides
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.trajectory import Trajectory
-from scvi_codegen.systems.contact import coefficients
-from scvi_codegen.systems.event import Crossings, Kink
+from scvi_codegen.systems.event import Crossings
 
 
 class Change(NamedTuple):
@@ -110,7 +106,7 @@ def _event_functions(run: Trajectory) -> Iterator[tuple[Crossings, Callable[...,
         for crossings in run.events
         for k, event in enumerate(run.stepper._events_of_entries(crossings.event))
     ]
-    formulas = EventFormulas(run.stepper.interface, [event for _, event in scalar_events])
+    formulas = cast(Any, run.stepper).event_formulas([event for _, event in scalar_events])
     arguments = (*formulas.q, *formulas.p, *formulas.v, symbol(TIME), *formulas.parameters)
     for (crossings, _), g, (_, values) in zip(scalar_events, formulas.functions, formulas.changes, strict=True):
         if not g.free_symbols.isdisjoint(formulas.multipliers):
@@ -255,7 +251,7 @@ class RunInModes:
     @cached_property
     def functions(self) -> Tape:
         """Functions of kinks and transitions by (q, p, v, t, parameters, multipliers)."""
-        of = EventFormulas(self.run.stepper.interface, self.run.stepper.searched)
+        of = cast(Any, self.run.stepper).event_formulas(self.run.stepper.searched)
         return Tape(of.functions, (*of.q, *of.p, *of.v, symbol(TIME), *of.parameters, *of.multipliers))
 
     def values(self, x: Numbers, parameters: Array) -> Numbers:
@@ -265,7 +261,8 @@ class RunInModes:
         if self.tested.system.constraints:
             zeros, forces = motion.constraint_terms(q, v, x[-1])[2][1:3].ravel(), motion.multipliers(q, v, x[-1])
         values = self.functions([*q, *p, *v, x[-1], *motion.parameters, *forces])
-        sides = [np.sign(named[event.mode]) if isinstance(event, Kink) else 1 for event in self.run.stepper.searched]
+        modes = (getattr(event, "mode", None) for event in self.run.stepper.searched)
+        sides = [1 if mode is None else np.sign(named[mode]) for mode in modes]
         return np.array([*np.multiply(values, sides), *zeros, *-zeros], dtype=object)
 
     def derivatives(self, x: Numbers, parameters: Array) -> Numbers:
@@ -285,9 +282,9 @@ class RunInModes:
     def changes(self) -> list[tuple[float, int, Numbers, Numbers, tuple[Array, Array]]]:
         """Some of the transitions that are alone at their time: it, number, x before and after, parameters there."""
         run, changes = self.run, []
-        for crossings, rows in changes_by_events(replace(run, events=())):
+        for crossings, rows in replace(run, events=()).changes_by_events():
             for t, q, p, row in zip(crossings.t.tolist(), crossings.q, crossings.p, rows.tolist(), strict=True):
-                sides = parameters_on_sides(run, run.t.item(max(row - 1, 0))), parameters_on_sides(run, t)
+                sides = run.parameters_on_sides(run.t.item(max(row - 1, 0))), run.parameters_on_sides(t)
                 ends = numbers([*q, *p, t]), numbers([*run.q[row], *run.p[row], t])
                 changes.append((t, run.stepper.searched.index(crossings.event), *ends, sides))
         times = [change[0] for change in changes]
@@ -311,7 +308,7 @@ class RunInModes:
             imposed[[stepper.interface.parameters.index(name) for name in (rows.closed, *rows.sticks)]] = 1.0
             motion, row = self.motion(imposed), first + cast(int, rows.normal)
             q, t, jump = ends[0][:m], ends[0][-1], (ends[1] - ends[0])[m:-1]
-            laws = Tape(coefficients(self.tested.system), motion.symbols)
+            laws = Tape([law for item in self.tested.system.contacts for law in item.laws], motion.symbols)
             at_impact = laws([*q, *motion.velocity(q, ends[0][m:-1], t), t, *motion.parameters])
             friction, _, restitution = at_impact[3 * contact : 3 * contact + 3]
             for q, p, t in ((x[:m], x[m:-1], x[-1]) for x in ends):
@@ -331,7 +328,7 @@ class RunInModes:
     def states(self) -> Iterator[tuple[Numbers, Array]]:
         """Yield states x with parameters: some of those of the run, and those before transitions."""
         for t in self.run.t[:: -(-len(self.run) // SHORT_RUN)].tolist():
-            yield numbers([*np.concatenate(self.run.at(t)), t]), parameters_on_sides(self.run, t)
+            yield numbers([*np.concatenate(self.run.at(t)), t]), self.run.parameters_on_sides(t)
         yield from ((before, sides[0]) for _, _, before, _, sides in self.changes)
 
 
@@ -384,7 +381,7 @@ def _conditions(of: RunInModes, rows_of_kinds: list[int]) -> Finding:
 
 def _states_at_kinks(of: RunInModes) -> Finding | None:
     errors, m, searched = list[float](), of.tested.system.dimension, of.run.stepper.searched
-    for t, k, before, after, sides in (change for change in of.changes if isinstance(searched[change[1]], Kink)):
+    for t, k, before, after, sides in (change for change in of.changes if hasattr(searched[change[1]], "mode")):
         jump = after - before
         if jump.any():
             n = of.derivatives(before, sides[0])[k]

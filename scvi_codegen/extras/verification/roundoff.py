@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from scvi_codegen.api.formulas import mp
-from scvi_codegen.api.runs import EnsembleSettings
+from scvi_codegen.api.methods import Discretisation
 from scvi_codegen.api.states import Array
 from scvi_codegen.api.systems import forms_of
 from scvi_codegen.codegen.native.options import SolverOptions
@@ -35,11 +35,7 @@ from scvi_codegen.extras.verification.system_under_test import (
     SystemUnderTest,
 )
 from scvi_codegen.methods import SCVI
-from scvi_codegen.runs.ensembles.ensemble import Ensemble
-from scvi_codegen.runs.ensembles.individual import runs_of
-from scvi_codegen.runs.ensembles.lanes import CommonRuns, LaneRuns
 from scvi_codegen.runs.stepper import Stepper
-from scvi_codegen.systems.splittings.kinetic import kinetic_splitting
 
 SHORT = 2.0**-40
 SHORT_STEPS = 64
@@ -87,9 +83,7 @@ def _compensated(tested: SystemUnderTest) -> bool:
 
 def _has_compensation(tested: SystemUnderTest) -> bool:
     """Return True if the method has fixed-point iterations or leapfrog steps, which use the compensation."""
-    split = kinetic_splitting(tested.moved)
-    explicit = not isinstance(split, str) and tested.method.explicit_step(split) is not None
-    return explicit or tested.stepper.interface.has_fallback
+    return Discretisation(tested.moved, tested.method).explicit or tested.stepper.interface.has_fallback
 
 
 def _advanced(
@@ -176,11 +170,9 @@ def _lanes(tested: SystemUnderTest, starts: list[State], steps: int, carry: Arra
     """Yield final state and compensation terms of each lane, as :func:`_advanced`."""
     q, p = (np.array([getattr(start, name) for start in starts]) for name in "qp")
     first, m = starts[0], len(carry) // 2
-    settings = EnsembleSettings(h=first.h, steps=steps, t=first.t, parameters=tested.parameters)
-    work = runs_of(Ensemble.of(tested.stepper, q, p, settings))
-    assert isinstance(work, CommonRuns)
+    settings = {"h": first.h, "steps": steps, "t": first.t, "parameters": tested.parameters}
+    work: Any = tested.stepper.ensemble_runs(q, p, settings)
     batch = work.batch()
-    assert isinstance(batch, LaneRuns)
     block = batch.part(0, min(batch.width, len(starts)))
     block.begin()
     block.lanes("carry_q")[:] = carry[:m, None]

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.api.formulas import Tape, mp
+from scvi_codegen.api.methods import Discretisation
 from scvi_codegen.api.states import Array
 from scvi_codegen.api.systems import MechanicalSystem
 from scvi_codegen.extras.exact.solution import ExactMotion, exact_motion, numbers
@@ -23,7 +24,6 @@ from scvi_codegen.extras.verification.system_under_test import (
 )
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.trajectory import Trajectory
-from scvi_codegen.systems.time_transformation import time_rescaling_function
 
 ERROR_RATIO = 100.0
 """Largest ratio of the error in t to that in tau: the quadrature of dt = g dtau has an error of the same order."""
@@ -222,7 +222,7 @@ def _follow_step_density(runs: VariableSteps) -> Finding:
 def _density_deviation(runs: VariableSteps, run: Trajectory, tau: float) -> float:
     """Return the largest relative deviation of the steps from tau (g_k + g_{k+1}) / 2."""
     system = runs.motion.system
-    rate = time_rescaling_function(system, runs.stepper.interface.time_transformation, in_time=True)
+    rate = Discretisation.time_rate(system, runs.stepper.interface.time_transformation)
     symbols = (*system.coordinates, *system.auxiliaries, system.time, *system.parameters)
     parameters = [mp.mpf(value) for value in system.defaults]
     tape, g = Tape([rate], symbols), []

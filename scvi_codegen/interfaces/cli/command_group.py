@@ -22,7 +22,6 @@ import click
 from click.shell_completion import CompletionItem
 
 from scvi_codegen.codegen.native.announcements import announce_to
-from scvi_codegen.common.atomic import write_text
 from scvi_codegen.common.errors import (
     AccuracyWarning,
     BuildError,
@@ -166,6 +165,10 @@ def errors_as_messages(arguments: Sequence[str] = ()) -> Iterator[None]:
             yield
     except (StepFailedError, UnresolvedError, PathError, BuildError, RecordingError) as error:
         raise CommandFailure(str(error)) from error
+    except click.ClickException as error:
+        if type(error) is click.ClickException:  # of an extra
+            raise CommandFailure(error.message) from None
+        raise
     except ScviCodegenError as error:
         cause = error.__cause__
         unwritten = isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError)
@@ -177,7 +180,7 @@ def errors_as_messages(arguments: Sequence[str] = ()) -> Iterator[None]:
     except MemoryError as error:
         raise CommandFailure("not enough memory") from error
     except KeyboardInterrupt as error:
-        raise CommandFailure("interrupted", INTERRUPTED) from error
+        raise CommandFailure(str(error) or "interrupted", INTERRUPTED) from error
 
 
 @contextmanager
@@ -258,25 +261,18 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def check_writable(path: Path, hint: str) -> None:
+def check_writable(path: Path, hint: str, *, states: bool = False) -> None:
     """Raise an error of usage unless a file can be written; ``hint`` names the option that requires it.
 
-    Called before long computations.
+    Called before long computations; of a file of ``states`` format and library are checked, too.
     """
+    if states:
+        from scvi_codegen.runs.results.export import check_format  # not needed for --help
+
+        check_format(path)
     if path.is_dir() and path.suffix.lower() != ".zarr":
         raise click.BadParameter(f"'{path}' is a folder", param_hint=hint)
     if not path.parent.is_dir():
         raise click.BadParameter(f"there is no folder '{path.parent}'", param_hint=hint)
     if not os.access(path.parent, os.W_OK):
         raise click.BadParameter(f"the folder '{path.parent}' is not writable", param_hint=hint)
-
-
-def emit(text: str, /, output: str | None, **numbers: Any) -> None:
-    """Print a text, or write it to a file atomically; ``numbers`` as for :func:`tell`."""
-    if output is None:
-        tell(text, **numbers)
-        return
-    check_writable(Path(output), "'-o'")
-    write_text(output, text.rstrip("\n") + "\n")
-    tell(**numbers, written=[output])
-    note(f"wrote {output}")

@@ -40,8 +40,6 @@ from scvi_codegen.interfaces.models.options import (
 from scvi_codegen.interfaces.models.problems import PROBLEMS, problem
 from scvi_codegen.methods import ARGUMENTS, METHODS, size_of, specification_of
 
-MOST_COORDINATES = 2000
-"""Largest number of coordinates of an array model that is compiled with its sizes: its equations are unrolled."""
 Choices = Mapping[str, Any]
 """Options of the command line that override MODEL, by name; ``None`` or an empty tuple for options that are absent."""
 OFFERED_SIZES = range(1, 17)
@@ -192,12 +190,15 @@ _folders = click.option(
 
 
 def model_arguments(*further: str, required: bool = True) -> Callable[[Command], Command]:
-    """Return the decorator that adds the argument MODEL, the options that override it, and further ones by name."""
+    """Return the decorator that adds the argument MODEL and the options that override it.
+
+    ``further``: names of other options, or of the section of model files that is theirs, as ``"family"``.
+    """
 
     def decorated(command: Command) -> Command:
         command = _folders(command)
         for option in reversed(OPTIONS):
-            if option.common or option.name in further:
+            if option.common or not {option.name, option.section}.isdisjoint(further):
                 command = _flag(option)(command)
         return click.argument(
             "model_name", metavar="MODEL" if required else "[MODEL]", required=required, shell_complete=complete_model
@@ -259,13 +260,3 @@ def read_model(name: str, choices: Choices, steps: Mapping[str, float] | None = 
         except SystemDefinitionError as error:
             raise SystemDefinitionError(f"{error} (There is no model file '{name}' either.)") from error
     return catalogue_model(name, sections)
-
-
-def with_known_sizes(model: Model, option: str) -> Model:
-    """Return the model of named coordinates that an option requires."""
-    if model.array_system is not None and model.dimension > MOST_COORDINATES:
-        raise click.UsageError(
-            f"{option} compiles an array model with its sizes, which is limited to {MOST_COORDINATES} coordinates: "
-            f"omit {option}, or reduce the sizes ({model.dimension} coordinates here)"
-        )
-    return model.with_known_sizes()

@@ -4,7 +4,7 @@ import math
 import os
 import shlex
 import time
-from collections.abc import Callable, Container
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -50,17 +50,16 @@ def check_output(output: str, *, ensemble: bool = False) -> None:
         if not ensemble:
             formats = f"a trajectory is written as {export.FORMATS} or into a folder {SUFFIX}"
         raise click.BadParameter(f"{formats}, not as '{output}'", param_hint="'-o'")
-    export.check_format(output)
-    check_writable(Path(output), "'-o'")
+    check_writable(Path(output), "'-o'", states=True)
 
 
-def check_resumed(context: click.Context, allowed: Container[str] = WITH_RESUME, defines: str = OF_RUN) -> None:
+def check_resumed(context: click.Context) -> None:
     """Reject options that would change what ``--resume`` continues."""
     for name in context.params:
         passed = context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT
-        if passed and name not in allowed:
+        if passed and name not in WITH_RESUME:
             word = "MODEL" if name == "model_name" else f"--{name.replace('_', '-')}"
-            raise click.UsageError(f"{word} is not allowed with --resume: {defines}")
+            raise click.UsageError(f"{word} is not allowed with --resume: {OF_RUN}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

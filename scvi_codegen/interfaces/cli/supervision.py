@@ -6,6 +6,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
+from typing import Any
 
 import click
 
@@ -62,10 +63,21 @@ def interruptions() -> Iterator[list[int]]:
 
 
 @contextlib.contextmanager
-def progress_bar(steps: int, label: str = "integrating") -> Iterator[Callable[[int], None]]:
-    """Show a bar on stderr if that is a terminal; the function it yields takes the number of completed steps."""
+def progress_bar(steps: int, label: str = "integrating") -> Iterator[Callable[..., Any]]:
+    """Show a bar on stderr if that is a terminal and not ``--quiet``.
+
+    Yields a function of the number of completed steps, and of a text that is shown beside the bar; it returns whether
+    there is a bar.
+    """
     if not sys.stderr.isatty() or steps == 0 or is_quiet():
-        yield lambda done: None
+        yield lambda done, text="": False
         return
-    with click.progressbar(length=steps, label=label, file=sys.stderr) as bar:
-        yield lambda done: bar.update(done - bar.pos)
+
+    def show(done: int, text: str = "") -> bool:
+        bar.current_item = text
+        bar.update(done - bar.pos)
+        bar.render_progress()
+        return True
+
+    with click.progressbar(length=steps, label=label, file=sys.stderr, item_show_func=lambda text: text) as bar:
+        yield show

@@ -13,10 +13,11 @@ import numpy as np
 from scvi_codegen.codegen.lowering.arrays import check_solver
 from scvi_codegen.codegen.variants import SUMS
 from scvi_codegen.common.display.cards import Html, card, listed, plain
-from scvi_codegen.common.errors import ModelFileError, StateError
+from scvi_codegen.common.errors import ArgumentError, ModelFileError, StateError
 from scvi_codegen.common.representation import summary
-from scvi_codegen.common.validation import check_kind
+from scvi_codegen.common.validation import check_kind, keyword_hint
 from scvi_codegen.interfaces.models.options import (
+    FURTHER,
     RUN_FIELDS,
     STATE,
     VELOCITY,
@@ -33,19 +34,23 @@ from scvi_codegen.systems.arrays.system import ArraySystem
 from scvi_codegen.systems.first_order import FirstOrderSystem
 from scvi_codegen.systems.formulas.symbols import input_parameters
 from scvi_codegen.systems.rolling import unroll_sums
-from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS, MechanicalSystem
+from scvi_codegen.systems.system import MechanicalSystem
 
 if TYPE_CHECKING:
     from scvi_codegen.codegen.native.options import SolverOptions
+    from scvi_codegen.codegen.rendering.source import Interface
     from scvi_codegen.interfaces.models.input_tables import InputTable
     from scvi_codegen.runs.accuracy.global_error import GlobalError
     from scvi_codegen.runs.driver.run import Run
     from scvi_codegen.runs.driver.segments import Input
     from scvi_codegen.runs.states.validation import Array
     from scvi_codegen.runs.stepper import Stepper
+    from scvi_codegen.runs.stepping.array_interface import RunArrays
     from scvi_codegen.runs.trajectory import Trajectory
     from scvi_codegen.systems.event import Event
 
+MOST_COORDINATES = 2000
+"""Largest number of coordinates of an array model that commands compile with its sizes: its equations are unrolled."""
 DEFAULT_METHOD = SVI(8)
 """Default method; this object, unlike an equal one, says that none was named."""
 
@@ -120,7 +125,7 @@ class Model(TimeSpan):
         return card(self.system.name, facts, Html(formula) if formula else plain(repr(self.system)))
 
     def __post_init__(self) -> None:
-        check_kind(SYSTEM_OR_ARRAYS, self.system, "system", ModelFileError)
+        check_kind(MechanicalSystem.OR_ARRAYS, self.system, "system", ModelFileError)
         if self.mesh is None:
             object.__setattr__(self, "mesh", self.system.mesh)
         object.__setattr__(self, "page", _with_lists(self.page))
@@ -209,6 +214,34 @@ class Model(TimeSpan):
             span=entry.span,
         )
 
+    @classmethod
+    def of_arguments(cls, function: str, system: MechanicalSystem, arguments: Mapping[str, Any]) -> Model:
+        """Return the model of a system with the other attributes as ``arguments`` of a function.
+
+        Raises:
+            ArgumentError: for an argument that is no attribute, with the likely name.
+        """
+        accepted = [name for name in cls.__dataclass_fields__ if name not in ("system", *FURTHER)]
+        for name in arguments:
+            if name not in accepted:
+                raise ArgumentError(f"{function}() takes no {name!r}{keyword_hint(name, accepted)}")
+        return cls(**{"system": system, "method": DEFAULT_METHOD, **arguments})
+
+    def arrays(self, interface: Interface) -> RunArrays:
+        """Return sizes, state, fields and tables of array sizes known at run time; StateError if they do not agree."""
+        from scvi_codegen.runs.stepping.array_interface import read_arrays
+
+        return read_arrays(interface, self.q, self.fields, self.tables)
+
+    def absolute_tolerances(self, interface: Interface) -> tuple[float, ...]:
+        """Return the absolute tolerance of each coordinate; none if all are 0."""
+        if self.absolute_tolerance is None:
+            return ()
+        from scvi_codegen.runs.stepping.step_plan import absolute_tolerances, checked_absolute_tolerance
+
+        values = checked_absolute_tolerance(self.absolute_tolerance)
+        return tuple(absolute_tolerances(interface, interface.dimension, values).tolist())
+
     @property
     def method_of_runs(self) -> Method:
         """Method of runs with the steps of this model: that of their tolerance if no method was named."""
@@ -237,13 +270,21 @@ class Model(TimeSpan):
         """Number m of coordinates."""
         return len(self.q) if self.array_system is None else sum(map(np.size, self.q.values()))
 
-    def with_known_sizes(self) -> Model:
+    def with_known_sizes(self, option: str = "") -> Model:
         """Return the model of the same motion with all array entries as named coordinates, which has every feature.
 
         Compiling it takes time that grows with the number of coordinates.
+
+        Raises:
+            ModelFileError: above ``MOST_COORDINATES`` if an option of a command requires it, which the error names.
         """
         if (system := self.array_system) is None:
             return self
+        if option and self.dimension > MOST_COORDINATES:
+            raise ModelFileError(
+                f"{option} compiles an array model with its sizes, which is limited to {MOST_COORDINATES} coordinates: "
+                f"omit {option}, or reduce the sizes ({self.dimension} coordinates here)"
+            )
         unrolled = unroll_sums(system, self.sizes, tables=self.tables, parameters=self.fields)
         state = {name: getattr(self, name) for name in STATE.values() if getattr(self, name) is not None}
         if not system.rotations:

@@ -123,3 +123,15 @@ def exact_gauss_four() -> tuple[tuple[Expressions, ...], Expressions, Expression
         (w1 + w5, v1 + w3 + v4, v1 + w3 - v4, w1),
     )
     return A, (2 * w1, 2 * v1, 2 * v1, 2 * w1), (half - w2, half - v2, half + v2, half + w2)
+
+
+def exact_part(part: Nodes | Quadrature | Tableau) -> list[Any] | None:
+    """Return all exact points, weights and coefficients of a part of a method, or None."""
+    if isinstance(part, Tableau):
+        tableau = exact_tableau(part)
+        return None if tableau is None else [x for row in (*tableau[0], *tableau[1:]) for x in row]
+    if isinstance(part, Quadrature):
+        rule = exact_rule(part)
+        return None if rule is None else [x for group in rule for x in group]
+    points = exact_points(part)
+    return None if points is None else [*points]

@@ -7,7 +7,7 @@ from typing import TypeAlias
 import sympy
 
 from scvi_codegen.common.display.cards import Html, grid, plain
-from scvi_codegen.common.display.mathml import mathml
+from scvi_codegen.common.display.mathml import Typeset
 from scvi_codegen.common.display.tables import TableBlock
 from scvi_codegen.common.precision import Number, Vector, mp
 from scvi_codegen.methods.tables.closed_forms import exact_points, exact_rule, exact_tableau
@@ -60,7 +60,7 @@ def _listed(title: str, series: range, columns: Sequence[_Column]) -> TableBlock
 def numbers_html(table: TableBlock) -> Html:
     """Return the first rows of a table for a notebook."""
     shown = table.rows[:MOST_ROWS]
-    rows = [[plain(cell) if isinstance(cell, str) else Html(mathml(cell)) for cell in row] for row in shown]
+    rows = [[plain(cell) if isinstance(cell, str) else Html(Typeset.whole(cell)) for cell in row] for row in shown]
     left_out = len(table.rows) - len(rows)
     title = f"{table.name} (the first {MOST_ROWS} of {len(table.rows)} rows)" if left_out else table.name
     return grid(rows, head=table.columns, caption=title)

@@ -10,7 +10,7 @@ from scvi_codegen.runs.accuracy.resolution import warn_of_unresolved_fields
 from scvi_codegen.runs.accuracy.size import RESOLVED, roundoff
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runs.results.energy import energy_reason
-from scvi_codegen.runs.results.saved_states import SavedStates, parameters_on_sides
+from scvi_codegen.runs.results.saved_states import SavedStates
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.memory import Memory
 from scvi_codegen.runs.stepping.step_plan import Adaptive, FixedSteps
@@ -144,7 +144,7 @@ def _changed_energies(
     errors. ``ends``: the energies if they are known. Velocities are computed only if these differ.
     """
     stepper, q = states.stepper, np.asarray(states.q)
-    sides = [(k, parameters_on_sides(states, states.t[k])) for k in (0, -1)]
+    sides = [(k, states.parameters_on_sides(states.t[k])) for k in (0, -1)]
     try:
         first, last = ends or (
             float(stepper._energies_of(states.t[[k]], states.q[[k]], states.p[[k]], parameters)[0])

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native.options import SolverOptions
-from scvi_codegen.runs.results.saved_states import parameters_on_sides, times_of_changes
+from scvi_codegen.runs.results.saved_states import times_of_changes
 
 Array = NDArray[np.float64]
 
@@ -59,7 +59,7 @@ def _apart(
     (q, p), binding = (np.ascontiguousarray(np.asarray(x)[rows]) for x in (part.q, part.p)), stepper.binding
     pieces, ends = (counts - before).astype(np.int64), np.empty((2, *q.shape))
     arguments = *map(binding.pointer, (np.ascontiguousarray(part.t[rows]), h)), binding.whole_numbers(pieces)
-    parameters = parameters_on_sides(part, float(part.t[rows[0]]))
+    parameters = part.parameters_on_sides(float(part.t[rows[0]]))
     pointers = map(binding.pointer, (q, p, *ends))
     status, _ = stepper._call_steps("pieces", parameters, options, len(rows), *arguments, *pointers)
     if status:

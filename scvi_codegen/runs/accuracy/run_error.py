@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.codegen.variants import Derivatives
 from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError
+from scvi_codegen.common.representation import with_uncertainty
 from scvi_codegen.common.thread_pool import run_jobs
 from scvi_codegen.runs.accuracy.size import (
     RESOLVED,
@@ -42,7 +43,7 @@ from scvi_codegen.runs.results.dense_output import parameters_set_until
 from scvi_codegen.runs.results.joining import concatenated
 from scvi_codegen.runs.results.output import ALL_STATES
 from scvi_codegen.runs.results.recomputation import motion_by_reactions, steps_after
-from scvi_codegen.runs.results.saved_states import Array, SavedStates, parameters_on_sides, times_of_changes
+from scvi_codegen.runs.results.saved_states import Array, SavedStates, times_of_changes
 from scvi_codegen.runs.states.rotations import members_of
 from scvi_codegen.runs.states.words import low_words, with_low
 from scvi_codegen.runs.stepping.features import refusal, require
@@ -105,6 +106,15 @@ class RunError:
     proportional: int = sys.maxsize
     _run: Any = field(repr=False)
 
+    def relative_until(self, rows: int) -> tuple[Array, Array]:
+        """Return (2, m) sizes of the first ``rows`` states and (rows,) running maxima of relative errors."""
+        return relative_until(self, rows)
+
+    def roundings(self, sizes: Array) -> Array:
+        """Return the (n,) largest bounds of rounding errors relative to (2, m) sizes, 0 where they are unknown."""
+        deviations = DEVIATIONS * np.stack([self.rounding_q, self.rounding_p], axis=1)
+        return np.asarray(np.nan_to_num(relative(deviations, sizes).max(axis=(1, 2))))
+
     @property
     def lost(self) -> float | None:
         """First time at which ``relative`` is 0.1 or more, an order of magnitude only; ``None`` if there is none."""
@@ -137,28 +147,6 @@ class RunError:
         if self.lost is not None:
             lines.append(f"no meaningful digits from t = {self.lost:g}")
         return "\n".join([*lines, self.reason] if self.reason else lines)
-
-
-def with_uncertainty(value: float, error: float) -> str:
-    """Return a value with the uncertain digits of its error in parentheses: ``0.512345(12)`` is 0.512345 +- 0.000012.
-
-    The error has two digits, rounded up; an error above the value is written in full, ``3(12)``.
-    """
-    if not (math.isfinite(value) and math.isfinite(error)):
-        return f"{value:.3g}(lost)"
-    if error == 0.0:
-        return repr(float(value))
-    decimals = 1 - math.floor(math.log10(error))
-    digits = math.ceil(error * 10.0**decimals - 1e-9) if abs(decimals) < 300 else 0
-    if digits >= 100:
-        digits, decimals = 10, decimals - 1
-    exponent = math.floor(math.log10(abs(value))) if value else -decimals
-    if -5 < exponent < 16 and decimals >= 0:
-        return f"{value:.{decimals}f}({digits})"
-    shown = max(0, decimals + exponent)
-    if decimals + exponent < 0:
-        digits = math.ceil(error / 10.0**exponent)
-    return f"{value / 10.0**exponent:.{shown}f}({digits})e{exponent:+03d}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -319,7 +307,7 @@ def leave_out_rounding(run: Any, bounds: Array, entries: Array) -> None:
         if parts[k] > so_far:  # a new maximum
             determined = np.zeros(tiny.shape[0], bool)
             q, t = np.asarray(run.q[k]), float(run.t[k])
-            determined[determined_coordinates(run.stepper, q, t, parameters_on_sides(run, t))] = True
+            determined[determined_coordinates(run.stepper, q, t, run.parameters_on_sides(t))] = True
             entries[:, tiny[:, k] & determined, k] = 0.0
             so_far = max(so_far, entries[:, :, k].max())
 
@@ -462,7 +450,7 @@ class _Replay:
         """Transport the errors over single steps between two rows of a part that begins at the row ``first``."""
         t, h = np.ascontiguousarray(piece.t[begin:end]), np.ascontiguousarray(steps_after(piece, begin, end))
         q, p = (np.ascontiguousarray(np.asarray(column)[begin : end + 1]) for column in (piece.q, piece.p))
-        starts, parameters = Starts(t, h, q, p), parameters_on_sides(piece, float(piece.t[begin]))
+        starts, parameters = Starts(t, h, q, p), piece.parameters_on_sides(float(piece.t[begin]))
         for k, (part, defects) in enumerate(self._defects(starts, parameters)):
             resolved, row = defects.parts > 0, begin + k * MOST_STEPS
             for start, stop in _alike(resolved):
@@ -521,7 +509,7 @@ class _Replay:
         fine = run._recorded(None, ALL_STATES)
         parts = list[tuple[Starts, Defects]]()
         if not (len(times_of_changes(fine)) or (fine.modes is not None and len(fine.modes.t))):
-            h, sides = steps_after(fine, 0, len(fine) - 1), parameters_on_sides(fine, t)
+            h, sides = steps_after(fine, 0, len(fine) - 1), fine.parameters_on_sides(t)
             times, h, x, y = (np.ascontiguousarray(of) for of in (fine.t, h, fine.q, fine.p))
             parts = self._defects(Starts(times, h, x, y), sides)  # of rounding, as states have no low words
         if parts and all(defects.parts.all() for _, defects in parts):
@@ -610,7 +598,7 @@ def corrected_states(run: Any, error: RunError) -> CorrectedStates:
             q[:, member.columns], p[:, member.columns] = unit, p[:, member.columns] - along * unit
     velocity = np.full_like(q, np.nan)
     for k in np.flatnonzero(np.isfinite(q).all(axis=1)).tolist():
-        parameters = parameters_on_sides(run, float(run.t[k]))
+        parameters = run.parameters_on_sides(float(run.t[k]))
         if stepper.interface.constraints:
             q[k], p[k], _ = projected(stepper, q[k], p[k], float(run.t[k]), parameters)
         velocity[k] = stepper.velocity(q[k], p[k], float(run.t[k]), parameters)

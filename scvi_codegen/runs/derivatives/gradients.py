@@ -17,8 +17,8 @@ from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.runs.derivatives.transformed_derivatives import time_of
 from scvi_codegen.runs.events.saltation import Jump, jumps_within
-from scvi_codegen.runs.results.recomputation import SAME_STEP_SIZE, check_recomputed, steps_after, steps_between
-from scvi_codegen.runs.results.saved_states import SavedStates, parameters_on_sides
+from scvi_codegen.runs.results.recomputation import check_recomputed, steps_after, steps_between
+from scvi_codegen.runs.results.saved_states import SavedStates
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.step_derivatives import LinearisedMethod, Sensitivity, Starts
 from scvi_codegen.runs.stepping.step_plan import FixedSteps
@@ -162,7 +162,7 @@ def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], ve
             vectors[last] = vectors[last] @ jumps[last].matrix
         part = starts.part(first, last) if jumps else starts
         ends = states.stepper._propagate(
-            part, vectors[first : last + 1], parameters_on_sides(states, part.t[0]), states.options, transpose=back
+            part, vectors[first : last + 1], states.parameters_on_sides(part.t[0]), states.options, transpose=back
         )
         saved = np.concatenate([part.q, part.p], axis=1)
         if last in jumps:
@@ -218,4 +218,4 @@ def _has_fixed_step_size(states: SavedStates) -> bool:
         return False
     spans = np.diff(states.stepped)
     steps = np.rint(spans / states.h)
-    return bool((np.abs(spans - steps * states.h) <= SAME_STEP_SIZE * abs(states.h) * np.maximum(1.0, steps)).all())
+    return bool((np.abs(spans - steps * states.h) <= FixedSteps.SAME * abs(states.h) * np.maximum(1.0, steps)).all())

@@ -5,13 +5,13 @@ respect to the initial data times a direction v is J^T F'' J v plus F' contracte
 states along v: tangent propagation, then second-order adjoints.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.runs.derivatives.gradients import (
@@ -28,10 +28,12 @@ from scvi_codegen.runs.derivatives.gradients import (
     starts_of,
     tangents_from_directions,
 )
+from scvi_codegen.runs.results.recomputation import changes_by_events
 from scvi_codegen.runs.results.saved_states import SavedStates
 from scvi_codegen.runs.states.validation import Array, columns_of_inputs
 from scvi_codegen.runs.stepping.features import require
-from scvi_codegen.runs.stepping.step_derivatives import LinearisedMethod, Sensitivity
+from scvi_codegen.runs.stepping.step_derivatives import LinearisedMethod, Sensitivity, Starts
+from scvi_codegen.systems.event import Crossings
 
 
 def checked_function(
@@ -204,6 +206,22 @@ class TrajectoryDerivatives(SavedStates):
             now = second_order_adjoints(part, run_seeds, curved, tangents, self._without_inputs(now))
             by_runs.append(now[1])
         return self._gradient(by_runs[::-1], columns.shape[1:])
+
+    def tangent_segments(self) -> Iterator[tuple[Starts, NDArray[np.intp]]]:
+        """Yield the steps of segments, and (steps + 1,) indices of the saved states at their ends, -1 for others."""
+        return (starts_of(self, first, last) for first, last in pieces(self))
+
+    def propagate_tangents(self, starts: Starts, numbers: NDArray[np.intp], vectors: Array) -> None:
+        """Fill (steps + 1, k, variables) tangent vectors from the first ones, and compare the steps with the run."""
+        propagate(self, starts, numbers, vectors, back=False)
+
+    def changes_by_events(self) -> Iterator[tuple[Crossings, NDArray[np.intp]]]:
+        """Yield the crossings of each event that changes the state, and the rows of the states after them."""
+        return changes_by_events(self)
+
+    def tangents_at(self, tangents: Array) -> tuple[Array, Array]:
+        """Return (n, outputs, k) tangent vectors at the states and (k, variables) at the end, from (k, variables)."""
+        return forward(self, tangents)
 
     @property
     def _fixed_indices(self) -> list[int]:

@@ -30,7 +30,7 @@ from scvi_codegen.runs.events.contacts import in_first_modes
 from scvi_codegen.runs.results.dense_output import check_has_end, times_of_run
 from scvi_codegen.runs.states.validation import (
     Array,
-    EnsembleParameters,
+    Parameters,
     States,
     check_inputs_given,
     check_left_to_inputs,
@@ -59,7 +59,7 @@ def checked_ensemble(stepper: Integrator, q: States, other: States, name: str) -
 
 
 def momenta_of_each(
-    stepper: Integrator, q: States, p: States | None, velocity: States | None, t: float, parameters: EnsembleParameters
+    stepper: Integrator, q: States, p: States | None, velocity: States | None, t: float, parameters: Parameters
 ) -> States:
     """Return the momenta of states specified by p or by velocity, each with its own parameters."""
     if velocity is None and p is not None:
@@ -85,7 +85,7 @@ def momenta_of_each(
 
 
 def start_of_ensemble(
-    stepper: Integrator, q: States, p: States, t: float, parameters: EnsembleParameters, durations: ArrayLike = 0.0
+    stepper: Integrator, q: States, p: States, t: float, parameters: Parameters, durations: ArrayLike = 0.0
 ) -> tuple[Array, Array, Array]:
     """Return (k, m) positions and momenta, projected onto constraints, and (k, number of parameters) parameters.
 
@@ -123,7 +123,7 @@ class EnsembleSettings:
     save_every: int = 1
     t: float = 0.0
     t_eval: ArrayLike | None = None
-    parameters: EnsembleParameters = None
+    parameters: Parameters = None
     options: SolverOptions | None = None
     error: float | None = None
     observe: str | None = None

@@ -9,7 +9,7 @@ import numpy as np
 from scvi_codegen.codegen.native.options import REASONS
 from scvi_codegen.common.errors import AccuracyWarning, ContactError, EventWarning, MethodError, warn
 from scvi_codegen.runs.events.contact_changes import Rows
-from scvi_codegen.runs.results.saved_states import Array, SavedStates, parameters_on_sides
+from scvi_codegen.runs.results.saved_states import Array, SavedStates
 from scvi_codegen.runs.states.validation import Parameters, States
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.systems.contacts.rows import ContactMode
@@ -151,7 +151,7 @@ def contact_modes(states: Any) -> list[tuple[float, tuple[str, ...]]]:
     starts = [float(states.t[0]), *states.modes.t.tolist()] if states.modes is not None else [float(states.t[0])]
     result: list[tuple[float, tuple[str, ...]]] = []
     for t in starts:
-        named = stepper.parameters_by_name(parameters_on_sides(states, t))
+        named = stepper.parameters_by_name(states.parameters_on_sides(t))
         names = tuple(contact.mode(named).value for contact in stepper.interface.contacts)
         if not result or result[-1][1] != names:
             result.append((t, names))
@@ -169,7 +169,7 @@ def contact_forces(states: Any) -> Array:
     forces = np.zeros((len(states), len(contacts), 1 + max(1, *(contact.slips for contact in contacts))))
     unique = True
     for row, (q, p, t) in enumerate(zip(states.q, states.p, states.t.tolist(), strict=True)):
-        parameters = parameters_on_sides(states, t)
+        parameters = states.parameters_on_sides(t)
         named = stepper.parameters_by_name(parameters)
         blocks = [np.ascontiguousarray(part, float) for part in (q, p, parameters)]
         binding.function("contact_forces")(t, *map(binding.pointer, (*blocks, total)), binding.workspace())

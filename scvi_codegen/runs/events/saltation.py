@@ -29,7 +29,6 @@ from scvi_codegen.common.errors import StateError
 from scvi_codegen.runs.events.contact_changes import Rows, change_at, kept_direction, slip_of
 from scvi_codegen.runs.results.dense_output import states_at
 from scvi_codegen.runs.results.recomputation import changes_by_events, steps_after
-from scvi_codegen.runs.results.saved_states import parameters_on_sides
 from scvi_codegen.runs.states.times import WHOLE
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.integrator import Integrator
@@ -117,8 +116,8 @@ def jumps_within(
         t, state = float(states.t[0]), np.concatenate([states.q[0], states.p[0]])
         rows = [len(states) - 1, 0, min(1, len(states) - 1)]
         ends = np.concatenate([states.q[rows], states.p[rows]], axis=1)
-        check_sides(stepper, ends, states.t[rows].tolist(), float(starts.h[0]), parameters_on_sides(states, t))
-        here = Place(states, t, parameters_on_sides(states, t), all_inputs)
+        check_sides(stepper, ends, states.t[rows].tolist(), float(starts.h[0]), states.parameters_on_sides(t))
+        here = Place(states, t, states.parameters_on_sides(t), all_inputs)
         matrix = _with_directions(here, np.eye(stepper._input_size), state, 0.0 * here.parameters)
         matrix[:, [len(state) + column for column in stepper.mode_columns]] = 0.0
         jumps[0] = Jump(matrix, state)
@@ -171,7 +170,7 @@ def _check_grazes(states: SavedStates, numbers: NDArray[np.intp], changed: Array
 
     def values(t: Array, q: Array, p: Array) -> Array:
         at = zip(q, p, t.tolist(), strict=True)
-        return np.array([_event_values(stepper, *state, parameters_on_sides(states, state[-1])) for state in at])
+        return np.array([_event_values(stepper, *state, states.parameters_on_sides(state[-1])) for state in at])
 
     t = states.t[first:last]
     if not isinstance(states.plan, FixedSteps):  # adaptive steps may be as long as the motion from zero to zero
@@ -190,7 +189,7 @@ def _check_grazes(states: SavedStates, numbers: NDArray[np.intp], changed: Array
             near = np.abs(values(times, *states_at(states, times))[:, k])
             beside = np.clip(near.argmin(), 2, SAMPLES - 3) + np.array([-2, 2])
             ends, near = times[beside], near[beside[0] : beside[1] + 1]
-        place = Place(states, float(ends.mean()), parameters_on_sides(states, float(ends.mean())), False)
+        place = Place(states, float(ends.mean()), states.parameters_on_sides(float(ends.mean())), False)
         if near.min() <= TOUCH * scale and _jumps_at(place, event, k):
             raise _graze(event, place.t)
 
@@ -223,7 +222,7 @@ def _end_of_part(states: SavedStates, starts: Starts, k: int, row: int) -> Jump:
     matrix, by_size = np.eye(size), np.eye(size)[-1]
     if isinstance(states.plan, FixedSteps) and row + 1 < len(states) and abs(steps - round(steps)) > WHOLE * steps:
         start, t = (starts.q[k - 1], starts.p[k - 1], float(starts.h[k - 1])), float(starts.t[k - 1])
-        ends = stepper._products(*start, t, parameters_on_sides(states, t), states.options, by_size[np.newaxis])
+        ends = stepper._products(*start, t, states.parameters_on_sides(t), states.options, by_size[np.newaxis])
         matrix = _moved_back(matrix, ends[0, : 2 * stepper.dimension], by_size)
     return Jump(matrix, np.concatenate([starts.q[k], starts.p[k]]))
 
@@ -283,7 +282,7 @@ def _turns(states: SavedStates, numbers: NDArray[np.intp]) -> dict[int, tuple[Ev
     for k, places in _directions(states.stepper):
         event = Transition(function="1", contact=k, kind="turns", gap="slip")
         for row in np.searchsorted(states.t, history.t).tolist():
-            old, new = (parameters_on_sides(states, float(states.t[n]))[places[:2]] for n in (row - 1, row))
+            old, new = (states.parameters_on_sides(float(states.t[n]))[places[:2]] for n in (row - 1, row))
             if numbers[0] < row <= numbers[-1] and not np.array_equal(old, new):
                 result[row] = event, np.concatenate([states.q[row], states.p[row]])
     return result
@@ -300,11 +299,11 @@ def _jump(
     stepper, options = states.stepper, states.options
     m, size = stepper.dimension, stepper._input_size
     t, after = float(states.t[row]), np.concatenate([states.q[row], states.p[row]])
-    sides = (parameters_on_sides(states, time) for time in (float(starts.t[k - 1]), t))
+    sides = (states.parameters_on_sides(time) for time in (float(starts.t[k - 1]), t))
     here, later = (Place(states, t, parameters, all_inputs) for parameters in sides)
 
     def products(state: Array, h: float, time: float, seeds: Array) -> Array:
-        sides = parameters_on_sides(states, time)
+        sides = states.parameters_on_sides(time)
         return stepper._products(state[:m], state[m:], h, time, sides, options, seeds)[:, : 2 * m].T
 
     start = np.concatenate([starts.q[k - 1], starts.p[k - 1]])

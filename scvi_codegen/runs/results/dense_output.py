@@ -22,7 +22,7 @@ from scvi_codegen.codegen.native.arguments import checked_number, real_array
 from scvi_codegen.codegen.native.options import step_failure
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.runs.results.output import Output
-from scvi_codegen.runs.results.saved_states import ROUNDINGS, SavedStates, parameters_on_sides
+from scvi_codegen.runs.results.saved_states import ROUNDINGS, SavedStates
 from scvi_codegen.runs.results.time_transformation import part_of_step, states_in_transformed_time
 from scvi_codegen.runs.states.words import Words, fraction_of, low_words, split, with_low
 from scvi_codegen.runs.stepping.features import require
@@ -119,7 +119,7 @@ def _take_partial_steps(states: SavedStates, t: Array, h: Array, q: Array, p: Ar
     for k, begin, length in zip(numbers.tolist(), t[numbers].tolist(), h[numbers].tolist(), strict=True):
         q_k, p_k = q_start + k * m, p_start + k * m
         if states.stepper.modes:
-            parameters = binding.pointer(sides := parameters_on_sides(states, begin))  # noqa: F841  (kept for C)
+            parameters = binding.pointer(sides := states.parameters_on_sides(begin))  # noqa: F841  (kept for C)
         status = step(begin, length, q_k, p_k, parameters, options, q_k, p_k, report, workspace)
         if status:
             raise step_failure(status, report, step=0, h=length, failures=binding.failures)

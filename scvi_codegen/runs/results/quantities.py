@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scvi_codegen.codegen.rendering.source import Interface
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.representation import one_line
-from scvi_codegen.runs.results.saved_states import SavedStates, in_modes, parameters_on_sides
+from scvi_codegen.runs.results.saved_states import SavedStates, in_modes
 from scvi_codegen.runs.states.rotation_quantities import values_by_name
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.integrator import Integrator
@@ -66,7 +66,7 @@ def quantities(stepper: Integrator, parameters: Array, t: Array, q: Array, p: Ar
 
 def quantities_of(states: SavedStates, t: Array, q: Array, p: Array) -> dict[str, Array]:
     """Return the quantities of some of the states of a run that keeps its modes."""
-    return quantities(states.stepper, parameters_on_sides(states, float(states.t[0])), t, q, p)
+    return quantities(states.stepper, states.parameters_on_sides(float(states.t[0])), t, q, p)
 
 
 def quantities_in_modes(states: SavedStates) -> dict[str, Array]:

@@ -14,20 +14,13 @@ from numpy.typing import NDArray
 
 from scvi_codegen.common.errors import ScviCodegenError, StateError
 from scvi_codegen.runs.results.dense_output import whole_steps
-from scvi_codegen.runs.results.saved_states import (
-    ROUNDINGS,
-    STEP_END_TOLERANCE,
-    Array,
-    SavedStates,
-    parameters_on_sides,
-)
+from scvi_codegen.runs.results.saved_states import ROUNDINGS, STEP_END_TOLERANCE, Array, SavedStates
 from scvi_codegen.runs.stepping.projection import linearised, multipliers
+from scvi_codegen.runs.stepping.step_plan import FixedSteps
 from scvi_codegen.systems.event import Crossings, Transition
 
 REACTIONS = 4
 """Number of states of a run whose constraint forces are computed."""
-SAME_STEP_SIZE = 1e-9
-"""Largest relative difference of step sizes that are equal."""
 SAME_TIME = 4 * float(np.finfo(float).eps)
 """Largest difference of times that are equal, relative to the largest one."""
 SAME_STATE = 1e-6
@@ -47,7 +40,7 @@ def work_and_impulses_until(states: SavedStates) -> Array:
     ):
         count, q, p = steps_between(length, span), states.q[k], states.p[k]
         total = values[-1]
-        step = partial(stepper.work_and_impulses, parameters=parameters_on_sides(states, start), options=states.options)
+        step = partial(stepper.work_and_impulses, parameters=states.parameters_on_sides(start), options=states.options)
         for j in range(count):
             q, p, output = step(q, p, length if count > 1 else span, start + j * length)
             total = total + output
@@ -95,7 +88,7 @@ def steps_after(states: SavedStates, first: int, last: int) -> Array:
     """
     spans, lengths = np.diff(states.stepped[first : last + 1]), states.step_sizes[first:last]
     rounding = ROUNDINGS * np.finfo(float).eps * np.abs(states.stepped[first + 1 : last + 1])
-    return np.where(np.abs(spans - lengths) < SAME_STEP_SIZE * np.abs(lengths) + rounding, lengths, spans)
+    return np.where(np.abs(spans - lengths) < FixedSteps.SAME * np.abs(lengths) + rounding, lengths, spans)
 
 
 def steps_between(length: float, span: float) -> int:
@@ -149,7 +142,7 @@ def motion_by_reactions(states: Any, t: Array, q: Array, p: Array) -> Array:
     for k in range(0, len(t), -(-len(t) // REACTIONS)):
         with suppress(StateError), np.errstate(all="ignore"):  # constraints that are dependent
             at = float(t[k])
-            parameters = parameters_on_sides(states, at)
+            parameters = states.parameters_on_sides(at)
             impulse = longest * (
                 multipliers(stepper, q[k], p[k], at, parameters)[0] @ linearised(stepper, at, parameters)(q[k])[1]
             )
@@ -181,7 +174,7 @@ def _exchanged_at_events(states: SavedStates, energy: Array, *, by_contacts: boo
         touching[rows] |= isinstance(crossings.event, Transition)
         states_before = zip(rows.tolist(), crossings.q, crossings.p, crossings.t.tolist(), strict=True)
         for row, q, p, t in states_before:
-            value = stepper.energy(q, p, t, parameters_on_sides(states, float(states.t[row - 1])))
+            value = stepper.energy(q, p, t, states.parameters_on_sides(float(states.t[row - 1])))
             if not abs(value - energy[row - 1]) >= abs(before[row] - energy[row - 1]):  # NaN: none
                 before[row] = value
     here = np.isfinite(before) & (touching == by_contacts)

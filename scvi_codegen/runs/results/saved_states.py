@@ -16,7 +16,7 @@ from scvi_codegen.common.errors import MethodError
 from scvi_codegen.runs.states.words import scalar
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.memory import Memory
-from scvi_codegen.runs.stepping.step_plan import Fixed, StepPlan
+from scvi_codegen.runs.stepping.step_plan import Fixed, FixedSteps, StepPlan
 
 Array = NDArray[np.float64]
 ROUNDINGS, STEP_END_TOLERANCE = 4.0, 1e-6
@@ -61,6 +61,11 @@ class SavedStates:
         return self.t if self.tau is None else self.tau
 
     @property
+    def has_fixed_steps(self) -> bool:
+        """Whether the steps have one size, but for those that end at events and output times."""
+        return isinstance(self.plan, FixedSteps)
+
+    @property
     def forward(self) -> float:
         """1, or -1 for a run backward in time."""
         return math.copysign(1.0, self.t[-1] - self.t[0])
@@ -73,6 +78,20 @@ class SavedStates:
 
     def __len__(self) -> int:
         return len(self.t)
+
+    def parameters_on_sides(self, t: float) -> Array:
+        """Return the parameters of the steps after time t, with the modes of contacts and kinks in the run."""
+        modes = getattr(self, "modes", None)
+        if modes is None:
+            if len(self.stepper.modes) > len(self.stepper.interface.mode_names):
+                raise MethodError(
+                    "values of parameters that events set are not stored in recordings: energies and other functions "
+                    "of parameters are those of integrate(..) with the same events"
+                )
+            return self.parameters
+        parameters = self.parameters.copy()
+        parameters[self.stepper.mode_columns] = modes.at(t, self.forward)
+        return parameters
 
     def _restarted(self, k: int, h: float) -> Memory:
         """Return a run from saved state k with fixed steps h."""
@@ -118,21 +137,6 @@ class ModeHistory:
         return cls(np.concatenate([part.t for part in histories]), np.concatenate(values), ambiguous, missed)
 
 
-def parameters_on_sides(states: SavedStates, t: float) -> Array:
-    """Return the parameters of the steps after time t, with the modes of contacts and kinks in the run."""
-    modes = getattr(states, "modes", None)
-    if modes is None:
-        if len(states.stepper.modes) > len(states.stepper.interface.mode_names):
-            raise MethodError(
-                "values of parameters that events set are not stored in recordings: energies and other functions of "
-                "parameters are those of integrate(..) with the same events"
-            )
-        return states.parameters
-    parameters = states.parameters.copy()
-    parameters[states.stepper.mode_columns] = modes.at(t, states.forward)
-    return parameters
-
-
 def times_of_changes(states: Any) -> Array:
     """Return the sorted times of events that change the state, and of transitions of contacts and kinks."""
     transitions = getattr(states, "transitions", ())
@@ -148,11 +152,11 @@ def in_modes(states: SavedStates, quantity: Callable[[Any, Any, Any, Array], Arr
     """Return a (n, ..) quantity of (q, p, t, parameters), with the modes after each state."""
     modes = getattr(states, "modes", None)
     if modes is None or not len(modes.t):
-        return quantity(states.q, states.p, states.t, parameters_on_sides(states, float(states.t[-1])))
+        return quantity(states.q, states.p, states.t, states.parameters_on_sides(float(states.t[-1])))
     rows = np.searchsorted(states.forward * modes.t, states.forward * states.t, side="right")
     parts = [np.flatnonzero(rows == number) for number in np.unique(rows)]
     values = [
-        quantity(states.q[part], states.p[part], states.t[part], parameters_on_sides(states, float(states.t[part[0]])))
+        quantity(states.q[part], states.p[part], states.t[part], states.parameters_on_sides(float(states.t[part[0]])))
         for part in parts
     ]
     return np.concatenate(values)

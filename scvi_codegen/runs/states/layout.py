@@ -28,7 +28,6 @@ from scvi_codegen.common.errors import StateError
 from scvi_codegen.runs.states.rotations import check_names, column, joined_columns, members_of, state_of
 from scvi_codegen.runs.states.validation import (
     Array,
-    EnsembleParameters,
     Parameters,
     States,
     check_lengths,
@@ -180,7 +179,7 @@ class StateLayout:
         check_lengths(self.interface, numbers)
         return numbers
 
-    def parameters_of_each(self, values: EnsembleParameters, count: int) -> Array:
+    def parameters_of_each(self, values: Parameters, count: int) -> Array:
         """Return (k, number of parameters) values: defaults replaced by name, one or k numbers each, or by an array."""
         numbers = parameters_of_each(self.interface, values, count, np.asarray(self.interface.defaults, dtype=float))
         for j, row in enumerate(numbers if self.interface.lengths else ()):
@@ -375,7 +374,7 @@ class TwoWordLayout(StateLayout):
         words: Array = with_low(numbers, parameter_values(self.interface, low, before))
         return words
 
-    def parameters_of_each(self, values: EnsembleParameters, count: int) -> Array:
+    def parameters_of_each(self, values: Parameters, count: int) -> Array:
         """Return the parameter values of each trajectory in two words."""
         high, low = split(values, "parameters")
         none = np.zeros(len(self.interface.defaults))

@@ -1,6 +1,5 @@
 """States and parameters of an integrator: validation against its interface, and arrays and single names by name."""
 
-import difflib
 import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -169,10 +168,11 @@ SEQUENCES, NUMBERS = (list, tuple), frozenset((float, int, np.float64))
 """Types of short vectors, and of their entries, that are converted without NumPy."""
 States = ArrayLike | Mapping[str, Any]
 """Positions, momenta or velocities: numbers in order, or arrays by name."""
-Parameters = Mapping[str, Any] | Sequence[float] | Array | None
-"""Parameters, also arrays of known sizes, by name (others have their defaults), or all in order."""
-EnsembleParameters = Mapping[str, ArrayLike] | Sequence[Any] | Array | None
-"""Parameters of trajectories: values by name, of all or of each; or rows."""
+Parameters = Mapping[str, Any] | Sequence[Any] | Array | None
+"""Parameters, also arrays of known sizes, by name (others have their defaults), or all in order.
+
+Of an ensemble a value by name may be one of all trajectories or one of each, and several rows are those of each.
+"""
 
 
 def is_vector(value: Any) -> bool:
@@ -227,7 +227,7 @@ def _with_modes(interface: Interface, values: Array) -> Array:
     return values
 
 
-def parameters_of_each(interface: Interface, argument: EnsembleParameters, count: int, defaults: Array) -> Array:
+def parameters_of_each(interface: Interface, argument: Parameters, count: int, defaults: Array) -> Array:
     """Return (k, number of parameters) values: defaults replaced by name, one or k numbers each, or by an array."""
     names = interface.parameters
     values = np.empty((count, len(defaults)))
@@ -310,13 +310,13 @@ def parameter_columns(interface: Interface, parameters: Mapping[str, Any]) -> It
     for name, value in parameters.items():
         shape = () if name in interface.parameters else arrays.get(name, ())
         if not shape:
-            yield name, parameter_index(interface, name), value
+            yield name, interface.parameter_index(name), value
             continue
         array = real_array(value, f"the parameter {name}")
         if array.ndim and array.shape[max(0, array.ndim - len(shape)) :] != shape:
             raise StateError(f"the parameter {name} must have the shape {shape}, not {array.shape}")
         size = math.prod(shape)
-        first = parameter_index(interface, "_".join([name, *("0" for _ in shape)])) if size else 0
+        first = interface.parameter_index("_".join([name, *("0" for _ in shape)])) if size else 0
         leading = array.shape[: array.ndim - len(shape)]
         yield name, slice(first, first + size), array.reshape(*leading, size) if array.ndim else array
 
@@ -373,16 +373,3 @@ def no_input(name: str, inputs: Collection[str]) -> StateError:
 def columns_of_inputs(interface: Interface) -> list[int]:
     """Return the indices of the parameters of inputs: coefficients by power, and the breakpoint they refer to."""
     return [interface.parameters.index(f"{name}_{part}") for name in interface.inputs for part in "0123t"]
-
-
-def parameter_index(interface: Interface, name: str) -> int:
-    """Return the index of a parameter; raise ``StateError`` with the nearest name if unknown."""
-    names = interface.parameters
-    if name in names:
-        return names.index(name)
-    folded = {parameter.lower(): parameter for parameter in names}
-    near = [folded[key] for key in difflib.get_close_matches(str(name).lower(), folded, 1)]
-    if not names:
-        raise StateError(f"there is no parameter {name!r}: '{interface.system}' has none. Declare it in its definition")
-    hint = f"; did you mean {near[0]!r}?" if near else ""
-    raise StateError(f"there is no parameter {name!r} among {', '.join(interface.own_parameters)}{hint}")

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from scvi_codegen.codegen.variants import Derivatives
-from scvi_codegen.common.errors import MethodError, MethodWarning, ScviCodegenError, StateError, closest, warn
-from scvi_codegen.common.representation import clipped
+from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError, closest
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
+from scvi_codegen.systems.kinks import warn_of_formulas
 
 OPERATIONS = {
     "adaptive": "adaptive step size (t_end without h)",
@@ -292,21 +292,6 @@ def require(stepper: Any, operation: str, *together: str) -> None:
     if operation in BY_FORMULAS and stepper.interface.modes and not stepper.warned_of_kinks:
         stepper.warned_of_kinks = True
         warn_of_formulas(stepper.interface, OPERATIONS[operation])
-
-
-def warn_of_formulas(of: Any, subject: str) -> None:
-    """Warn that steps do not end at kinks of a system or an interface, other than rint and cutoffs of lists."""
-    kinks = [u for u in of.kinks if not (u.startswith("cos(pi*") or of.lengths)]
-    if kinks:
-        u, loop, indices = kinks[0].partition(" for ")
-        remedy = "Use short steps (h=, max_step=), or sizes= with at most 256 switching functions"
-        if getattr(of, "temperature", None) is not None:
-            remedy = "Use short steps (h=) or, with named coordinates, metropolis=True: its averages have no error of h"
-        warn(
-            f"{subject} does not locate the kinks of this system, such as {clipped(u, 60)} = 0{loop}{indices}: steps "
-            f"across them use the formulas as they are and lose order. {remedy}",
-            MethodWarning,
-        )
 
 
 def refusal_of(stepper: Any, operation: str, *together: str) -> ScviCodegenError | None:

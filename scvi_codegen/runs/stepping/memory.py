@@ -18,15 +18,7 @@ from scvi_codegen.codegen.native.options import SolverOptions, checked_options, 
 from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.common.validation import LARGEST_COUNT, checked_count
 from scvi_codegen.runs.states.layout import InitialData
-from scvi_codegen.runs.states.validation import (
-    Array,
-    Parameters,
-    States,
-    inputs_not_given,
-    missing_input,
-    no_input,
-    parameter_index,
-)
+from scvi_codegen.runs.states.validation import Array, Parameters, States, inputs_not_given, missing_input, no_input
 from scvi_codegen.runs.states.words import Word, Words, stacked, with_low, word
 from scvi_codegen.runs.stepping.chunks import drive
 from scvi_codegen.runs.stepping.features import require
@@ -153,7 +145,7 @@ class Memory:
         self._h = cast("float | None", NO_PLAN.h)  # fixed step size; None for other steps
         self.longest, self._can_measure_growth = 0.0, hasattr(memory, "measures_growth")
         self._sums_action = hasattr(memory, "actions")
-        firsts = {name: parameter_index(stepper.interface, f"{name}_0") for name in stepper.interface.inputs}
+        firsts = {name: stepper.interface.parameter_index(f"{name}_0") for name in stepper.interface.inputs}
         self._inputs = {name: slice(first, first + 5) for name, first in firsts.items()}
         self._ranges = {name: limits for name, *limits in stepper.interface.input_ranges}
 

@@ -7,13 +7,13 @@ from fractions import Fraction
 from typing import Any, NamedTuple, Self, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.codegen.rendering.source import Interface
 from scvi_codegen.common.errors import AccuracyWarning, StateError, closest, warn
 from scvi_codegen.common.validation import check_tolerance, checked_count
-from scvi_codegen.runs.states.times import steps_to
+from scvi_codegen.runs.states.times import steps_to, steps_within, times_after
 from scvi_codegen.runs.states.validation import coordinate_shapes
 from scvi_codegen.runs.states.words import check_doubles
 from scvi_codegen.runs.stepping.features import FEATURES, refusal
@@ -34,12 +34,26 @@ AbsoluteTolerance: TypeAlias = float | tuple[tuple[str, float], ...]
 class FixedSteps:
     """Steps of one size h, of tau in transformed time; base of :class:`Fixed` and :class:`Until`."""
 
+    SAME = 1e-9  # relative difference of step sizes that rounding explains
     h: float
+
+    def times(self, t: float, numbers: ArrayLike) -> NDArray[np.float64]:
+        """Return the times after these numbers of steps from t, correctly rounded."""
+        return times_after(t, self.h, numbers)[0]
+
+    def number_in(self, spans: ArrayLike) -> NDArray[np.intp]:
+        """Return the number of equal steps not longer than |h| in each span > 0; StateError if too large."""
+        return steps_within(spans, self.h)
 
 
 @dataclass(frozen=True, slots=True)
 class Fixed(FixedSteps):
     """Fixed steps, as many as a call requests."""
+
+    @classmethod
+    def checked(cls, h: Any) -> Self:
+        """Return the plan of an argument; StateError unless it is a finite number other than 0."""
+        return cls(checked_step(h))
 
 
 @dataclass(frozen=True, slots=True)

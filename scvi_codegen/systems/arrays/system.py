@@ -23,7 +23,7 @@ so G M^-1 G^T is sparse; its pattern is that of the net and is known when a run 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import chain
@@ -39,11 +39,20 @@ from scvi_codegen.common.validation import OfRunTimeSizes, of
 from scvi_codegen.systems.checks.continuity import corner_in, irregularity
 from scvi_codegen.systems.checks.definition import warn_of_negative, warn_of_unused
 from scvi_codegen.systems.forces import check_damping
-from scvi_codegen.systems.formulas.array_statements import ArrayForce, latex_sum
-from scvi_codegen.systems.formulas.arrays import ArrayTerm, parse_array, parse_coordinate
+from scvi_codegen.systems.formulas.array_statements import (
+    ArrayForce,
+    array_text,
+    formula_of_entries,
+    is_indexed,
+    latex_entry,
+    latex_sum,
+    latex_sums,
+)
+from scvi_codegen.systems.formulas.arrays import MAX_UNROLLED_TERMS, ArrayTerm, parse_array, parse_coordinate, term_of
 from scvi_codegen.systems.formulas.expressions import gradient, gradient_tuple, hessian, kinks_of, unsupported_part
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED, Access, Array, Convolution, Loop, Size
 from scvi_codegen.systems.formulas.neighbours import Neighbours
+from scvi_codegen.systems.formulas.numpy_values import Elements
 from scvi_codegen.systems.formulas.rotations import MemberArray
 from scvi_codegen.systems.formulas.symbols import DOT, check_names, input_formulas, symbol
 from scvi_codegen.systems.system import BATH_ENERGY, MechanicalSystem
@@ -645,6 +654,59 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
                 raise SystemDefinitionError(
                     f"the table {table} must be declared with a size and a number of columns, as bonds[B, 2]"
                 )
+
+    def derivatives(self, term: ArrayTerm, variables: tuple[Array, ...]) -> tuple[tuple[Access, Expr], ...]:
+        """Return the derivatives of a term by its entries of arrays."""
+        return force_of(term, variables).targets
+
+    MAX_UNROLLED_TERMS = MAX_UNROLLED_TERMS
+    """Largest number of terms of a sum that may be written out."""
+
+    @staticmethod
+    def assembled(**fields: Any) -> ArraySystem:
+        """Return the system of its fields, a Hamiltonian if these have momenta."""
+        system = (ArrayHamiltonian if fields.get("momenta") else ArrayLagrangian)(**fields)
+        system.warn_of_mistakes()
+        return system
+
+    @staticmethod
+    def term(loops: tuple[Loop, ...], formula: Expr, accesses: Mapping[Symbol, Access]) -> ArrayTerm:
+        """Return the term of a formula over loops, with the accesses by symbol that occur in it."""
+        return term_of(loops, formula, accesses)
+
+    @staticmethod
+    def elements(loops: Sequence[Loop], sizes: Mapping[str, int], tables: Mapping[str, Any]) -> Elements:
+        """Return all index values of loops, and the values of formulas there, in NumPy."""
+        return Elements(loops, sizes, tables)
+
+    @staticmethod
+    def formula_text(formula: Expr) -> str:
+        """Return a formula in index notation as text."""
+        return array_text(formula)
+
+    @staticmethod
+    def is_indexed(text: str) -> bool:
+        """Return whether a formula contains entries or sums of arrays."""
+        return is_indexed(text)
+
+    @staticmethod
+    def formula_of_entries(text: str, arrays: Sequence[Array], symbols: Mapping[str, Symbol]) -> Expr:
+        """Return a formula in index notation of arrays of known sizes as a formula of their entries."""
+        return formula_of_entries(text, arrays, symbols)
+
+    @staticmethod
+    def constraint_text(term: ArrayTerm) -> str:
+        """Return a constraint as text."""
+        return constraint_text(term)
+
+    def latex_derivatives(self, term: ArrayTerm) -> Iterator[str]:
+        """Yield the derivatives of a term by its entries of the state in LaTeX, with its summation signs."""
+        from sympy import latex
+
+        entries = {slot: latex_entry(access) for slot, access in term.slots}
+        for access, derivative in self.derivatives(term, self.state):
+            by = rf"\frac{{\partial}}{{\partial {latex_entry(access)}}}"
+            yield rf"{latex_sums(term)} \; {by}: \quad {latex(derivative, symbol_names=entries)}"
 
 
 class ArrayLagrangian(ArraySystem):

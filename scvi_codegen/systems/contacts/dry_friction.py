@@ -20,7 +20,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.common.validation import OfRunTimeSizes
-from scvi_codegen.systems.contact import MOST_ROWS, Friction, rows_of
+from scvi_codegen.systems.contact import MOST_ROWS, Friction
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -51,7 +51,8 @@ def with_dry_friction(system: Any) -> Any:
             if limit := _limit(system, slip, directions, pushes):
                 forces = others
                 contacts.append(Friction(slip if len(slip) > 1 else slip[0], limit))
-    if not contacts or rows_of(whole := (*system.contacts, *contacts)) > MOST_ROWS:
+    whole = (*system.contacts, *contacts)
+    if not contacts or sum(item.rows for item in whole) > MOST_ROWS:
         return system
     return replace(system, forces=forces, contacts=whole)
 

@@ -22,7 +22,6 @@ from scvi_codegen.systems.contact import (
     ContactLike,
     Friction,
     Impacts,
-    rows_of,
     slips_of,
     static_limit,
 )
@@ -117,7 +116,7 @@ class _Binding:
         """Return the system with these contacts."""
         expressions, rows = [], []
         elements = [element for item in contacts for element in self._elements(item)]
-        if (count := rows_of(elements)) > MOST_ROWS:
+        if (count := sum(element.rows for element in elements)) > MOST_ROWS:
             raise SystemDefinitionError(
                 f"'{self.system.name}' has {count} gaps and slips of contacts, of at most {MOST_ROWS}: leave some out"
             )

@@ -23,6 +23,7 @@ import sympy
 from sympy import Add, Expr, Function, Mul, Pow, Rational, S, Symbol, log
 from sympy.core.function import AppliedUndef
 
+from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.systems.formulas.adjoints import Elimination, Gradient, gradient_by_adjoints
 from scvi_codegen.systems.formulas.intermediates import (
@@ -188,6 +189,26 @@ class Tape:
             raise ArithmeticError("a value is not a finite real number: the state is outside the domain of the formula")
         return results
 
+    @classmethod
+    def samples(cls, expressions: Sequence[Expr]) -> Iterator[list[Number]]:
+        """Yield values in 60 digits at reproducible random points of order 1, without those where one is undefined.
+
+        Raises:
+            SystemDefinitionError: for what is outside the grammar.
+        """
+        if problem := next(filter(None, map(unsupported_part, expressions)), None):
+            raise SystemDefinitionError(problem)
+        symbols = sorted(set().union(*(expression.free_symbols for expression in expressions)), key=str)
+        tape, generator = cls(expressions, symbols), random.Random(20250101)
+        for _ in range(ATTEMPTS):
+            with suppress(ArithmeticError):
+                yield tape([mp.mpf(generator.uniform(0.3, 1.3)) for _ in symbols])
+
+    @staticmethod
+    def cancels(terms: Sequence[Expr]) -> bool:
+        """Return whether the sum of terms is zero at random points; false where it is undefined."""
+        return sums_to_zero(terms)
+
     def _place(self, expression: sympy.Expr) -> int:
         """Return the index of an expression's value, appending the operations that compute it."""
         if expression in self._places:
@@ -236,15 +257,6 @@ NEGLIGIBLE = mp.mpf(10) ** -40
 """Largest sum that counts as 0, relative to the sum of the absolute values of its terms."""
 
 
-def samples(expressions: Sequence[Expr]) -> Iterator[list[Number]]:
-    """Yield values in 60 digits at reproducible random points of order 1, without those where one is undefined."""
-    symbols = sorted(set().union(*(expression.free_symbols for expression in expressions)), key=str)
-    tape, generator = Tape(expressions, symbols), random.Random(20250101)
-    for _ in range(ATTEMPTS):
-        with suppress(ArithmeticError):
-            yield tape([mp.mpf(generator.uniform(0.3, 1.3)) for _ in symbols])
-
-
 def cancel(terms: Sequence[Number]) -> bool:
     """Return whether the sum of numbers is 0 to 40 digits, relative to their sizes or to 1."""
     return bool(abs(mp.fsum(terms)) <= NEGLIGIBLE * (1 + mp.fsum(map(abs, terms))))
@@ -252,7 +264,7 @@ def cancel(terms: Sequence[Number]) -> bool:
 
 def sums_to_zero(terms: Sequence[Expr]) -> bool:
     """Return whether the sum of terms is zero at ``SAMPLES`` random points; false where it is undefined."""
-    values = list(islice(samples(terms), SAMPLES)) if Add(*terms) != 0 else [[mp.zero]] * SAMPLES
+    values = list(islice(Tape.samples(terms), SAMPLES)) if Add(*terms) != 0 else [[mp.zero]] * SAMPLES
     zeros = (abs(mp.fsum(parts)) <= NEGLIGIBLE * mp.fsum(map(abs, parts)) for parts in values)
     return len(values) == SAMPLES and all(zeros)
 

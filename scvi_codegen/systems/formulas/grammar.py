@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Container, Iterable, Mapping
-from typing import ClassVar, NamedTuple, NoReturn
+from typing import Any, ClassVar, NamedTuple, NoReturn
 
 from sympy import Add, Expr, Mul, Pow, Rational, S, Symbol
 
@@ -92,12 +92,13 @@ class Token(NamedTuple):
     column: int
 
 
-def parse_expression(text: str, symbols: Mapping[str, Symbol]) -> Expr:
+def parse_expression(text: str | Expr, symbols: Mapping[Any, Expr]) -> Expr:
     """Parse one formula.
 
     Args:
-        text: the formula; line breaks count as spaces.
-        symbols: the names it may use, in addition to ``pi`` and the names of ``FUNCTIONS``.
+        text: the formula; line breaks count as spaces. Also a SymPy expression, whose constructors are evaluated.
+        symbols: the names it may use, in addition to ``pi`` and the names of ``FUNCTIONS``; of a SymPy expression the
+            parts that are replaced.
 
     Returns:
         The SymPy expression, free of floating-point numbers.
@@ -109,7 +110,7 @@ def parse_expression(text: str, symbols: Mapping[str, Symbol]) -> Expr:
     >>> parse_expression("0.5*x**2 - cos(2*x)/3", {"x": x})
     x**2/2 - cos(2*x)/3
     """
-    return parsed(Parser(text, symbols))
+    return evaluated(text, symbols) if isinstance(text, Expr) else parsed(Parser(text, symbols))
 
 
 def named_tables(functions: Iterable[tuple[str, Table]], names: Container[str] = ()) -> dict[str, NamedTable]:

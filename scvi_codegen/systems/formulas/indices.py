@@ -82,6 +82,34 @@ class Array:
     letters: str = ""
     is_field: bool = field(default=False, compare=False)
 
+    @staticmethod
+    def size(name: str, number: int = 0) -> Size:
+        """Return the size ``name + number``; a whole number if ``name`` is empty."""
+        return Size(name, number)
+
+    @staticmethod
+    def loop(index: str, first: Size, end: Size, *, periodic: bool = False) -> Loop:
+        """Return the loop over an index from ``first`` to ``end`` - 1, which a periodic one wraps."""
+        return Loop(index=index, first=first, end=end, periodic=periodic)
+
+    @staticmethod
+    def place(index: str = "", **further: Any) -> Place:
+        """Return the place of an index; ``base``, ``table``, ``column``, ``minus`` as of :class:`Place`."""
+        return Place(index=index, **further)
+
+    def at(self, *places: Place, sums: Sequence[Convolution] = ()) -> Access:
+        """Return an entry of the array, or of convolutions of it along axes."""
+        return Access(array=self, places=places, sums=tuple(sums))
+
+    def convolution(self, axis: int, index: str) -> Convolution:
+        """Return the sum over an axis with coefficients c[j - i] of this array; ``index`` is shown."""
+        return Convolution(axis, self, index)
+
+    @classmethod
+    def of_shape(cls, name: str, shape: Sequence[int]) -> Array:
+        """Return the array with these sizes."""
+        return cls(name, tuple(Size("", n) for n in shape))
+
     def shape(self, sizes: Mapping[str, int]) -> tuple[int, ...]:
         """Return the numerical shape for the sizes of a run."""
         return tuple(axis.at(sizes) for axis in self.axes)

@@ -118,6 +118,11 @@ class Elements:
                 span[indices[grid.reshape(-1)]] for indices in (first, second)
             )
 
+    @staticmethod
+    def transposed(values: NDArray[Any], access: Access, arrays: Mapping[str, NDArray[Any]]) -> Any:
+        """Return the transposed convolutions of an array in an access."""
+        return convolved(values, access, arrays, -1)
+
     def of(self, access: Access) -> tuple[Any, ...]:
         """Return the indices of an access at all elements, one array or number per axis."""
         return tuple(place.at(self.index, self.sizes, self.tables, self.periods) for place in access.places)

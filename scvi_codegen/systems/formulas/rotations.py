@@ -124,6 +124,15 @@ class Rotation:
         q, _ = _vectors(self.coordinates)
         return tuple(rates_matrix(q).T * Matrix(p) / 2)
 
+    def torque(self, derivatives: Sequence[Expr]) -> Matrix:
+        """Return tau_k = sum_ij D_ij (R hat(e_k))_ij of derivatives D by the nine entries, in the body frame.
+
+        Column j of R hat(e_k) is R (e_k x e_j).
+        """
+        weights: Matrix = Matrix(3, 3, self.entries).T * Matrix(3, 3, list(derivatives))
+        pairs: tuple[tuple[int, int], ...] = ((2, 1), (0, 2), (1, 0))
+        return Matrix([weights[i, j] - weights[j, i] for i, j in pairs])
+
 
 @dataclass(frozen=True, slots=True)
 class _Vector:

@@ -53,8 +53,7 @@ def forces_at_points(
             if isinstance(member, Direction):
                 yield member.name, Matrix([force.dot(point.diff(entry)) for entry in member.entries])
             elif isinstance(member, Rotation):
-                derivatives = Matrix(3, 3, [force.dot(point.diff(entry)) for entry in member.entries])
-                yield member.name, torque_of(Matrix(3, 3, member.entries), derivatives)
+                yield member.name, member.torque([force.dot(point.diff(entry)) for entry in member.entries])
 
 
 def _vectors(
@@ -89,13 +88,6 @@ def _three(formulas: Any, role: str, read: Callable[[Any], Expr]) -> Matrix:
     if not isinstance(formulas, Sequence) or isinstance(formulas, str) or len(formulas) != len(AXES):
         raise SystemDefinitionError(f"{role} must have three components, not {formulas!r}")
     return Matrix([read(formula if isinstance(formula, Expr) else str(formula)) for formula in formulas])
-
-
-def torque_of(matrix: Matrix, derivatives: Matrix) -> Matrix:
-    """Return tau_k = sum_ij D_ij (R hat(e_k))_ij, with column j of R hat(e_k) = R (e_k x e_j)."""
-    weights: Matrix = matrix.T * derivatives
-    pairs: tuple[tuple[int, int], ...] = ((2, 1), (0, 2), (1, 0))
-    return Matrix([weights[i, j] - weights[j, i] for i, j in pairs])
 
 
 def rotations_of_frames(rotations: Mapping[Any, Any] | None) -> tuple[dict[str, str], dict[Expr, Expr]]:

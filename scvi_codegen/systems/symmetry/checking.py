@@ -32,7 +32,7 @@ from scvi_codegen.systems.formulas.grammar import parse_expression
 from scvi_codegen.systems.symmetry.invariants import combined, conserved, gauge_columns, polynomial_in
 from scvi_codegen.systems.symmetry.sampling import Sample, rates_of
 from scvi_codegen.systems.symmetry.symmetry import MAX_SEARCHED_COORDINATES, Symmetry
-from scvi_codegen.systems.system import SYSTEM, MechanicalSystem
+from scvi_codegen.systems.system import MechanicalSystem
 
 
 def integrated(system: MechanicalSystem, change: Expr) -> Expr | None:
@@ -71,7 +71,7 @@ DECIDED_AT = 3
 """Number of points at which the change of L is tested."""
 
 
-@checks_arguments(system=SYSTEM)
+@checks_arguments(system=MechanicalSystem.KIND)
 def check_symmetry(
     system: MechanicalSystem,
     direction: Sequence[Expr | str] | None = None,

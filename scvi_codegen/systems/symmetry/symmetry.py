@@ -42,7 +42,7 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.common.display.cards import Html, card
-from scvi_codegen.common.display.mathml import mathml
+from scvi_codegen.common.display.mathml import Typeset
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import checks_arguments, several
@@ -72,7 +72,7 @@ from scvi_codegen.systems.symmetry.invariants import (
     rotation_columns,
 )
 from scvi_codegen.systems.symmetry.sampling import Rates, rates_of, terms_among_few_bodies
-from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS, MechanicalSystem
+from scvi_codegen.systems.system import MechanicalSystem
 from scvi_codegen.systems.term_groups import roll_terms
 
 MAX_SEARCHED_COORDINATES = 12
@@ -122,9 +122,14 @@ class Symmetry:
         if not occurring.isdisjoint(self.momenta):
             derivatives = gradient_tuple(self.momentum_map, self.coordinates)
             moved += [(p, -rate) for p, rate in zip(self.momenta, derivatives, strict=True)]
-        changes = [f"{mathml(Symbol('delta'))}{mathml(x)} = {mathml(xi)}" for x, xi in moved if xi != 0]
-        facts = [("conserves", Html(mathml(self.momentum_map))), ("direction", Html("; ".join(changes[:MOST_SHOWN])))]
-        facts += [("gauge", Html(mathml(self.gauge)))] if self.gauge != 0 else []
+        changes = [
+            f"{Typeset.whole(Symbol('delta'))}{Typeset.whole(x)} = {Typeset.whole(xi)}" for x, xi in moved if xi != 0
+        ]
+        facts = [
+            ("conserves", Html(Typeset.whole(self.momentum_map))),
+            ("direction", Html("; ".join(changes[:MOST_SHOWN]))),
+        ]
+        facts += [("gauge", Html(Typeset.whole(self.gauge)))] if self.gauge != 0 else []
         return card(f"Symmetry: {self.name}", facts)
 
     def degrees(self) -> set[tuple[int, int, int]] | None:
@@ -158,7 +163,7 @@ SYMMETRIES = several("a list of symmetries", Symmetry)
 def symmetries(system: ArraySystem) -> tuple[ArrayMap, ...]: ...  # type: ignore[overload-overlap]
 @overload
 def symmetries(system: MechanicalSystem) -> tuple[Symmetry, ...]: ...
-@checks_arguments(system=SYSTEM_OR_ARRAYS)
+@checks_arguments(system=MechanicalSystem.OR_ARRAYS)
 @lru_cache(maxsize=64)
 def symmetries(system: MechanicalSystem) -> tuple[Symmetry, ...] | tuple[ArrayMap, ...]:
     """Return the affine symmetries of a system, a basis with short momentum maps: translations, rotations, boosts, ..

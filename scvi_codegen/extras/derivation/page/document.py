@@ -9,16 +9,11 @@ import sympy
 from sympy import Function as Applied
 from sympy import Symbol
 
-from scvi_codegen.api.formulas import gradient_tuple
-from scvi_codegen.api.methods import Discretisation, Method, StageGroup, StageSystem
+from scvi_codegen.api.formulas import jacobian
+from scvi_codegen.api.methods import Discretisation, Method, StageSystem
+from scvi_codegen.api.program import Derivation
 from scvi_codegen.api.systems import MechanicalSystem, forms_of
-from scvi_codegen.api.text import counted
-from scvi_codegen.codegen.ir.kernel import Kernel
-from scvi_codegen.codegen.ir.program import Program
-from scvi_codegen.codegen.lowering.program import step_texts
-from scvi_codegen.codegen.pipeline import c_identifier, program_of
-from scvi_codegen.codegen.rendering.program_source import render
-from scvi_codegen.common.display.tables import TableBlock
+from scvi_codegen.api.text import TableBlock, counted
 from scvi_codegen.extras.derivation.equations import StepEquations, derive
 from scvi_codegen.extras.derivation.notation import contact_lines, events_text, table_entries
 from scvi_codegen.extras.derivation.page.drawings import curve_section, jacobian_section, tables_section
@@ -37,7 +32,6 @@ from scvi_codegen.extras.derivation.writing import (
     page_template,
     style_sheet,
 )
-from scvi_codegen.systems.contacts.modes import in_all_modes
 from scvi_codegen.systems.event import Event
 from scvi_codegen.version import __version__
 
@@ -104,8 +98,10 @@ def _euler_lagrange(system: MechanicalSystem) -> Iterator[Content]:
 
 
 def _hamilton(system: MechanicalSystem) -> Iterator[Content]:
-    by_momenta = gradient_tuple(system.formula, system.auxiliaries)
-    rates = [Formula(rate, velocity, "19a") for rate, velocity in zip(by_momenta, system.velocities, strict=True)]
+    by_momenta = jacobian([system.formula], system.auxiliaries)
+    rates = [
+        Formula(by_momenta.get((0, k), sympy.S.Zero), velocity, "19a") for k, velocity in enumerate(system.velocities)
+    ]
     kicks = [
         Formula(force, Symbol(f"{p.name}_dot"), "19b")
         for p, force in zip(system.auxiliaries, forms_of(system).momentum_rate, strict=True)
@@ -227,7 +223,7 @@ def _unknowns(system: MechanicalSystem, stages: StageSystem) -> str:
     return f"Unknown are {', '.join(names)}{components}: {size} in all. Known are q_k, p_k, t_k and h."
 
 
-def _place(group: StageGroup) -> str:
+def _place(group: Any) -> str:
     first = group.name.partition("_")[0]
     named = FAMILIES.get(first, f"At the points of '{group.name}'")
     return named if len(group.abscissae) == 1 else f"{named}, {len(group.abscissae)} of them"
@@ -235,7 +231,7 @@ def _place(group: StageGroup) -> str:
 
 def derivation_html(system: MechanicalSystem, method: Method, *, events: Sequence[Event] = ()) -> str:
     """Return the derivation of ``method`` for ``system``, with ``events`` of runs, as a self-contained page of HTML."""
-    system = in_all_modes(system)
+    system = Derivation(system, method).in_all_modes
     Discretisation(system, method).check()
     more = [Section(name="events", title="Events", contents=(Listing(events_text(events, system)),))] if events else []
     return page_template("derivation.html.jinja").render(
@@ -250,8 +246,8 @@ def derivation_html(system: MechanicalSystem, method: Method, *, events: Sequenc
 
 
 def _sections(system: MechanicalSystem, method: Method) -> Iterator[Section]:
-    program = program_of(system, method, prefix=c_identifier(system.name))
-    functions = render(program).functions
+    derivation = Derivation(system, method)
+    program, functions = derivation.program, derivation.functions
     stages = Discretisation(system, method).paper
     derived = component_equations(system, method, stages)
     yield system_section(system)
@@ -261,7 +257,7 @@ def _sections(system: MechanicalSystem, method: Method) -> Iterator[Section]:
     yield stage_section(system, stages)
     yield idel_section(system, stages)
     yield component_equations_section(derived)
-    if texts := step_texts(system, method):
+    if texts := derivation.statements:
         yield statements_section(texts)
     yield jacobian_section(system, stages, derived, program)
     yield operations_section(program)
@@ -284,7 +280,7 @@ def statements_section(texts: Mapping[str, str]) -> Section:
 COUNTS = re.compile(r" Operations: .*$")
 
 
-def kernels_of(program: Program) -> tuple[Kernel, ...]:
+def kernels_of(program: Any) -> tuple[Any, ...]:
     """Return every kernel of the C, each name once."""
     kernels = list(program.kernels)
     if program.fixed_point:
@@ -295,7 +291,7 @@ def kernels_of(program: Program) -> tuple[Kernel, ...]:
     return tuple({kernel.name: kernel for kernel in kernels}.values())
 
 
-def operations_section(program: Program) -> Section:
+def operations_section(program: Any) -> Section:
     """Return the section on operations of every kernel before and after sharing of common subexpressions."""
     rows = tuple(
         (
@@ -322,7 +318,7 @@ def operations_section(program: Program) -> Section:
     return Section(name="operations", title="Operation counts", contents=contents)
 
 
-def kernels_section(system: MechanicalSystem, program: Program, functions: Mapping[str, Any]) -> Section:
+def kernels_section(system: MechanicalSystem, program: Any, functions: Mapping[str, Any]) -> Section:
     """Return the section with one pair per kernel: formulas at the left, C at the right."""
     names = _names(system)
     pairs = tuple(_pair(program, kernel, functions, names) for kernel in kernels_of(program))
@@ -349,7 +345,7 @@ def kernel_text(functions: Mapping[str, Any], name: str) -> str:
     return "\n".join(functions[part].text for part in (*parts, name))
 
 
-def _pair(program: Program, kernel: Kernel, functions: Mapping[str, Any], names: Mapping[Symbol, Symbol]) -> SideBySide:
+def _pair(program: Any, kernel: Any, functions: Mapping[str, Any], names: Mapping[Symbol, Symbol]) -> SideBySide:
     function = functions[kernel.name]
     values, partials = (
         [
@@ -379,9 +375,7 @@ h, q, p, v0, g = (Symbol(name) for name in ("h", "q_k", "p_k", "v_0", "g"))
 inverse_mass = Symbol("M__-1")
 
 
-def functions_section(
-    system: MechanicalSystem, method: Method, program: Program, functions: Mapping[str, Any]
-) -> Section:
+def functions_section(system: MechanicalSystem, method: Method, program: Any, functions: Mapping[str, Any]) -> Section:
     """Return the section on functions, from the loop over the steps down: formulas or words left, C right."""
     stages = Discretisation(system, method).equations
     kernels = {kernel.name for kernel in kernels_of(program)}
@@ -419,7 +413,7 @@ def _function_pair(function: Any, start: str, all_formulas: Iterator[Content]) -
     )
 
 
-def _formulas(name: str, system: MechanicalSystem, stages: StageSystem, program: Program) -> Iterator[Content]:
+def _formulas(name: str, system: MechanicalSystem, stages: StageSystem, program: Any) -> Iterator[Content]:
     """Yield the equations that a function computes, if any."""
     if name == "evaluate":
         yield Paragraph(

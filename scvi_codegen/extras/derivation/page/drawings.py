@@ -5,23 +5,20 @@ from dataclasses import dataclass
 from functools import singledispatch
 from html import escape
 from itertools import accumulate
+from typing import Any
 
 import sympy
 from sympy import Function, Identity, KroneckerProduct, MatrixSymbol, Symbol
 
-from scvi_codegen.api.formulas import Vector, jacobian
+from scvi_codegen.api.formulas import Number, jacobian, mp
 from scvi_codegen.api.methods import Method, StageSystem
 from scvi_codegen.api.systems import MechanicalSystem
-from scvi_codegen.api.text import counted
-from scvi_codegen.codegen.ir.program import Program
-from scvi_codegen.common.display.tables import Cell, TableBlock
+from scvi_codegen.api.text import TableBlock, counted
 from scvi_codegen.extras.derivation.equations import StepEquations
 from scvi_codegen.extras.derivation.notation import TableEntry
 from scvi_codegen.extras.derivation.writing import Content, Drawing, Formula, Paragraph, Section, formulas
 from scvi_codegen.methods import SCVI, SVI, Composition, RungeKutta, SpectralCollocation, StoermerVerlet
-from scvi_codegen.methods.tables.number_tables import Part, decimal, number_table, positions, short
 from scvi_codegen.methods.tables.quadrature import Quadrature
-from scvi_codegen.methods.tables.tableau import Tableau
 
 WIDTH, MARGIN, ROW, RADIUS = 640, 30, 74, 5
 TALLEST = 30
@@ -48,9 +45,15 @@ def step_drawing(method: Method) -> Drawing | None:
     return Drawing(svg, caption)
 
 
-def _row(part: Part, y: int) -> str:
+def _positions(part: Any) -> tuple[Number, ...]:
+    """Return the abscissae on the step, in [0, 1], of a tableau, nodes or a quadrature."""
+    positions: tuple[Number, ...] = part.c if hasattr(part, "c") else part.abscissae
+    return positions
+
+
+def _row(part: Any, y: int) -> str:
     line = f'<path d="M{MARGIN} {y}H{WIDTH - MARGIN}" stroke="currentColor" opacity="0.4"/>'
-    marks = [_mark(float(c), y, stem) for c, stem in zip(positions(part), _stems(part), strict=True)]
+    marks = [_mark(float(c), y, stem) for c, stem in zip(_positions(part), _stems(part), strict=True)]
     return line + _text(MARGIN, y - 46, escape(_words(part)), "start") + "".join(marks)
 
 
@@ -66,20 +69,20 @@ def _mark(c: float, y: int, stem: float | None) -> str:
     )
 
 
-def _stems(part: Part) -> list[float | None]:
+def _stems(part: Any) -> list[float | None]:
     """Return heights by weight for a quadrature; ``None`` for nodes and stages."""
     if not isinstance(part, Quadrature):
-        return [None] * len(positions(part))
-    weights: Vector = part.weights
+        return [None] * len(_positions(part))
+    weights: tuple[Number, ...] = part.weights
     largest = max(abs(weight) for weight in weights)
     return [float(TALLEST * weight / largest) for weight in weights]
 
 
-def _words(part: Part) -> str:
-    count = len(positions(part))
+def _words(part: Any) -> str:
+    count = len(_positions(part))
     if isinstance(part, Quadrature):
         return f"{counted(count, 'quadrature point')} ({part.name})"
-    return f"{counted(count, 'stage' if isinstance(part, Tableau) else 'node')} ({part.name})"
+    return f"{counted(count, 'stage' if hasattr(part, 'c') else 'node')} ({part.name})"
 
 
 def _text(x: float, y: float, text: str, anchor: str) -> str:
@@ -102,6 +105,8 @@ CAPTIONS = {
 }
 SHOWN_WITH_PARTS = ("w", "dw", "d", "b")
 """Entries that are part of the tables of quadratures and tableaux."""
+SHORT = 40
+"""Largest number of characters of an exact form that is shown."""
 MOST_CELLS = 40
 """Largest number of rows, and of columns, of a table; of a longer column the first ones are shown."""
 tau, j, s = Symbol("tau"), Symbol("j", integer=True), Symbol("s")
@@ -116,8 +121,8 @@ def curve_section(method: Method) -> Section:
 
 def tables_section(method: Method, entries: tuple[TableEntry, ...]) -> Section:
     """Return the section on nodes, weights, tableaux, and all entries that the equations name."""
-    contents: list[Content] = [number_table(part) for part in method.parts]
-    skipped = {*SHOWN_WITH_PARTS, *("ac" if any(isinstance(part, Tableau) for part in method.parts) else "")}
+    contents: list[Content] = [*method.tables]
+    skipped = {*SHOWN_WITH_PARTS, *("ac" if any(hasattr(part, "c") for part in method.parts) else "")}
     for prefix in dict.fromkeys(entry.name.of for entry in entries):
         if prefix not in skipped:
             contents += _entry_table(prefix, [entry for entry in entries if entry.name.of == prefix])
@@ -132,7 +137,7 @@ def tables_section(method: Method, entries: tuple[TableEntry, ...]) -> Section:
 
 def _entry_table(prefix: str, entries: list[TableEntry]) -> Iterator[Content]:
     """Yield entries of one name: a matrix, or a column if they have one index; say what is left out."""
-    cells: dict[tuple[int, ...], Cell] = {entry.name.indices: _shown(entry) for entry in entries}
+    cells: dict[tuple[int, ...], Any] = {entry.name.indices: _shown(entry) for entry in entries}
     caption = CAPTIONS.get(prefix, f"{prefix}_{{n,j}}: coefficients of the equations")
     if any(len(index) < 2 for index in cells):
         column = tuple((str(index[-1]), cell) for index, cell in sorted(cells.items()))
@@ -148,8 +153,9 @@ def _entry_table(prefix: str, entries: list[TableEntry]) -> Iterator[Content]:
     yield TableBlock(columns=("n", *(f"j = {column}" for column in sorted(columns))), rows=rows, name=caption)
 
 
-def _shown(entry: TableEntry) -> Cell:
-    return entry.exact if short(entry.exact) else decimal(entry.value)
+def _shown(entry: TableEntry) -> Any:
+    is_short = entry.exact is not None and len(str(entry.exact)) <= SHORT
+    return entry.exact if is_short else str(mp.nstr(entry.value, 17))
 
 
 @singledispatch
@@ -371,7 +377,7 @@ MOST_TITLED = 1000
 
 
 def jacobian_section(
-    system: MechanicalSystem, stages: StageSystem, derived: StepEquations | None, program: Program
+    system: MechanicalSystem, stages: StageSystem, derived: StepEquations | None, program: Any
 ) -> Section:
     """Return the section on the sparsity pattern of the Jacobian."""
     pattern = jacobian_pattern(stages, system.dimension)

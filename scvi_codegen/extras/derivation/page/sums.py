@@ -11,20 +11,22 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from typing import Any
 
 import sympy
 from sympy import Symbol
 
 from scvi_codegen.api.formulas import Number
-from scvi_codegen.api.methods import StageGroup, StageSystem
+from scvi_codegen.api.methods import StageSystem
+from scvi_codegen.api.program import Derivation
 from scvi_codegen.api.systems import MechanicalSystem, forms_of
-from scvi_codegen.codegen.lowering.stage_groups import argument_name
-from scvi_codegen.common.display.mathml import RAISED
 from scvi_codegen.extras.derivation.writing import Formula
-from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, Table
+from scvi_codegen.methods.stage_system import Table
 
 ARGUMENTS = {"v": "q_dot", "a": "q_ddot", "j": "q_d3", "s": "q_d4"}
 """Time derivatives of the curve as they are typeset."""
+RAISED = "QVP"
+"""Letters whose first index counts nodes."""
 PLACES = {"start": "k", "end": "k+1"}
 MEANINGS = {
     "L": "L the Lagrangian, whose index says by what it is differentiated",
@@ -40,18 +42,18 @@ MULTIPLIED_FORCES = (
 )
 
 
-def point_index(group: StageGroup, point: object = "n") -> str:
+def point_index(group: Any, point: object = "n") -> str:
     """Return the index of a point of a stage group: n, or k and k + 1 at an end of the step."""
     return PLACES.get(group.name, str(point if len(group.abscissae) > 1 else 1))
 
 
-def argument_symbol(system: MechanicalSystem, gather: Gather, suffix: str) -> Symbol:
+def argument_symbol(system: MechanicalSystem, gather: Any, suffix: str) -> Symbol:
     """Return the symbol of the arguments of a gather at a point."""
-    name = argument_name(system, gather)
+    name = Derivation.argument_name(system, gather)
     return Symbol(f"{ARGUMENTS.get(name, name)}_{suffix}")
 
 
-def result_symbol(system: MechanicalSystem, group: StageGroup, scatter: Scatter, suffix: str) -> Symbol:
+def result_symbol(system: MechanicalSystem, group: Any, scatter: Any, suffix: str) -> Symbol:
     """Return the symbol of the results of a scatter at a point; for gradients, scatters are parallel to gathers."""
     forms = forms_of(system)
     if system.constraints and scatter.results == forms.position_conditions:
@@ -63,18 +65,18 @@ def result_symbol(system: MechanicalSystem, group: StageGroup, scatter: Scatter,
     if group.scalar is None:
         letters = {forms.force: "L_q", forms.momentum: "L_v", forms.euler_lagrange: "E", forms.constitutive: "L_p"}
         return Symbol(f"{letters[scatter.results]}_{suffix}")
-    name = argument_name(system, group.gathers[group.scatters.index(scatter)])
+    name = Derivation.argument_name(system, group.gathers[group.scatters.index(scatter)])
     return Symbol(f"E_{suffix}" if name == "lambda" else f"{scalar_name(group)}_{name}_{suffix}")
 
 
-def scalar_name(group: StageGroup) -> str:
+def scalar_name(group: Any) -> str:
     """Return L, its k-th time derivative along the curve, or S."""
     if group.name == "node":
         return "S"
     return {0: "L", 1: "L_dot"}.get(group.scalar_power, f"L_d{group.scalar_power}")
 
 
-def meaning(group: StageGroup) -> str:
+def meaning(group: Any) -> str:
     """Return the meaning of the letter of a stage group's results."""
     if group.scalar is not None:
         name = scalar_name(group)
@@ -153,7 +155,7 @@ h, n, j = Symbol("h"), Symbol("n", integer=True), Symbol("j", integer=True)
 RUNNING_ROW = "i"
 
 
-def gather_formulas(system: MechanicalSystem, stages: StageSystem, group: StageGroup) -> Iterator[Formula]:
+def gather_formulas(system: MechanicalSystem, stages: StageSystem, group: Any) -> Iterator[Formula]:
     """Yield the arguments of the kernel of a stage group at point n, except those that are unknowns themselves."""
     for gather in group.gathers:
         total, left = gathered(gather.table, stages.blocks), argument_symbol(system, gather, point_index(group))
@@ -166,7 +168,7 @@ def gather_formulas(system: MechanicalSystem, stages: StageSystem, group: StageG
             yield Formula(right, left)
 
 
-def row_formulas(system: MechanicalSystem, stages: StageSystem) -> Iterator[tuple[Row, Formula]]:
+def row_formulas(system: MechanicalSystem, stages: StageSystem) -> Iterator[tuple[Any, Formula]]:
     """Yield the equations; rows that differ in an index alone are one, with the range of the index after the number."""
     lines = [_Line.of(system, stages, r) for r in range(len(stages.rows))]
     for _, alike in groupby(zip(stages.rows, lines, strict=True), key=lambda pair: pair[1].pattern):
@@ -191,7 +193,7 @@ def end_formulas(system: MechanicalSystem, stages: StageSystem) -> tuple[Formula
     )
 
 
-def gathered(table: Table, blocks: Sequence[Block]) -> sympy.Expr:
+def gathered(table: Table, blocks: Sequence[Any]) -> sympy.Expr:
     """Return one line of a table times q_k and the unknowns, as sums over unknowns of one kind."""
     columns = [column_of(table, c) for c in range(len(blocks) + 1)]
     first = columns[0]
@@ -205,7 +207,7 @@ def gathered(table: Table, blocks: Sequence[Block]) -> sympy.Expr:
     return sympy.Add(*terms)
 
 
-def _group_terms(letter: str, group: Sequence[tuple[Column, Block]]) -> Iterator[sympy.Expr]:
+def _group_terms(letter: str, group: Sequence[tuple[Column, Any]]) -> Iterator[sympy.Expr]:
     """Yield unknowns of one kind times their coefficients."""
     columns, numbers = [column for column, _ in group], [int(block.index) for _, block in group]
     factor, span = h ** group[0][1].power, (j, numbers[0], numbers[-1])
@@ -238,8 +240,8 @@ class _Part:
     """Contribution of a scatter to a line: the column of the table, and the result that it multiplies."""
 
     system: MechanicalSystem
-    group: StageGroup
-    scatter: Scatter
+    group: Any
+    scatter: Any
     column: Column
     power: int
 

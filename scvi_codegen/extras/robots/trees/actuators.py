@@ -14,7 +14,7 @@ from itertools import chain
 import numpy as np
 from sympy import Add, Expr, Matrix, S
 
-from scvi_codegen.api.formulas import DOT, input_parameters, symbol
+from scvi_codegen.api.formulas import DOT, Intermediate, input_parameters, symbol
 from scvi_codegen.extras.robots.trees.closures import frames_in_common
 from scvi_codegen.extras.robots.trees.document import Element
 from scvi_codegen.extras.robots.trees.energies import (
@@ -23,14 +23,13 @@ from scvi_codegen.extras.robots.trees.energies import (
     exact_number,
     exact_vector,
     position_of,
+    positive_part,
     rotation_of,
     rotation_vector,
 )
 from scvi_codegen.extras.robots.trees.schema import ACTUATORS, Kind
 from scvi_codegen.extras.robots.trees.tendons import Tendon, length_of, rate_of
 from scvi_codegen.extras.robots.trees.tree import SINGLE, Joint, Link, Pose, Vector, identifier, numbered, symbols_of
-from scvi_codegen.systems.formulas.intermediates import intermediate
-from scvi_codegen.systems.formulas.kinks import positive_part
 
 Motion = tuple[Expr, Expr]
 """Length of an actuator and its rate, times the gear."""
@@ -78,7 +77,7 @@ def motion_of_sites(links: Sequence[Link], ends: Sequence[tuple[int, Pose]], gea
     rate = rate_of(links, Matrix(held).dot(Matrix([*(place - origin), *axes, *-others])))
     turn = rotation_vector(as_quantities(others.T * axes))[0]
     length = force.dot(others.T * (place - origin)) + torque.dot(turn) if ends[1:] else S.Zero
-    return intermediate(length), rate.xreplace(dict(zip(held, loads, strict=True)))
+    return Intermediate.named(length), rate.xreplace(dict(zip(held, loads, strict=True)))
 
 
 def actuator_of(
@@ -113,7 +112,7 @@ def actuator_of(
     names = chain([identifier(label)], numbered(f"ctrl_{identifier(label)}"))
     name = next(x for x in names if taken.isdisjoint({x, *input_parameters([x])}))
     at, along, against = (exact_number(g) * symbol(name) + exact_number(b) for g, b in zip(gain, bias, strict=True))
-    length, rate = motion[0], intermediate(motion[1])
+    length, rate = motion[0], Intermediate.named(motion[1])
     return label, name, controls, (between(at + along * length + against * rate, forces), rate)
 
 
@@ -124,7 +123,7 @@ def in_shared_ranges(
     shared = [*acting]
     for tendon in tendons:
         places = [k for k, target in enumerate(targets) if target == ("tendon", tendon.name)]
-        total, scale = intermediate(Add(*(acting[k][3][0] for k in places))), S.One
+        total, scale = Intermediate.named(Add(*(acting[k][3][0] for k in places))), S.One
         for bound in map(exact_number, tendon.pull if tendon.pull and len(places) > 1 else ()):
             sign = 1 if bound > 0 else -1
             scale *= bound / (bound + sign * positive_part(sign * (total - bound)))

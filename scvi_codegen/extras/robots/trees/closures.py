@@ -14,13 +14,11 @@ from itertools import chain
 import numpy as np
 from sympy import Add, Expr, Matrix, cos, eye, sin
 
-from scvi_codegen.api.formulas import RotationNames, Tape, jacobian, mp, symbol
+from scvi_codegen.api.formulas import Intermediate, RotationNames, Tape, jacobian, mp, symbol
 from scvi_codegen.common.errors import SystemDefinitionWarning, warn
-from scvi_codegen.common.tangent_space import DEPENDENT
 from scvi_codegen.extras.robots.trees.energies import exact_matrix, exact_number, exact_vector, position_of, rotation_of
 from scvi_codegen.extras.robots.trees.tree import SINGLE, Link, Pose, Vector, hat, rounded
-from scvi_codegen.systems.derived_expressions import dense
-from scvi_codegen.systems.formulas.intermediates import intermediate
+from scvi_codegen.extras.robots.variables import matrix_of
 
 ATTEMPTS, ITERATIONS = 4, 20
 """Random points, and iterations from each, for states of the loop; half turns of welds are states of lower rank."""
@@ -58,7 +56,7 @@ def at_reference(links: Sequence[Link], link: int) -> Pose:
 def conditions_of(links: Sequence[Link], closures: Iterable[Closure | Coupling]) -> list[Expr]:
     """Return independent expressions that are 0."""
     groups = [_conditions(links, closure) for closure in closures]
-    conditions = [*map(intermediate, chain.from_iterable(chain.from_iterable(groups)))]
+    conditions = [*map(Intermediate.named, chain.from_iterable(chain.from_iterable(groups)))]
     sizes = [len(group) for parts in groups for group in parts]
     turning = [rotation_of(link.joint) for link in links if link.joint.kind in ("ball", "free")]
     in_coordinates = RotationNames(turning).in_coordinates
@@ -91,7 +89,7 @@ def _independent(conditions: Sequence[Expr], sizes: Sequence[int], reference: Ma
 
     def at(q: Vector) -> tuple[Vector, Vector]:
         values = tape([mp.mpf(x) for x in q.tolist()])
-        rows = dense(entries, values[count:], (count, len(variables)))
+        rows: Vector = matrix_of(entries, values[count:], (count, len(variables)))
         lengths = np.maximum.reduceat(np.linalg.norm(rows, axis=1), first)
         scales = np.repeat(np.where(lengths > 0, lengths, 1.0), sizes)
         return np.array(values[:count], float) / scales, rows / scales[:, None]
@@ -113,7 +111,7 @@ def _pivots(rows: Vector) -> Iterator[int]:
         yield pivot
         unit = rows[pivot] / lengths[pivot]
         rows = rows - np.outer(rows @ unit, unit)
-    if lengths.max() > DEPENDENT:
+    if lengths.max() > NEARLY_DEPENDENT**2:  # of states that satisfy the conditions to NEARLY_DEPENDENT
         share = f"{lengths.max():.1e} of it is independent of the others, as by rounded axes"
         warn(f"an equation of a closed loop is omitted, although {share}", SystemDefinitionWarning)
 
@@ -161,7 +159,7 @@ def _frame(links: Sequence[Link], link: int, pose: Pose, outer: int) -> tuple[Ma
                 turn = turn * (eye(3) + sin(q) * across + (1 - cos(q)) * across * across)
             else:
                 origin += turn * exact_vector(rounded(joint.axis)) * q
-        position = (origin + turn * position).applyfunc(intermediate)
-        axes = (turn * axes).applyfunc(intermediate)
+        position = (origin + turn * position).applyfunc(Intermediate.named)
+        axes = (turn * axes).applyfunc(Intermediate.named)
         link = links[link].parent
     return position, axes

@@ -18,15 +18,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from sympy import Matrix
 
-from scvi_codegen.api.formulas import symbol
+from scvi_codegen.api.formulas import Intermediate, symbol
 from scvi_codegen.extras.robots.trees.closures import at_reference, frames_in_common
 from scvi_codegen.extras.robots.trees.document import Element
 from scvi_codegen.extras.robots.trees.energies import exact_number
 from scvi_codegen.extras.robots.trees.shapes import shape_of, size_of
 from scvi_codegen.extras.robots.trees.tendons import rate_of
 from scvi_codegen.extras.robots.trees.tree import Link, Pose, Vector
-from scvi_codegen.systems.contact import ContactLike, contact
-from scvi_codegen.systems.formulas.intermediates import intermediate
+from scvi_codegen.systems.contact import Contact, Friction, contact
 
 PARTS = {"capsule": "end", "box": "corner"}
 """Names of the spheres of geoms that have several."""
@@ -125,12 +124,12 @@ class Pair(NamedTuple):
             yield Touch(f"{part}{body.title} on {plane.title}", body.link, at, radius, world, friction)
 
 
-def contacts_of(links: Sequence[Link], touches: Iterable[Touch], law: Mapping[str, Any]) -> list[ContactLike]:
+def contacts_of(links: Sequence[Link], touches: Iterable[Touch], law: Mapping[str, Any]) -> list[Contact | Friction]:
     """Return the contacts of spheres with planes that they may reach; ``law``: restitution and law of their impacts."""
     return [made for touch in touches for made in _contact(links, touch, law)]
 
 
-def _contact(links: Sequence[Link], touch: Touch, law: Mapping[str, Any]) -> list[ContactLike]:
+def _contact(links: Sequence[Link], touch: Touch, law: Mapping[str, Any]) -> list[Contact | Friction]:
     ends = (touch.link, Pose(touch.center)), (-1, touch.plane)
     (position, axes), (origin, directions) = frames_in_common(links, ends)
     radius, normal = exact_number(touch.radius), directions[:, 2]
@@ -138,7 +137,7 @@ def _contact(links: Sequence[Link], touch: Touch, law: Mapping[str, Any]) -> lis
     if gap.is_number and gap > 0:
         return []
     fixed = Matrix([symbol(f"{touch.name} {k}") for k in range(3)])
-    arm = dict(zip(fixed, (-radius * axes.T * normal).applyfunc(intermediate), strict=True))
+    arm = dict(zip(fixed, (-radius * axes.T * normal).applyfunc(Intermediate.named), strict=True))
     rates = (rate_of(links, directions[:, k].dot(position + axes * fixed)) for k in range(2) if touch.friction)
     slips = [rate.xreplace(arm) for rate in rates if rate != 0]
     slip = slips[0] if len(slips) == 1 else slips or None

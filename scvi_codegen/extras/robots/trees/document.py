@@ -15,7 +15,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from scvi_codegen.common.atomic import is_inside
+from scvi_codegen.api.text import is_inside
 from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
 from scvi_codegen.extras.robots.trees.schema import Kind
 from scvi_codegen.extras.robots.trees.tree import Vector

@@ -43,7 +43,8 @@ from typing import Any
 import numpy as np
 from sympy import Abs, Add, Expr, Matrix, Rational, S, Symbol, atan2, cos, eye, sin, sqrt, zeros
 
-from scvi_codegen.api.formulas import DOT, Rotation, RotationNames, gradient_tuple, symbol
+from scvi_codegen.api.formulas import DOT, Intermediate, Rotation, RotationNames, jacobian, parse_expression, symbol
+from scvi_codegen.api.systems import system_from_sympy
 from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
 from scvi_codegen.extras.robots.trees.tree import (
     SINGLE,
@@ -55,11 +56,7 @@ from scvi_codegen.extras.robots.trees.tree import (
     impossible_inertias,
     without_fixed,
 )
-from scvi_codegen.systems.contact import MOST_ROWS, ContactLike, contact, friction, rows_of
-from scvi_codegen.systems.formulas.intermediates import intermediate, product, total
-from scvi_codegen.systems.formulas.kinks import positive_part
-from scvi_codegen.systems.formulas.symbols import default_momenta
-from scvi_codegen.systems.reading import system_from_sympy
+from scvi_codegen.systems.contact import Contact, Friction, contact, friction
 
 
 class Tree:
@@ -118,7 +115,7 @@ class Tree:
         """Return the components of a vector that is turned."""
         for matrix in self.turns[joint.name] if back else reversed(self.turns[joint.name]):
             rows = zip(*matrix, strict=True) if back else matrix
-            vector = [intermediate(total(map(product, row, vector))) for row in rows]
+            vector = [Intermediate.named(Intermediate.sum_of_products(row, vector)) for row in rows]
         return vector
 
     def origin(self, joint: Joint) -> Matrix:
@@ -249,7 +246,7 @@ class Tree:
                 spin, speed = (as_quantities(axes * x) for x in (w, v + w.cross(exact_vector(pose.position))))
                 yield from zip(law(spin, speed), (*spin, *speed), strict=True)
 
-    def contacts(self, law: Mapping[str, Any]) -> Iterator[ContactLike]:
+    def contacts(self, law: Mapping[str, Any]) -> Iterator[Contact | Friction]:
         """Yield the contacts of joints with limits, and the dry friction of joints.
 
         A hinge or slide has the gaps q - low and high - q. A rotation R by an angle a <= high, with cos a = (tr R -
@@ -311,15 +308,16 @@ def forces_on(rates: Sequence[Symbol], loads: Iterable[tuple[Expr, Expr]]) -> It
     """Yield the force on each rate u, the sum of F dv/du over loads F and the velocities v along which they act."""
     held = {symbol(f"_load_{k}"): pair for k, pair in enumerate(loads)}
     power = Add(*(load * along for load, (_, along) in held.items()))
-    values = {load: intermediate(value) for load, (value, _) in held.items()}
-    yield from (part.xreplace(values) for part in gradient_tuple(power, rates))
+    values = {load: Intermediate.named(value) for load, (value, _) in held.items()}
+    slopes = jacobian([power], rates)
+    yield from (slopes.get((0, k), S.Zero).xreplace(values) for k in range(len(rates)))
 
 
 def between(force: Expr, bounds: tuple[float, float] | None) -> Expr:
     """Return a force that is clamped to a range."""
     if bounds is None or force == 0:
         return force
-    force, (low, high) = intermediate(force), map(exact_number, bounds)
+    force, (low, high) = Intermediate.named(force), map(exact_number, bounds)
     return force + positive_part(low - force) - positive_part(force - high)
 
 
@@ -333,7 +331,7 @@ def rotation_vector(turn: Matrix) -> tuple[Matrix, Expr]:
     along = Matrix([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
     sine = sqrt(along.dot(along) + TINY)
     angle = atan2(sine, (turn.trace() - 1) / 2)
-    return along * intermediate(angle / sine), angle
+    return along * Intermediate.named(angle / sine), angle
 
 
 def position_of(joint: Joint) -> tuple[str, ...]:
@@ -346,7 +344,7 @@ def integral(coefficients: Sequence[float], x: Expr) -> Expr:
     return Add(*(exact_number(c) * x**k / k for k, c in enumerate(coefficients, 2)))
 
 
-def limits_of(length: Expr, low: float, high: float, name: str, law: Mapping[str, Any]) -> Iterator[ContactLike]:
+def limits_of(length: Expr, low: float, high: float, name: str, law: Mapping[str, Any]) -> Iterator[Contact | Friction]:
     """Yield the contacts at the ends of the range of a coordinate or length."""
     yield contact(length - exact_number(low), name=f"lower {name}", **law)
     yield contact(exact_number(high) - length, name=f"upper {name}", **law)
@@ -355,17 +353,25 @@ def limits_of(length: Expr, low: float, high: float, name: str, law: Mapping[str
 def times(a: Matrix, b: Matrix) -> Matrix:
     """Return the product of matrices, faster than SymPy, which converts their entries."""
     columns = [*zip(*b.tolist(), strict=True)]
-    return Matrix([[total(map(product, row, column)) for column in columns] for row in a.tolist()])
+    return Matrix([[Intermediate.sum_of_products(row, column) for column in columns] for row in a.tolist()])
+
+
+def positive_part(x: Expr) -> Expr:
+    """Return x where it is positive, else 0."""
+    return parse_expression("positive_part(x)", {"x": x})
 
 
 def plus(*matrices: Matrix) -> Matrix:
     """Return the sum of matrices, faster than SymPy, too."""
-    return Matrix(*matrices[0].shape, [*map(total, zip(*(each.flat() for each in matrices), strict=True))])
+    return Matrix(
+        *matrices[0].shape,
+        [Intermediate.sum_of_products(terms) for terms in zip(*(matrix.flat() for matrix in matrices), strict=True)],
+    )
 
 
 def as_quantities(vector: Matrix) -> Matrix:
     """Return a vector of intermediate quantities."""
-    return vector.applyfunc(intermediate)
+    return vector.applyfunc(Intermediate.named)
 
 
 def exact_number(value: float) -> Expr:
@@ -397,7 +403,7 @@ def system_of_tree(
     constraints: Sequence[Expr] = (),
     check_inertias: bool = True,
     tendons: tuple[Expr, Expr, Expr] = (S.Zero, S.Zero, S.Zero),
-    touching: Sequence[ContactLike] = (),
+    touching: Sequence[Contact | Friction] = (),
     law: Mapping[str, Any] = MappingProxyType({}),
     actuators: Sequence[Any] = (),
     **own: Any,
@@ -409,11 +415,12 @@ def system_of_tree(
             raise SystemDefinitionError(f"{problem}, or integrate it as it is written by check_inertias=False")
         warn(problem, SystemDefinitionWarning)
     contacts = *tree.contacts(law), *touching
-    if (rows := rows_of(contacts)) > MOST_ROWS:
+    rows, of_parts = (sum(item.rows for item in some) for some in (contacts, touching))
+    if rows > Contact.MOST_ROWS:
         raise SystemDefinitionError(
-            f"the robot has {rows} gaps and slips of contacts, {rows_of(touching)} of them of geoms and tendons, of at "
-            f"most {MOST_ROWS}: leave some out by contype='0' conaffinity='0' or condim='1' of geoms, <exclude>, "
-            "limits='ignore' or friction='ignore'"
+            f"the robot has {rows} gaps and slips of contacts, {of_parts} of them of geoms and tendons, of at "
+            f"most {Contact.MOST_ROWS}: leave some out by contype='0' conaffinity='0' or condim='1' of geoms, "
+            "<exclude>, limits='ignore' or friction='ignore'"
         )
 
     def made(**fields: Any) -> Any:
@@ -466,10 +473,10 @@ def dual_energy(tree: Tree) -> Expr:
         parent, joint = tree.links[i].parent, tree.links[i].joint
         inertia, bias = inertias[i], biases[i]
         for axis, momentum in _degrees_of_freedom(tree, joint):
-            pivot = intermediate(inertia[axis, axis] + exact_number(joint.armature))
+            pivot = Intermediate.named(inertia[axis, axis] + exact_number(joint.armature))
             if joint.follows or pivot == 0:
                 return S.Zero
-            innovation = intermediate(momentum - bias[axis])
+            innovation = Intermediate.named(momentum - bias[axis])
             gain = as_quantities(inertia[:, axis] / pivot)
             terms.append(innovation**2 / (2 * pivot))
             inertia = as_quantities(_symmetric(plus(inertia, times(gain, -inertia[:, axis].T))))
@@ -486,11 +493,11 @@ def dual_energy(tree: Tree) -> Expr:
 def _degrees_of_freedom(tree: Tree, joint: Joint) -> Iterator[tuple[int, Expr]]:
     """Yield the axes of a joint, among three angular and three linear ones, with their momenta."""
     if joint.kind in ("hinge", "slide"):
-        yield 2 if joint.kind == "hinge" else 5, symbol(*default_momenta([joint.name]))
+        yield 2 if joint.kind == "hinge" else 5, symbol(f"p_{joint.name}")
     else:
         yield from enumerate(rotation_of(joint).rates)
     if joint.kind == "free":
-        momentum = Matrix([symbol(name) for name in default_momenta(position_of(joint))])
+        momentum = Matrix([symbol(f"p_{name}") for name in position_of(joint)])
         yield from enumerate(tree.turned(joint, momentum, back=True), 3)
 
 

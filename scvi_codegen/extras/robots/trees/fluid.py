@@ -9,10 +9,10 @@ import numpy as np
 import scipy
 from sympy import Abs, Expr, Matrix, sqrt
 
+from scvi_codegen.api.formulas import Intermediate
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.extras.robots.trees.energies import TINY, exact_number, exact_vector
 from scvi_codegen.extras.robots.trees.tree import Vector, about
-from scvi_codegen.systems.formulas.intermediates import intermediate
 
 MOST_TURNS = 500
 """Rotations of Jacobi's method, which takes fewer than ten."""
@@ -49,7 +49,7 @@ def ellipsoid(r: Vector, coefficients: Vector, rho: float, beta: float, w: Matri
         )
     )
     speed, top, bottom = sqrt(v.dot(v) + TINY), normal.dot(v), normal.dot(normal) + TINY
-    area = intermediate(number(np.pi) * sqrt(bottom / (top + TINY)))  # across the velocity
+    area = Intermediate.named(number(np.pi) * sqrt(bottom / (top + TINY)))  # across the velocity
     resistance = number(slender * np.pi * largest * middle) + number(blunt - slender) * area
     force = pull.cross(w) - (number(3 * np.pi * beta * d) + number(rho) * speed * resistance) * v
     force += number(magnus * rho * volume) * w.cross(v)

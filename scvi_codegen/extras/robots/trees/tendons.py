@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from sympy import Abs, Add, Expr, Matrix, S, sqrt
 
-from scvi_codegen.api.formulas import DOT, symbol
+from scvi_codegen.api.formulas import DOT, Intermediate, Tape, jacobian, mp, symbol
 from scvi_codegen.extras.robots.trees.closures import frames_in_common
 from scvi_codegen.extras.robots.trees.energies import (
     Tree,
@@ -17,15 +17,11 @@ from scvi_codegen.extras.robots.trees.energies import (
     integral,
     limits_of,
     position_of,
+    positive_part,
     rotation_of,
 )
 from scvi_codegen.extras.robots.trees.tree import SINGLE, Joint, Link, Pose
-from scvi_codegen.systems.contact import ContactLike, friction
-from scvi_codegen.systems.formulas.expressions import derivative_along, evaluate, gradient
-from scvi_codegen.systems.formulas.intermediates import intermediate
-from scvi_codegen.systems.formulas.kinks import positive_part
-from scvi_codegen.systems.formulas.symbols import default_momenta
-from scvi_codegen.systems.rotations.points import torque_of
+from scvi_codegen.systems.contact import Contact, Friction, friction
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +48,7 @@ def energies_of(links: Sequence[Link], tendons: Iterable[Tendon]) -> tuple[Expr,
     kinetic, potential, dissipated = S.Zero, S.Zero, S.Zero
     for tendon in tendons:
         length = length_of(links, tendon)
-        rate = intermediate(rate_of(links, length)) if tendon.armature or tendon.damping else S.Zero
+        rate = Intermediate.named(rate_of(links, length)) if tendon.armature or tendon.damping else S.Zero
         kinetic += exact_number(tendon.armature) * rate**2 / 2
         dissipated += integral(tendon.damping, Abs(rate))
         if any(tendon.stiffness):
@@ -62,9 +58,11 @@ def energies_of(links: Sequence[Link], tendons: Iterable[Tendon]) -> tuple[Expr,
     return kinetic, potential, dissipated
 
 
-def contacts_of_tendons(links: Sequence[Link], tendons: Iterable[Tendon], law: Mapping[str, Any]) -> list[ContactLike]:
+def contacts_of_tendons(
+    links: Sequence[Link], tendons: Iterable[Tendon], law: Mapping[str, Any]
+) -> list[Contact | Friction]:
     """Return the contacts of tendons with limits, where ``law`` is that of impacts, and their dry friction."""
-    contacts: list[ContactLike] = []
+    contacts: list[Contact | Friction] = []
     for tendon in tendons:
         length, of = length_of(links, tendon), f"of tendon '{tendon.name}'"
         if tendon.limits:
@@ -82,7 +80,7 @@ def length_of(links: Sequence[Link], tendon: Tendon) -> Expr:
     length = Add(*(exact_number(factor) * symbol(name) for name, factor in tendon.joints))
     for ends in pairwise(tendon.points):
         (start, _), (end, _) = frames_in_common(links, ends)
-        length += sqrt(intermediate((end - start).dot(end - start)))
+        length += sqrt(Intermediate.named((end - start).dot(end - start)))
     return length
 
 
@@ -98,12 +96,12 @@ def rate_of(links: Sequence[Link], length: Expr) -> Expr:
     rate = S.Zero
     for joint in (link.joint for link in links if link.joint.kind != "fixed"):
         names = _numbers_of(joint)
-        rate += derivative_along(length, [*map(symbol, names)], [symbol(name + DOT) for name in names])
+        slopes = jacobian([length], [*map(symbol, names)])
+        rate += Add(*(slope * symbol(names[k] + DOT) for (_, k), slope in slopes.items()))
         if joint.kind not in SINGLE:
             turn = rotation_of(joint)
-            slopes = gradient(length, turn.entries)
-            torque = torque_of(Matrix(3, 3, turn.entries), Matrix(3, 3, [slopes.get(k, S.Zero) for k in range(9)]))
-            rate += torque.dot(Matrix(turn.rates))
+            slopes = jacobian([length], turn.entries)
+            rate += turn.torque([slopes.get((0, k), S.Zero) for k in range(9)]).dot(Matrix(turn.rates))
     return rate
 
 
@@ -126,7 +124,10 @@ def mean_inverses(links: Sequence[Link], labels: Collection[str]) -> Iterator[tu
     values = {symbol(link.joint.name): link.joint.zero for link in links}
     for k, joint in enumerate(link.joint for link in links if energy != 0):
         names = _numbers_of(joint)
-        momenta = [*map(symbol, default_momenta(names)), *(() if joint.kind in SINGLE else rotation_of(joint).rates)]
+        momenta = [
+            *(symbol(f"p_{name}") for name in names),
+            *(() if joint.kind in SINGLE else rotation_of(joint).rates),
+        ]
         if joint.kind != "fixed" and joint.label in labels:
             yield k, 2 * sum(_evaluated(links, energy, values | {p: 1.0}) for p in momenta) / len(momenta)
 
@@ -137,4 +138,5 @@ def _evaluated(links: Sequence[Link], expression: Expr, values: dict[Expr, float
         turn = joint.pose.rotation.flat if joint.kind == "free" else Pose().rotation.flat
         values = values | dict(zip(rotation_of(joint).entries, turn, strict=True))
         values |= zip(map(symbol, position_of(joint)), joint.pose.position, strict=True)
-    return float(evaluate(expression, {x: float(values.get(x, 0)) for x in expression.free_symbols}))
+    symbols = [*expression.free_symbols]
+    return float(Tape([expression], symbols)([mp.mpf(float(values.get(x, 0))) for x in symbols])[0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, count
@@ -12,12 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.api.formulas import DOT, TIME
-from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.systems.formulas.expressions import FUNCTIONS
-from scvi_codegen.systems.formulas.rotations import matrix_of
-from scvi_codegen.systems.formulas.symbols import C_KEYWORDS
-from scvi_codegen.systems.formulas.symbols import identifier as spelled
+from scvi_codegen.api.formulas import DOT, check_names
+from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning
 
 Vector = NDArray[np.float64]
 
@@ -254,7 +251,9 @@ def about(axis: Vector, angle: float) -> Vector:
 
 def rotation_by(q: Vector) -> Vector:
     """Return the rotation matrix of a quaternion of any length but 0."""
-    return np.array(matrix_of([*map(float, q / np.linalg.norm(q))]), dtype=float)
+    w, *vector = q / np.linalg.norm(q)
+    v = np.array(vector)
+    return np.asarray((w * w - v @ v) * np.eye(3) + 2.0 * (np.outer(v, v) + w * hat(v)))
 
 
 def hat(v: Vector) -> Vector:
@@ -310,7 +309,27 @@ def identifier(name: str) -> str:
     Greek letters are spelled out, accents omitted, other characters replaced by ``_``. ``joint_`` precedes names that
     do not begin with a letter, and ``_`` follows words of C and of formulas.
     """
-    letters = unicodedata.normalize("NFKD", spelled(name))
+    letters = unicodedata.normalize("NFKD", "".join(map(_spelled, name.strip())))
     plain = re.sub(r"\W", "_", "".join(x for x in letters if not unicodedata.combining(x)), flags=re.ASCII)
     plain = plain if plain[:1].isalpha() else f"joint_{plain.lstrip('_')}"
-    return f"{plain}_" if plain in (*C_KEYWORDS, *FUNCTIONS, "pi", TIME) else plain
+    return plain if _is_free(plain) else f"{plain}_"
+
+
+def _spelled(character: str) -> str:
+    """Return the name of a Greek letter, other characters as they are."""
+    words = unicodedata.name(character, "").split()
+    if words[:1] != ["GREEK"] or words[2:3] != ["LETTER"] or len(words) != 4:
+        return character
+    letter = words[3].replace("LAMDA", "LAMBDA")
+    return letter.lower() if words[1] == "SMALL" else letter.capitalize()
+
+
+def _is_free(name: str) -> bool:
+    """Return whether a name is neither a word of C nor one of formulas."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            check_names([name], ())
+        except (SystemDefinitionError, SystemDefinitionWarning):
+            return False
+    return True

@@ -27,8 +27,7 @@ from scvi_codegen.extras.verification.structure import structure_checks
 from scvi_codegen.extras.verification.system_under_test import ROUNDINGS, SHORT_RUN, State, SystemUnderTest
 from scvi_codegen.methods import SVI, StoermerVerlet
 from scvi_codegen.runs.compiler import compile_stepper
-from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
-from scvi_codegen.runs.stepping.array_interface import RunArrays, check_accesses, read_arrays
+from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.systems.rolling import unroll_sums
 
 __all__ = ["state_of_fields", "verify_arrays"]
@@ -65,7 +64,7 @@ def verify_arrays(
     q, p, h, t = state
     stepper = with_events.with_events(())
     run = stepper.start(q, p, h=h, t=t, **arrays_of_run)
-    arrays = read_arrays(stepper.interface, q, arrays_of_run["parameters"], arrays_of_run["tables"])
+    arrays = stepper.run_arrays(q, arrays_of_run["parameters"], arrays_of_run["tables"])
     if stepper.source is None or system.coupled_terms or tolerance is not None or system.constraints:
         initial = State(run.q, run.p, run.t, run._step_size)
         return _at_known_sizes(system, method, with_events, arrays, initial, of_known_sizes)
@@ -88,7 +87,7 @@ def _at_known_sizes(
     system: ArraySystem,
     method: Method,
     with_events: Stepper,
-    arrays: RunArrays,
+    arrays: Any,
     initial: State,
     of_known_sizes: Callable[..., Certificate],
 ) -> Certificate:
@@ -128,9 +127,9 @@ def _subject(start: WholeStart) -> SystemUnderTest:
     return SystemUnderTest(unrolled, start.method, _bound(start.stepper, arrays), None, State(q, p, start.t, start.h))
 
 
-def _bound(stepper: Stepper, arrays: RunArrays) -> Stepper:
+def _bound(stepper: Stepper, arrays: Any) -> Stepper:
     """Return a stepper of arrays at these sizes, as one of named coordinates."""
-    result = cast(StepperOfRunTimeSizes, stepper)._bound_to(arrays)._copy(())
+    result: Stepper = cast(Any, stepper)._bound_to(arrays)._copy(())
     result.interface = replace(result.interface, map_names=())  # whole_checks examines momentum maps
     return result
 
@@ -186,7 +185,7 @@ def small_start(start: WholeStart) -> WholeStart:
             indices[name] = np.union1d(in_tables, further[: max(0, window - len(in_tables))])
         small = _cut(start, indices)
         try:
-            check_accesses(interface.layout, small.arrays.sizes, small.arrays.places)
+            start.stepper.check_accesses(small.arrays.sizes, small.arrays.places)
         except StateError:
             continue
         count = sum(values.size for values in small.arrays.state.values())

@@ -17,9 +17,6 @@ from scvi_codegen.extras.verification.certificate import Check, Finding, Outcome
 from scvi_codegen.extras.verification.system_under_test import EPSILON, LONG_RUN, ROUNDINGS, SHORT_RUN
 from scvi_codegen.runs.driver.run import Run
 from scvi_codegen.runs.stepper import Stepper
-from scvi_codegen.runs.stepping.array_interface import RunArrays
-from scvi_codegen.systems.formulas.indices import Access, Loop
-from scvi_codegen.systems.formulas.numpy_values import Elements, convolved
 
 Numbers = NDArray[np.float64]
 
@@ -40,7 +37,7 @@ class WholeStart:
     system: ArraySystem
     method: Method
     stepper: Stepper
-    arrays: RunArrays
+    arrays: Any
     p: Mapping[str, Numbers]
     h: float
     t: float
@@ -53,11 +50,12 @@ class WholeStart:
         moving = name.removesuffix(DOT)
         if moving != name and moving in self.p:
             return self.p[moving] / _masses(self)[moving]
-        return {**self.arrays.state, **self.arrays.fields}[name]
+        values: Numbers = {**self.arrays.state, **self.arrays.fields}[name]
+        return values
 
-    def elements(self, loops: Sequence[Loop]) -> Elements:
+    def elements(self, loops: Sequence[Any]) -> Any:
         """Return all index values of loops."""
-        return Elements(loops, self.arrays.sizes, self.arrays.places)
+        return self.system.elements(loops, self.arrays.sizes, self.arrays.places)
 
     def run(self, h: float | None = None) -> Run:
         """Start a run at the initial state, optionally with another step size."""
@@ -126,7 +124,7 @@ def _numpy_rates(start: WholeStart) -> tuple[dict[str, Numbers], dict[str, Numbe
         for access, formula in force.targets:
             added = np.zeros_like(result[access.array.name])
             _add(added, at.of(access), _values(start, at, formula, force.slots))
-            result[access.array.name] += convolved(added, access, start.arrays.fields, -1)
+            result[access.array.name] += at.transposed(added, access, start.arrays.fields)
     if system.momenta:
         pairs = list(zip(system.coordinates, system.momenta, strict=True))
         return {q.name: -result[p.name] for q, p in pairs}, {q.name: result[q.name] for q, _ in pairs}
@@ -164,7 +162,7 @@ def _energies(start: WholeStart) -> Finding:
     return Finding(wrong / (size or 1.0), ROUNDINGS * EPSILON * float(np.log2(count) + 1), "relative to its terms")
 
 
-def _values(start: WholeStart, elements: Elements, formula: Expr, slots: Sequence[tuple[Any, Access]]) -> Any:
+def _values(start: WholeStart, elements: Any, formula: Expr, slots: Sequence[tuple[Any, Any]]) -> Any:
     arrays = {access.array.name: start.array(access.array.name) for _, access in slots} | {**start.arrays.fields}
     numbers: dict[Expr, float] = dict(zip(start.system.parameters, start.arrays.numbers, strict=True))
     return elements.values(formula, slots, arrays, {**numbers, start.system.time: start.t})

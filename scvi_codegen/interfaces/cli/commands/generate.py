@@ -7,7 +7,7 @@ import click
 from scvi_codegen.codegen.native.building import TARGETS
 from scvi_codegen.codegen.rendering.program_source import Embedded
 from scvi_codegen.interfaces.cli.command_group import reporting, tell
-from scvi_codegen.interfaces.cli.model_options import model_arguments, read_model, with_known_sizes
+from scvi_codegen.interfaces.cli.model_options import model_arguments, read_model
 from scvi_codegen.interfaces.models.packages.fmu import generate_fmu
 from scvi_codegen.interfaces.models.packages.package import generate_package
 
@@ -72,7 +72,7 @@ def generate(
     if platforms and not fmu:
         raise click.UsageError("--platform requires --fmu: C code in a folder is for any platform")
     for option, needed in (("--fmu", fmu), ("--embedded", embedded), ("an adaptive step size", model.h is None)):
-        model = with_known_sizes(model, option) if needed else model
+        model = model.with_known_sizes(option) if needed else model
     if fmu:
         folder, python = generate_fmu(model, output, platforms=platforms, force=force), ""
     else:

@@ -19,7 +19,7 @@ from scvi_codegen.interfaces.cli.command_group import (
 )
 from scvi_codegen.interfaces.cli.ensembles import energy_balance, ensemble_summary, integrate_states
 from scvi_codegen.interfaces.cli.json_documents import ensemble_numbers, outcome_numbers, run_numbers
-from scvi_codegen.interfaces.cli.model_options import check_flag, model_arguments, read_model, with_known_sizes
+from scvi_codegen.interfaces.cli.model_options import check_flag, model_arguments, read_model
 from scvi_codegen.interfaces.cli.recording import (
     SUFFIX,
     RecordedOutcome,
@@ -164,7 +164,7 @@ def run(
         ("--advise", requested["advise"] is not None),
         (f"-o {output}", recorded),
     ):
-        model = with_known_sizes(model, option) if needed else model
+        model = model.with_known_sizes(option) if needed else model
     if model.system.inputs and requested["advise"] is not None:
         check_flag(ERRORS["advise"], WITH_INPUTS)
     if model.system.inputs and recorded:

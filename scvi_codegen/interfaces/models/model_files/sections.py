@@ -75,24 +75,6 @@ Built = TypeVar("Built")
 Section = Mapping[str, Any]
 Document = Mapping[str, Section]
 
-
-@dataclass(frozen=True, kw_only=True)
-class ModelSection:
-    """A section of model files that an extra adds.
-
-    Attributes:
-        keys: known ones.
-        system: function of the document, with an exact (m,) state; returns the system that the section defines.
-        initial: function of ``[initial]`` and this system; returns it with numbers instead of formulas.
-        check: function of the model; raises ModelFileError, naming the key at fault.
-    """
-
-    keys: tuple[str, ...]
-    system: Callable[[Document], Any] | None = None
-    initial: Callable[[Section, Any], Section] | None = None
-    check: Callable[[Any], None] | None = None
-
-
 ALTERNATIVES = ({"lagrangian", "hamiltonian"}, {"density", "hamiltonian"}, *ALTERNATIVE_KEYS)
 """Groups of alternative keys, of which one is given."""
 INHERITED = ("degree", "quadrature", "nodes", "stages")
@@ -230,6 +212,29 @@ def in_section(where: str, build: Callable[[], Built]) -> Built:
         return build()
     except (ScviCodegenError, TypeError) as error:
         raise ModelFileError(f"{where}: {error}") from error
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelSection:
+    """A section of model files that an extra adds.
+
+    Attributes:
+        keys: known ones.
+        system: function of the document, with an exact (m,) state; returns the system that the section defines.
+        initial: function of ``[initial]`` and this system; returns it with numbers instead of formulas.
+        check: function of the model; raises ModelFileError, naming the key at fault.
+
+    For these functions ``check_keys(section, names, kind, where)`` raises the error of unknown keys, ``real(value,
+    where)`` returns a finite number, and ``within(where, build)`` returns ``build()``, whose errors name the place.
+    """
+
+    keys: tuple[str, ...]
+    system: Callable[[Document], Any] | None = None
+    initial: Callable[[Section, Any], Section] | None = None
+    check: Callable[[Any], None] | None = None
+    check_keys = staticmethod(check_keys)
+    real = staticmethod(real)
+    within = staticmethod(in_section)
 
 
 def read_run(section: Section) -> dict[str, Any]:

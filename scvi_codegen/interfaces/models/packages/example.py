@@ -15,9 +15,8 @@ from scvi_codegen.common.precision import mp
 from scvi_codegen.interfaces.models.input_tables import tables_of_example
 from scvi_codegen.interfaces.models.model import Model
 from scvi_codegen.interfaces.models.options import RUN_FIELDS
-from scvi_codegen.runs.stepping.array_interface import read_arrays, read_state, table_limits
+from scvi_codegen.runs.stepping.array_interface import read_state, table_limits
 from scvi_codegen.runs.stepping.features import refusal
-from scvi_codegen.runs.stepping.step_plan import absolute_tolerances, checked_absolute_tolerance
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.event import Event
 from scvi_codegen.systems.formulas.expressions import evaluate
@@ -99,7 +98,7 @@ def example_of(model: Model, interface: Interface, *, controlled: bool) -> Examp
         tolerance=tolerance,
         max_step=model.max_step,
         first_step=model.first_step,
-        absolute_tolerances=absolute_tolerances_of(model, interface),
+        absolute_tolerances=model.absolute_tolerances(interface),
         controlled=controlled,
         save_every=save_every,
         outputs=outputs,
@@ -109,14 +108,6 @@ def example_of(model: Model, interface: Interface, *, controlled: bool) -> Examp
         end=model.end if inputs else 0.0,
         events=interface.searched(model.events),
     )
-
-
-def absolute_tolerances_of(model: Model, interface: Interface) -> tuple[float, ...]:
-    """Return the absolute tolerance of each coordinate; none if all are 0."""
-    if model.absolute_tolerance is None:
-        return ()
-    values = checked_absolute_tolerance(model.absolute_tolerance)
-    return tuple(absolute_tolerances(interface, interface.dimension, values).tolist())
 
 
 def _check_options(model: Model) -> None:
@@ -164,7 +155,7 @@ def _rate(system: MechanicalSystem, q: Sequence[float], p: Sequence[float]) -> A
 def array_example_of(model: Model, interface: Interface) -> tuple[ExampleRun, dict[str, Any]]:
     """Return the run of a model with array sizes known at run time, and its arrays by the name of their text file."""
     _check_options(model)
-    problem = read_arrays(interface, model.q, model.fields, model.tables)
+    problem = model.arrays(interface)
     files = {"q": _joined(problem.state)}
     moving = "p" if model.velocity is None else "velocity"
     if (state := getattr(model, moving)) is not None:
