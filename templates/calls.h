@@ -204,6 +204,11 @@ int NAME(call_pieces)(NAME(call) *c, long long count, const double *t, const dou
 }
 
 #ifdef HAS_DEFECTS
+#ifdef HAS_SET_FALLBACK
+#define LACKS_NEWTON(status) ((status) == STATUS(FALLBACK_REQUIRED))
+#else
+#define LACKS_NEWTON(status) 0
+#endif
 #define MOST_PARTS 16 /* of a step, which take as long as its solution by Newton's method */
 
 /* Length of a vector in units of sizes; infinite where a component other than 0 has the size 0. */
@@ -215,15 +220,16 @@ static double NAME(relative_length)(int count, const double *x, const double *si
   return sqrt(sum);
 }
 
-/* Defects x[k + 1] - phi(x[k]) of the step from x[k] = (q, p) at t to x[k + 1], q1, by phi in `parts` equal steps, whose
- * increments have low words, so that no rounding of states remains; returns 0 if a step fails or, unless that is accepted,
- * Newton's method solves one. */
+/* Defect x[k + 1] - phi(x[k]) of the step from x[k] = (q, p) at t to the next state, by phi in `parts` equal steps;
+ * their increments have low words, so that no rounding of states remains. Returns 0 if a step fails or Newton's method
+ * solves one, unless that is accepted; then the negative status where it is not there. */
 static int NAME(call_defect)(NAME(call) *c, double t, double h, long long parts, int by_newton, const double *q,
     const double *p, double *defect)
 {
   NAME(run) *run = c->run;
-  if (NAME(call_step)(c, t, h / (double)parts, parts, q, p, NULL, 0.0) || (c->report->fallback_steps && !by_newton))
-    return 0;
+  const int status = NAME(call_step)(c, t, h / (double)parts, parts, q, p, NULL, 0.0);
+  if (status || (c->report->fallback_steps && !by_newton))
+    return by_newton && LACKS_NEWTON(status) ? -status : 0;
   for (int i = 0; i < M; i++) {
     defect[i] = (q[M + i] - run->q[i]) - run->carry_q[i];
     defect[M + i] = (p[M + i] - run->p[i]) - run->carry_p[i];
@@ -263,6 +269,8 @@ static int NAME(call_parts)(NAME(call) *c, double t, double h, int by_newton, co
     memcpy(last, defect, sizeof last);
     *c->run = before;
     solved = NAME(call_defect)(c, t, h, parts, by_newton, q, p, defect);
+    if (solved < 0)
+      return solved;
     if (solved && NAME(call_resolved)(q, p, size, limits, defect, follows ? last : NULL))
       return parts;
     *least = solved ? *least : 2 * parts;
@@ -270,9 +278,9 @@ static int NAME(call_parts)(NAME(call) *c, double t, double h, int by_newton, co
   return 0;
 }
 
-/* Defects of `count` + 1 states of another run at times t by one step phi of size h from each, which begins at the curve
- * of the last one. Where the iteration fails it is taken in `parts`; where that does not suffice, Newton's method solves
- * all further ones. 0: no number of parts resolves the step. */
+/* Defects of `count` + 1 states of another run at times t by one step phi of size h from each, which begins at the
+ * curve of the last one. Where the iteration fails it is taken in `parts`; where that does not suffice, Newton's method
+ * solves all further ones. 0: no number of parts resolves the step. */
 int NAME(call_defects)(NAME(call) *c, long long count, const double *t, const double *h, const double *q,
     const double *p, const double *size, const double *limits, double *defects, int *parts)
 {
@@ -287,6 +295,8 @@ int NAME(call_defects)(NAME(call) *c, long long count, const double *t, const do
       parts[k] = NAME(call_parts)(c, t[k], h[k], by_newton, q, p, size, limits, defects, &least);
       least = 1;
     }
+    if (parts[k] < 0)
+      return -parts[k];
     if (parts[k] == 0)
       NAME(start)(c->run, t[k], h[k], q + M, p + M);
   }

@@ -324,7 +324,10 @@ class LinearisedMethod(StateFunctions):
         defects = Defects(np.empty((count, 2 * self.dimension)), np.empty(count, np.int32))
         arrays = starts.t, starts.h, starts.q, starts.p, sizes, limits, defects.misfits
         pointers = map(self.binding.pointer, arrays)
-        self._call_steps("defects", parameters, None, count, *pointers, self.binding.pointer(defects.parts))
+        into = self.binding.pointer(defects.parts)
+        status, report = self._call_steps("defects", parameters, None, count, *pointers, into)
+        if status:
+            raise step_failure(status, report, step=0, h=float(starts.h[0]))
         return defects
 
     def _transport_by_differences(
