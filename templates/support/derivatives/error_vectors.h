@@ -23,18 +23,18 @@ static inline void receive_errors(error_vectors *of, long long k, const real *q,
 {
   for (int i = 0; i < 2 * M; i++) {
     const real x = i < M ? q[i] : p[i - M];
-    real largest = REAL_MIN, sum = 0;
+    real largest = DBL_MIN, sum = 0;
     vectors[i] += of->defects ? of->defects[k * 2 * M + i] : 0;
     for (int j = 1; j < of->count; j++) {
       real *to = vectors + j * of->apart + i;
       *to += (next_random(&of->random) >> 63 ? of->rounding : -of->rounding) * x;
-      largest = MATH(fabs)(*to) > largest ? MATH(fabs)(*to) : largest;
+      largest = fabs(*to) > largest ? fabs(*to) : largest;
     }
     for (int j = 1; j < of->count; j++) {
       const real part = vectors[j * of->apart + i] / largest;
       sum += part * part;
     }
     of->errors[i * of->stride + k] = vectors[i];
-    of->deviations[i * of->stride + k] = largest * MATH(sqrt)(sum / (of->count - 1));
+    of->deviations[i * of->stride + k] = largest * sqrt(sum / (of->count - 1));
   }
 }
