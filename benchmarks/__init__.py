@@ -12,6 +12,7 @@
     digits       double-double arithmetic, and heyoka in long double and quadruple precision
     families     families of periodic orbits, orbits a second
     errors       run.error and error= beside the run
+    tolerances   default runs from 1e-3 to 1e-11 beside heyoka
     tables       energy drift, time from text to the first step
     steps        time of a step: by size and threads, with derivatives, by compiler and processor
     machine      description of the machine
@@ -50,6 +51,7 @@ from benchmarks.steps import (
     run_transforms,
 )
 from benchmarks.tables import run_drift, run_first_steps
+from benchmarks.tolerances import run_tolerances
 from scvi_codegen.common.atomic import write_text
 from scvi_codegen.common.errors import ScviCodegenError, StateError, closest
 
@@ -64,6 +66,7 @@ SECTIONS: Mapping[str, Callable[[Plan, ReportActivity], CaseResult | ResultTable
     "drift": run_drift,
     "families": run_families,
     "errors": run_errors,
+    "tolerances": run_tolerances,
     "first-step": run_first_steps,
     "scaling": run_scaling,
     "threads": run_threads,

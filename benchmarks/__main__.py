@@ -55,6 +55,7 @@ def main(
       drift                     energy over ten million steps
       families                  periodic orbits a second, by continuation
       errors                    run.error and error= beside the run
+      tolerances                default runs from 1e-3 to 1e-11 beside heyoka
       first-step                time from text to the first step
       scaling, threads          a step of array systems of 10^3 to 10^6 coordinates, in one and two threads
       by-hand                   a step of a ring and of a field beside C by hand

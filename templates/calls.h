@@ -204,6 +204,11 @@ int NAME(call_pieces)(NAME(call) *c, long long count, const double *t, const dou
 }
 
 #ifdef HAS_DEFECTS
+#ifdef HAS_SET_FALLBACK
+#define LACKS_NEWTON(status) ((status) == STATUS(FALLBACK_REQUIRED))
+#else
+#define LACKS_NEWTON(status) 0
+#endif
 #define MOST_PARTS 16 /* of a step, which take as long as its solution by Newton's method */
 
 /* Length of a vector in units of sizes; infinite where a component other than 0 has the size 0. */
@@ -215,30 +220,87 @@ static double NAME(relative_length)(int count, const double *x, const double *si
   return sqrt(sum);
 }
 
-/* Defects x[k + 1] - phi(x[k]) of `count` + 1 states x = (q, p) of another run at times t, by one step phi of size h
- * from each, which begins at the curve of the last one; it is taken in twice as many `parts` as long as the iteration
- * fails, and Newton's method would solve it. Increments of phi have low words, so that no rounding of states remains. Relative to sizes of (q, p), those of at most `part` of the change of momenta are `small`. */
-int NAME(call_defects)(NAME(call) *c, long long count, const double *t, const double *h, const double *q,
-    const double *p, const double *size, double part, double *defects, int *small, int *parts)
+/* Defect x[k + 1] - phi(x[k]) of the step from x[k] = (q, p) at t to the next state, by phi in `parts` equal steps;
+ * their increments have low words, so that no rounding of states remains. Returns 0 if a step fails or Newton's method
+ * solves one, unless that is accepted; then the negative status where it is not there. */
+static int NAME(call_defect)(NAME(call) *c, double t, double h, long long parts, int by_newton, const double *q,
+    const double *p, double *defect)
 {
-  NAME(run) *run = c->run, last;
-  int status = 0, present = 1;
-  NAME(start)(run, t[0], h[0], q, p);
-  for (long long k = 0; k < count && !status; k++, q += M, p += M, defects += 2 * M) {
-    double impulse[M];
-    last = *run;
-    while ((status = NAME(call_step)(c, t[k], h[k] / present, present, q, p, NULL, 0.0)), present < MOST_PARTS &&
-        (status || c->report->fallback_steps))
-      present *= 2, *run = last;
-    parts[k] = present;
-    for (int i = 0; i < M; i++) {
-      defects[i] = (q[M + i] - run->q[i]) - run->carry_q[i];
-      defects[M + i] = (p[M + i] - run->p[i]) - run->carry_p[i];
-      impulse[i] = p[M + i] - p[i];
-    }
-    small[k] = NAME(relative_length)(2 * M, defects, size) <= part * NAME(relative_length)(M, impulse, size + M);
+  NAME(run) *run = c->run;
+  const int status = NAME(call_step)(c, t, h / (double)parts, parts, q, p, NULL, 0.0);
+  if (status || (c->report->fallback_steps && !by_newton))
+    return by_newton && LACKS_NEWTON(status) ? -status : 0;
+  for (int i = 0; i < M; i++) {
+    defect[i] = (q[M + i] - run->q[i]) - run->carry_q[i];
+    defect[M + i] = (p[M + i] - run->p[i]) - run->carry_p[i];
   }
-  return status;
+  return 1;
+}
+
+/* Returns 1 if phi in half as many steps, or the change of momenta, shows that the error of phi is small beside the
+ * defect: it is below `part` of the change of momenta, the motion by forces, or the last one differs from it by `apart`
+ * of it and roundings (Hairer, Norsett & Wanner, Solving ODEs I, II.4). Lengths are relative to sizes of (q, p). */
+static int NAME(call_resolved)(const double *q, const double *p, const double *size, const double *limits,
+    const double *defect, const double *last)
+{
+  double change[2 * M];
+  for (int i = 0; i < M; i++)
+    change[i] = p[M + i] - p[i];
+  const double length = NAME(relative_length)(2 * M, defect, size);
+  if (length <= limits[0] * NAME(relative_length)(M, change, size + M))
+    return 1;
+  for (int i = 0; last && i < 2 * M; i++) {
+    const double *x = i < M ? q + i : p + i - M;
+    change[i] = fmax(fabs(defect[i] - last[i]) - limits[2] * (fabs(x[0]) + fabs(x[M] - x[0])), 0.0);
+  }
+  return last && NAME(relative_length)(2 * M, change, size) <= limits[1] * length;
+}
+
+/* Takes a step of phi in twice as many parts, from *least on, until it is resolved, and finds its defect; returns the
+ * number of parts, or 0. *least becomes that which can be solved, or more than MOST_PARTS. */
+static int NAME(call_parts)(NAME(call) *c, double t, double h, int by_newton, const double *q, const double *p,
+    const double *size, const double *limits, double *defect, int *least)
+{
+  const NAME(run) before = *c->run;
+  double last[2 * M];
+  int solved = 0;
+  for (int parts = *least; parts <= MOST_PARTS; parts *= 2) {
+    const int follows = solved;
+    memcpy(last, defect, sizeof last);
+    *c->run = before;
+    solved = NAME(call_defect)(c, t, h, parts, by_newton, q, p, defect);
+    if (solved < 0)
+      return solved;
+    if (solved && NAME(call_resolved)(q, p, size, limits, defect, follows ? last : NULL))
+      return parts;
+    *least = solved ? *least : 2 * parts;
+  }
+  return 0;
+}
+
+/* Defects of `count` + 1 states of another run at times t by one step phi of size h from each, which begins at the
+ * curve of the last one. Where the iteration fails it is taken in `parts`; where that does not suffice, Newton's method
+ * solves all further ones. 0: no number of parts resolves the step. */
+int NAME(call_defects)(NAME(call) *c, long long count, const double *t, const double *h, const double *q,
+    const double *p, const double *size, const double *limits, double *defects, int *parts)
+{
+  int least = 1, by_newton = 0;
+  NAME(start)(c->run, t[0], h[0], q, p);
+  memset(defects, 0, sizeof(double) * (size_t)(count * 2 * M));
+  for (long long k = 0; k < count; k++, q += M, p += M, defects += 2 * M) {
+    parts[k] = NAME(call_parts)(c, t[k], h[k], by_newton, q, p, size, limits, defects, &least);
+    if (least > MOST_PARTS) {
+      NAME(start)(c->run, t[k], h[k], q, p);
+      least = by_newton = 1;
+      parts[k] = NAME(call_parts)(c, t[k], h[k], by_newton, q, p, size, limits, defects, &least);
+      least = 1;
+    }
+    if (parts[k] < 0)
+      return -parts[k];
+    if (parts[k] == 0)
+      NAME(start)(c->run, t[k], h[k], q + M, p + M);
+  }
+  return 0;
 }
 
 /* Transports vectors of global errors, from `before` to `now`, over the steps phi of call_defects by differences: phi(x

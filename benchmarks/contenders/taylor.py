@@ -58,6 +58,11 @@ def heyoka_contenders(case: Case, quick: bool, loose: bool = False) -> Iterator[
     yield from _curve(from_lagrangian, case, FEW_TOLERANCES)
 
 
+def heyoka_at(case: Case, tolerances: Sequence[float]) -> Iterator[Contender]:
+    """Yield the curve ``heyoka`` at tolerances, the first of which chooses the formulation."""
+    return _curve([variant for variant in _variants(case) if not variant.formulation.momenta], case, tolerances)
+
+
 def heyoka_ensembles(case: Case, quick: bool) -> Iterator[Contender]:
     """Yield the curves ``heyoka batch`` and ``heyoka batch fast_math``."""
     variants = [replace(variant, curve="heyoka batch") for variant in _variants(case) if not variant.compact]

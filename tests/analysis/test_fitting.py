@@ -105,7 +105,7 @@ def pushed():
     return stepper, push, run, times
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("segments", [1, 4])
 def test_fit_with_known_start_and_tabulated_inputs(pushed, segments):
     """The cart is pushed as measured; what is known is not found."""

@@ -207,7 +207,7 @@ def test_paths_between_attitudes_are_their_runs():
 
 
 @pytest.mark.rotated
-def test_closed_paths_of_constraints_rotations_inputs_and_arrays():
+def test_closed_paths_of_constraints_rotations_and_arrays():
     rod = compiled(["x", "y"], "(x_dot**2 + y_dot**2)/2 - y", "svi:4", constraints=["x**2 + y**2 - 1"])
 
     def swing(t):
@@ -225,12 +225,6 @@ def test_closed_paths_of_constraints_rotations_inputs_and_arrays():
     turn = body.path(T=2 * np.pi, steps=24, closed=-np.eye(4), start=start)
     assert abs(turn.action - 3 * np.pi) < 1e-5  # one turn about the third axis, with omega = 1
     assert np.abs(turn.run().q[24] + turn.q[0]).max() < 1e-7
-    t = np.linspace(0, 3, 61)
-    forced = driven().path(
-        T=3.0, steps=60, closed=True, start=np.full((61, 1), 0.1), inputs={"u": (t, np.cos(2 * np.pi * t / 3))}
-    )
-    assert abs(forced.q[0, 0] - 1 / (1 - (2 * np.pi / 3) ** 2)) < 4e-4  # the input is interpolated linearly
-    assert np.abs(forced.run().q[-1] - forced.q[0]).max() < 1e-12
     chain = compiled(
         ["u[N]"], "sum(i in N, u_dot[i]**2/2 + u[i]**4/4) + sum(i in 0..N-2, (u[i+1] - u[i])**2/2)", "svi:3"
     )
@@ -238,6 +232,16 @@ def test_closed_paths_of_constraints_rotations_inputs_and_arrays():
     rest = chain.path(T=1.0, closed=["-u[0]", "-u[1]", "-u[2]"], **here)
     assert (rest.index, rest.repetitions) == (0, 2)
     assert np.abs(rest.q["u"]).max() < 1e-6  # the minimum
+
+
+@pytest.mark.tiers(0, 1)
+def test_closed_paths_of_inputs():
+    t = np.linspace(0, 3, 61)
+    forced = driven().path(
+        T=3.0, steps=60, closed=True, start=np.full((61, 1), 0.1), inputs={"u": (t, np.cos(2 * np.pi * t / 3))}
+    )
+    assert abs(forced.q[0, 0] - 1 / (1 - (2 * np.pi / 3) ** 2)) < 4e-4  # the input is interpolated linearly
+    assert np.abs(forced.run().q[-1] - forced.q[0]).max() < 1e-12
 
 
 @pytest.mark.rotated

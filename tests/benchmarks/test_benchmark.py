@@ -269,11 +269,12 @@ class TestCommand:
         assert "done: kept" in found.text()
 
 
+STEPS_TIMED = ("scaling", "threads", "by-hand", "transforms", "newton", "derivatives", "builds")
+
+
 class TestTables:
     @pytest.mark.rotated
-    @pytest.mark.parametrize(
-        "section", ["scaling", "threads", "by-hand", "transforms", "newton", "derivatives", "builds", "bath", "errors"]
-    )
+    @pytest.mark.parametrize("section", [*STEPS_TIMED, "bath", "errors", "tolerances"])
     def test_times_of_steps_are_measured(self, section):
         table = bench.SECTIONS[section](bench.Plan(repeats=1, quick=True), lambda text: None)
         timed = [

@@ -11,7 +11,7 @@ def largest_error(contender):
     return contender.error(np.array(reached() if callable(reached) else reached))
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("name", CONTACTS)
 def test_motions_are_those_of_the_closed_forms(name):
     assert min(largest_error(each) for each in our_contacts(contact_case(name), quick=True)) < 2e-13

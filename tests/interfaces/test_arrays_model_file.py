@@ -165,7 +165,7 @@ span = 1.0
 """
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_models_of_arrays_have_inputs(tmp_path: Path) -> None:
     """The mean moves as the exact integral of the force; known sizes give the same states."""
     path = tmp_path / "driven.toml"

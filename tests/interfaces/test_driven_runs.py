@@ -43,7 +43,7 @@ def model(here):
 RUN = ("run", "pushed.toml")
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_inputs_of_the_command_line_replace_those_of_the_file(model):
     (Path("elsewhere")).mkdir()
     Path("pushed.toml").rename("elsewhere/pushed.toml")

@@ -79,7 +79,7 @@ SERVO = """<mujoco><worldbody><body><joint name="j" axis="0 1 0" range="0 30"/><
 </mujoco>"""
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_flags_of_the_command_line_are_keys_of_robots(tmp_path):
     (tmp_path / "servo.xml").write_text(SERVO)
     flags = ["--limits", "contact", "--friction", "ignore", "--contacts", "ignore", "--actuators", "--keyframe", "0"]

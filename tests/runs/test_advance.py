@@ -17,6 +17,7 @@ def pushed() -> sc.Stepper:
     return sc.compile_stepper(PUSHED, sc.SVI(3))
 
 
+@pytest.mark.tiers(0, 1)
 def test_nan_input_leaves_all_inputs_unchanged(pushed):
     run = pushed.start([0.3], [0.1], h=0.05)
     run.set_inputs(u=0.4)

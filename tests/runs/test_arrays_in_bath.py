@@ -35,18 +35,22 @@ def test_motion_is_that_of_named_coordinates(method):
     assert not run.momentum_maps().size
 
 
-@pytest.mark.rotated
-def test_arrays_with_rods_and_with_a_temperature_of_time():
+RODS = {"constraints": ["sum(a in 2, (r[i+1, a] - r[i, a])**2) = 1 for i in N-1"], "temperature": "kT"}
+
+
+@pytest.mark.tiers(0, 1)
+@pytest.mark.parametrize(
+    ("further", "parts"), [(RODS, (5 / 8, 5 / 8)), ({"temperature": "kT*(1 + t/10)"}, (1.45, 1.95))]
+)
+def test_arrays_with_rods_and_with_a_temperature_of_time(further, parts):
     """Five of eight momenta are free; kT(t) is that of the time at slow heating. Within four standard errors."""
     potential = "sum(i in N, sum(a in 2, r_dot[i, a]**2))/2 - sum(i in N, sum(a in 2, r[i, a]**2))/2"
     arguments = {"coordinates": ["r[N, 2]"], "lagrangian": potential, "parameters": {"kT": 1.0}, "damping": 1.0}
-    rods = {"constraints": ["sum(a in 2, (r[i+1, a] - r[i, a])**2) = 1 for i in N-1"], "temperature": "kT"}
-    for further, parts in ((rods, (5 / 8, 5 / 8)), ({"temperature": "kT*(1 + t/10)"}, (1.45, 1.95))):
-        system, q = sc.LagrangianSystem.from_text(name="beads", **arguments, **further), np.zeros((400, 4, 2))
-        q[:, :, 0] = np.arange(4)
-        runs = sc.compile_stepper(system, "svi:1").integrate_ensemble(q, 0 * q, h=0.1, steps=100, save_every=50, seed=1)
-        squares = (runs.p.reshape(3, 400, 8) ** 2).mean(axis=2)[1:]
-        assert (np.abs(squares.mean(axis=1) - parts) < 4 * squares.std(axis=1) / 20).all()
+    system, q = sc.LagrangianSystem.from_text(name="beads", **arguments, **further), np.zeros((400, 4, 2))
+    q[:, :, 0] = np.arange(4)
+    runs = sc.compile_stepper(system, "svi:1").integrate_ensemble(q, 0 * q, h=0.1, steps=100, save_every=50, seed=1)
+    squares = (runs.p.reshape(3, 400, 8) ** 2).mean(axis=2)[1:]
+    assert (np.abs(squares.mean(axis=1) - parts) < 4 * squares.std(axis=1) / 20).all()
 
 
 @pytest.mark.second

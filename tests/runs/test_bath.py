@@ -218,7 +218,7 @@ def test_metropolis_with_a_magnetic_field_has_a_direction_variable():
     assert agrees(*averages(charge, [0, 0], 0.8, 6000, observe, metropolis=True), exact, 0.02)
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_rods_by_constraints_and_by_angles_agree_with_quadrature():
     angle = (np.arange(800) + 0.5) * np.pi / 400
     a, b = np.meshgrid(angle, angle, indexing="ij")
@@ -430,7 +430,7 @@ def test_the_remedy_of_kinks_exists_in_a_bath():
         compiled("svi:1", **{**WELL, "lagrangian": "x_dot**2/2 - abs(x)"})
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_model_files_and_generated_programs_have_the_same_noise(tmp_path):
     model = sc.Model(system=sc.LagrangianSystem.from_text("well", **WELL), method="svi:2", q=[1.0], p=[0.0], h=0.1,
                      steps=50, save_every=50, seed=0)  # fmt: skip

@@ -104,7 +104,7 @@ def test_additive_noise_acts_half_before_and_half_after_a_step():
     assert abs(run.energy()[-1] - run.energy()[0] - run.heat()) < 1e-12 * abs(run.heat())
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_escape_over_a_barrier_has_the_rate_of_the_fokker_planck_operator():
     # <x x(t)> = (x, e^(L t) x), L = sqrt(kT) (a^T D - a D^T) - g a^T a, D = d/dx + V'/(2 kT) (Risken, The
     # Fokker-Planck Equation, 1989, sec. 10.3) at sinc points; sees a wrong friction: a rate with 6 % error fails
@@ -127,7 +127,7 @@ def test_escape_over_a_barrier_has_the_rate_of_the_fokker_planck_operator():
     assert agrees((runs.q[1:, :, 0] * start[:, 0]).T, exact[1:], 0.006)
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_rotational_diffusion_of_a_free_body():
     # E R(t) from rest: dF/dt = (L + [omega]) F, L of damped Euler equations, in Hermite functions of omega; sees a
     # noise of the wrong axes, and the inertia of quaternions instead of J
@@ -154,7 +154,7 @@ def test_rotational_diffusion_of_a_free_body():
     assert agrees(np.swapaxes(diagonal, 0, 1), exact, 0.005)
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_axes_of_a_rigid_body_have_the_temperature():
     # <L_i^2/J_i> = kT; sees noise along the length of quaternions, which is no degree of freedom, and that of one axis
     body = compiled(

@@ -237,6 +237,7 @@ def test_where_a_puck_on_a_slope_stops(steps: dict[str, float], error: float) ->
     assert columns == pytest.approx(exact, abs=error)
 
 
+@pytest.mark.tiers(0, 1)
 def test_a_block_on_a_shaken_table_stops_and_slips_again() -> None:
     """By DOP853 until the slip is 1e-8, and from 1e-6 after it begins; the floor carries the block between."""
     slip = ["x_dot - 0.4*sin(3*t)", "y_dot - 0.3*A*sin(2*t)"]

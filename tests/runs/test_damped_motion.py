@@ -1,6 +1,14 @@
-"""Damped motion by adaptive steps: right within ten tolerances of the motion, or warned of, for random systems.
+"""Damped motion by adaptive steps: right within ten tolerances of the motion, warned of, or stated by ``run.error``.
 
 Judged by closed forms of linear motions and by DOP853 or Radau with equations written by hand.
+
+Each of N steps errs by a tolerance at most, and a damped motion does not amplify errors: those of a run are at most N
+tolerances, of any method. Fewer cannot be promised where steps alone are controlled: along a motion that decays errors
+of steps have one sign, and the motion forgets them more slowly than they come. Of 852 random runs without a warning (20
+of each kind and solver by svi:2 to 4, gauss:2, scvi:3) 16 err by more than ten tolerances, at most by 110 in 5252
+steps; the mean error of a step is at most .6 tolerances. A warning above ten tolerances would be false: the vector of
+the check of growth is of 3 of these 16 runs, a hundredth of their errors, and above ten tolerances in 15 of 72 regular
+runs by svi:8. ``error=`` asks for ten tolerances; what a run of a tolerance has reached, ``run.error`` states.
 """
 
 import math
@@ -26,9 +34,8 @@ SYSTEMS: dict[str, tuple[str, str, dict[str, Any]]] = {
 }
 """Coordinates, Lagrangian and dissipation, with the parameters c, k and g."""
 TOLERANCES = (None, 1e-4, 1e-6, 1e-8, 1e-10)
-MULTIPLES = {"svi:2": 10.0, "gauss:2": 10.0, "scvi:3": 30.0}
-"""Further factors of methods that take thousands of steps at tight tolerances: a damped motion does not amplify errors
-of steps, but N of them add up to N tolerances (measured: a twentieth of that in most runs, at most a quarter)."""
+RIGHT, STATED = 10.0, 0.05
+"""Tolerances within which a run is right, and part of an error within which ``run.error`` is."""
 ROUNDOFF = 1e-9
 """Largest error of runs without a tolerance, relative to the motion: low degrees take up to 1e6 steps."""
 
@@ -84,16 +91,21 @@ def check(kind: str, method: str, solver: str, seed: int) -> tuple[float, bool]:
     q, v = random.normal(size=m), np.zeros(m) if at_rest else random.normal(size=m)
     t = np.linspace(0.0, periods / c if kind != "drag" else periods / math.sqrt(c), 200)
     expected = reference(kind, c, k, g, q, v, t)
-    control = {} if tolerance is None else {"tolerance": tolerance}
+    arguments: dict[str, Any] = {"t_end": t[-1], "parameters": {"c": c, "k": k, "g": g}}
+    arguments |= {} if tolerance is None else {"tolerance": tolerance}
+    moves = stepper(kind, method, solver)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        run = stepper(kind, method, solver).integrate(
-            q, velocity=v, t_end=t[-1], parameters={"c": c, "k": k, "g": g}, save_every=10**9, **control
-        )
-    error = np.abs(run.q[-1] - expected[-1]).max() / np.ptp(expected, axis=0).max()
+        run = moves.integrate(q, velocity=v, save_every=10**9, **arguments)
+    size = np.ptp(expected, axis=0).max()
+    error = np.abs(run.q[-1] - expected[-1]).max() / size
     warned = any(issubclass(warning.category, sc.AccuracyWarning) for warning in caught)
-    allowed = ROUNDOFF if tolerance is None else 10.0 * MULTIPLES.get(method, 1.0) * tolerance + ROUNDOFF
-    return error / allowed, warned
+    if tolerance is None:
+        return error / ROUNDOFF, warned
+    if error > RIGHT * tolerance + ROUNDOFF and not warned:
+        stated = np.abs(moves.integrate(q, velocity=v, **arguments).error.q[-1]).max() / size
+        assert stated == pytest.approx(error, rel=STATED)
+    return error / (max(RIGHT, run.steps) * tolerance + ROUNDOFF), warned
 
 
 FEW = [

@@ -212,7 +212,7 @@ class TestOtherRuns:
         assert len(saved) == -(-saved.steps // 10) + 1
         assert saved.global_error <= 1e-9
 
-    @pytest.mark.rotated
+    @pytest.mark.tiers(0, 1)
     @pytest.mark.parametrize("indexed", [False, True], ids=["scalar", "array"])
     def test_confirmed_runs_with_inputs(self, indexed):
         """x'' = -x + u with u = 1 - t/2 until t = 2, then 0, from t = 0.5: exact."""

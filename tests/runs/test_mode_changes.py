@@ -18,7 +18,7 @@ def test_changes_that_chatter_are_named(plan):
         stepper.integrate([0.0], [1.0], events=shifts, **plan)
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_bounces_that_accumulate_slowly_end_in_rest():
     ball = lagrange("ball", "y", "y_dot**2/2 - y")
     stepper = sc.compile_stepper(ball, "svi:2", contacts=[sc.contact("y", restitution=0.998)])

@@ -325,6 +325,7 @@ def test_steps_near_painleves_paradox_are_solved(h: float) -> None:
     assert [*run.q[-1], *run.velocity[-1]] == pytest.approx(true, abs=1e-6)
 
 
+@pytest.mark.tiers(0, 1)
 def test_derivatives_through_an_impact_without_collision_are_refused() -> None:
     floor = sc.contact("y - cos(a)", slip="x_dot - cos(a)*a_dot", friction=1.5)
     stepper = of(f"{PLANE} + a_dot**2/6 - g*y", "x y a", [floor], "svi:2", g=1)
@@ -595,6 +596,7 @@ def test_contacts_are_part_of_a_system_and_of_its_model_file(tmp_path: Any) -> N
 FLOOR = MODEL.partition("[[contacts]]")[0].replace("- m*g*y", "- m*g*y - 1e4*positive_part(r - y)**2")
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("text", [MODEL, FLOOR + MODEL[MODEL.index("[parameters]") :].replace("mu = 0.3\n", "")])
 def test_generated_programs_and_packages_have_the_modes_of_runs(text: str, tmp_path: Any) -> None:
     (tmp_path / "ball.toml").write_text(text.replace("q = [0.0, 0.5, 0.0]", "q = [0.0, 0.7, 0.0]"))
@@ -609,7 +611,8 @@ def test_generated_programs_and_packages_have_the_modes_of_runs(text: str, tmp_p
         assert np.abs(last - np.hstack([made.t[-1], made.q[-1], made.p[-1]])).max() < 1e-12
 
 
-def test_three_contacts_of_a_woodpecker_lead_to_its_cycle() -> None:
+def woodpecker() -> tuple[sc.Stepper, sc.Trajectory]:
+    """Return the stepper of a woodpecker, and its run by adaptive steps."""
     system = sc.LagrangianSystem.from_text(
         name="woodpecker",
         coordinates=["y", "u", "s"],
@@ -626,6 +629,12 @@ def test_three_contacts_of_a_woodpecker_lead_to_its_cycle() -> None:
     run = stepper.integrate(
         [0, -0.6 / 5.8, -0.2788], velocity=[-0.3411, 0, -7.4583], t_end=5, tolerance=1e-10, events=passes
     )
+    return stepper, run
+
+
+@pytest.mark.tiers(0, 1)
+def test_three_contacts_of_a_woodpecker_lead_to_its_cycle() -> None:
+    _, run = woodpecker()
     (cycle,) = run.events
     ends = run.stepper.velocity(cycle.q[-2:], cycle.p[-2:], cycle.t[-2:])
     assert len(cycle) >= 33
@@ -633,6 +642,10 @@ def test_three_contacts_of_a_woodpecker_lead_to_its_cycle() -> None:
     assert ends.mean(axis=0) == pytest.approx([-0.3394786, 0, -7.4620946], rel=2e-6, abs=1e-9)
     assert np.abs(cycle.t - 2.9194720658).min() < 2e-9
     assert {modes[1] for _, modes in run.contact_modes} == {"open", "stick", "slip"}
+
+
+def test_the_cycle_of_a_woodpecker_is_a_periodic_orbit() -> None:
+    stepper, run = woodpecker()
     flight = [t for t, modes in run.contact_modes[:-1] if {*modes} == {"open"}][-1] + 0.012
     q, p = run.at(flight)[:2]
     orbit = sc.periodic_orbit(stepper, q, p, period=0.146, steps=150, gain=[None, 0, 0])
@@ -861,7 +874,7 @@ def test_drag_turns_with_the_velocity_at_impacts(steps: dict[str, float], by: st
     assert run.q[-1, 0] == pytest.approx(vt**2 / 10 * np.log(np.cos(later) / np.cos(up)), abs=1e-11)
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("steps", [{"h": 0.05}, {}])
 def test_kinks_of_what_rests_have_no_zeros(steps: dict[str, float]) -> None:
     """A stop where a spring begins; a block with drag that a force moves, which sticks before it turns."""

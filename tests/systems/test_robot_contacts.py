@@ -37,7 +37,7 @@ def test_a_slide_with_dry_friction_on_an_incline_does_not_creep_and_stops(tmp_pa
     assert (run.contact_modes[1][0], run.q[-1, 0]) == pytest.approx((1 / braking, 1 / (2 * braking)), rel=1e-12)
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_a_pendulum_on_a_ball_joint_stops_at_its_limit(tmp_path):
     box = '<body><joint name="j" type="ball" range="0 40"/><geom size=".1" pos="0 0 -.5" mass="2"/></body>'
     stepper = sc.compile_stepper(robot(tmp_path, box), "svi:2")
@@ -79,11 +79,11 @@ BALL = '<body name="b"><freejoint/><geom name="ball" size=".1" {}/></body>'
 PAIR = '<contact><pair geom1="ball" geom2="floor" {}/></contact>'
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_transitions_behind_many_hinges_have_intermediate_quantities(tmp_path):
     """Their formulas in joint coordinates would be too long to write."""
     arm = '<geom name="hand" size=".1" pos="0 0 -.3"/>'
-    for k in range(5):
+    for k in range(4):
         joint = f'<joint name="j{k}" axis="{k % 2} {(k + 1) % 2} .{k}"/><geom size=".1" contype="0" conaffinity="0"/>'
         arm = f'<body pos=".1 .2 -.3">{joint}{arm}</body>'
     base = '<freejoint name="f"/><geom size=".2" contype="0" conaffinity="0"/>'
@@ -206,7 +206,7 @@ type="slide" axis="0 0 1"/><joint name="pitch"/><geom fromto="-.2 0 0 .2 0 0" ma
 name="hip" damping="1" stiffness="20"/><geom fromto="0 0 0 .1 0 -.4" mass="1"/></body></body></worldbody></mujoco>"""
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_a_robot_falls_on_its_capsules_and_rests(tmp_path):
     stepper = sc.compile_stepper(read(tmp_path, SITTER, contacts="planes"), "svi:2")
     start = dict.fromkeys(["x", "z", "pitch", "hip"], 0.0)
@@ -224,10 +224,15 @@ STOOL = f"""<mujoco><worldbody><geom type="plane" size="5 5 .1" friction=".8"/>
 
 
 @pytest.mark.filterwarnings("ignore:a transition has several motions")
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(
     ("steps", "seeds"),
-    [({"h": 0.005}, (0, 1, 2, 3, 11)), ({"h": 0.002}, (20, 22)), ({"tolerance": 1e-8}, (1, 2, 4, 12, 16))],
+    [
+        ({"h": 0.005}, (11,)),
+        ({"h": 0.005}, (0, 1, 2, 3)),
+        ({"h": 0.002}, (20, 22)),
+        ({"tolerance": 1e-8}, (1, 2, 4, 12, 16)),
+    ],
 )  # slips of feet that end together: 11, 20, 12, 16
 def test_a_free_body_falls_on_four_feet_and_rests(steps, seeds, tmp_path):
     stepper = sc.compile_stepper(read(tmp_path, STOOL, contacts="planes"), "svi:2")
@@ -262,8 +267,8 @@ conaffinity="0"/>{"".join(map(FOOT.format, (".125 .173", "-.25 0", ".125 -.173")
 
 @pytest.mark.filterwarnings("ignore:a transition has several motions")
 @pytest.mark.filterwarnings("ignore:the contacts depend")
-@pytest.mark.rotated
-@pytest.mark.parametrize(("e", "spin"), [(0.0, [0, 0, 0]), (0.3, [0.3, 0.2, 0.5])])
+@pytest.mark.tiers(0, 1)
+@pytest.mark.parametrize(("e", "spin"), [(0.3, [0.3, 0.2, 0.5]), (0.0, [0, 0, 0])])
 def test_a_stool_on_three_feet_falls_bounces_and_rests(e, spin, tmp_path):
     """Flat without restitution it stops where it lands, x = v t."""
     start = {"x_seat": 0, "y_seat": 0, "z_seat": 0.15, "R_seat": [1, 0, 0, 0]}
@@ -279,7 +284,7 @@ def test_a_stool_on_three_feet_falls_bounces_and_rests(e, spin, tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:a transition has several motions")
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_feet_that_meet_beside_one_at_its_limit_stick(tmp_path):
     """The last impulses of least norm exceed the friction of a foot, others in the cones do not."""
     start = {"x_seat": 0, "y_seat": 0, "z_seat": 0.15, "R_seat": [1, 0, 0, 0]}
@@ -332,7 +337,7 @@ def test_a_robot_lands_on_a_bent_leg(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:a transition has several motions")
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_modes_with_forces_outside_of_their_cones_are_refused(tmp_path):
     """With a bound of normal forces that none satisfies after the last choice of modes."""
     own = sc.compile_stepper(read(tmp_path, STOOL, contacts="planes"), "svi:2")
@@ -466,16 +471,16 @@ ON_TWO_FEET = f"""<mujoco><default><geom contype="0" conaffinity="0"/>
 
 @pytest.mark.filterwarnings("ignore:a transition has several motions")
 @pytest.mark.filterwarnings("ignore:impact without collision")
-@pytest.mark.rotated
-def test_slips_that_an_impact_reverses_and_feet_that_alternate(tmp_path):
+@pytest.mark.tiers(0, 1)
+@pytest.mark.parametrize(("seed", "most"), [(51, 100), (113, 200), (293, 800)])
+def test_slips_that_an_impact_reverses_and_feet_that_alternate(seed, most, tmp_path):
     """Friction along a slip supplies energy: 5e-3 of its range. Feet that open each other's contacts do so to rest."""
-    stepper = sc.compile_stepper(read(tmp_path, ON_TWO_FEET, **ALL, restitution=0.3), "svi:2", flags=("-O1",))
-    for seed, most in ((51, 100), (113, 200), (293, 800)):
-        random = np.random.default_rng(seed)
-        start = [0.0, 0.62, 0.15 * random.normal(), *(0.3 * random.normal(size=4))]
-        run = stepper.integrate(start, velocity=0.5 * random.normal(size=7), h=0.005, t_end=0.6)
-        assert np.diff(run.energy()).max() < 1e-9 * np.ptp(run.energy())
-        assert len(run.contact_modes) < most  # 1332 if feet alternate by less than the rounding of their gaps
+    stepper = sc.compile_stepper(read(tmp_path, ON_TWO_FEET, **ALL, restitution=0.3), "svi:2")
+    random = np.random.default_rng(seed)
+    start = [0.0, 0.62, 0.15 * random.normal(), *(0.3 * random.normal(size=4))]
+    run = stepper.integrate(start, velocity=0.5 * random.normal(size=7), h=0.005, t_end=0.6)
+    assert np.diff(run.energy()).max() < 1e-9 * np.ptp(run.energy())
+    assert len(run.contact_modes) < most  # 1332 if feet alternate by less than the rounding of their gaps
 
 
 LEGS = """<body><joint name="z" type="slide" axis="0 0 1"/><joint name="x" type="slide" axis="1 0 0"/>

@@ -173,7 +173,7 @@ def written(file: Any, **parts: str) -> Any:
     return file
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("kind", READ)
 @pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.SystemDefinitionWarning")
 @pytest.mark.filterwarnings("ignore:the stepper of .* does not locate .*, of 20715 terms")
@@ -193,7 +193,7 @@ def test_outcome_of_mjcf_that_is_refused(kind, tmp_path):
         sc.LagrangianSystem.from_mjcf(file, actuators=True)
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("kind", URDF)
 @pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.SystemDefinitionWarning")
 def test_outcome_of_urdf(kind, tmp_path):

@@ -55,7 +55,7 @@ def test_damping_and_actuators_act_on_joints():
     assert sympy.Symbol("tau_rail_1_0") in {sympy.Symbol(each.name) for each in system.forces[1].free_symbols}
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_runs_of_a_ball_joint_and_a_hinge_keep_energy_and_vertical_momentum():
     stepper = sc.compile_stepper(sc.LagrangianSystem.from_mjcf(ROBOTS / "ball.xml"), "svi:3")
     start, rates = {"R_ball": [1, 0.2, 0.1, 0], "swing": 0.4}, {"omega_ball": [0.3, 0.2, 1.0], "swing": 0.5}
@@ -254,7 +254,7 @@ def test_limits_and_dry_friction_of_joints_are_contacts(kind, tmp_path):
         stepper.integrate({"lift": -0.7, "wheel": 0.0}, velocity={"lift": 0.0, "wheel": 1.0}, h=0.05, t_end=1.5)
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_parts_of_models_that_are_not_read_are_named_in_one_warning(tmp_path):
     text, file = (ROBOTS / "figure.xml").read_text(), tmp_path / "figure.xml"
     text = text.replace('name="flex"', 'name="flex" range="-90 90" frictionloss="0.1"')
@@ -359,7 +359,7 @@ armature="0" damping="0"/><joint name="z" type="slide" axis="0 0 1" armature="0"
 </worldbody></mujoco>"""
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_joints_of_a_robot_that_is_dropped_stay_at_rest(tmp_path):
     (tmp_path / "robot.xml").write_text(DROPPED)
     robot = sc.LagrangianSystem.from_mjcf(tmp_path / "robot.xml")
@@ -435,7 +435,7 @@ BASES = {
 }
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("base", BASES)
 def test_closed_loops_move_on_any_base(base, tmp_path):
     file, (joint, place, rates) = tmp_path / "loop.xml", BASES[base]
@@ -472,7 +472,7 @@ def test_robot_in_which_nothing_moves_is_refused(tmp_path):
         sc.LagrangianSystem.from_urdf(tmp_path / "none.urdf")
 
 
-@pytest.mark.rotated
+@pytest.mark.tiers(0, 1)
 def test_robots_of_a_folder_are_listed_with_their_outcome(tmp_path):
     """By the script of the benchmarks; with MuJoCo, those of MJCF are equal."""
     script = Path(__file__).parents[2] / "benchmarks" / "robot_files.py"

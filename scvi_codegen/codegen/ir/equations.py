@@ -492,7 +492,6 @@ class AdaptivePredictor:
         alone: by the change into the next step, -reach .. reach: from the last step to the next.
         last, before: by the changes into the last step and into the next: from these two steps.
         inside: by the number of levels, from 1 on: from a step to a shorter one that begins with it.
-        second_half: from a step to its second half.
         growth: factor of the error estimate per level.
     """
 
@@ -501,5 +500,4 @@ class AdaptivePredictor:
     last: tuple[tuple[NumberTable, ...], ...]
     before: tuple[tuple[NumberTable, ...], ...]
     inside: tuple[NumberTable, ...]
-    second_half: NumberTable
     growth: float

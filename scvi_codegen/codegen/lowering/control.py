@@ -104,7 +104,6 @@ def predictor_of(fixed_point: FixedPointIteration) -> AdaptivePredictor:
     alone = _tables_by_ratio(fixed_point, ratios, points, degree, (1.0,))
     shorter = [2.0 ** (-down / LEVELS_PER_BINADE) for down in range(1, REACH_INSIDE + 1)]
     inside = _tables_by_ratio(fixed_point, shorter, points, len(points) - 1, (1.0,), begin=0.0)
-    ((second_half,),) = _tables_by_ratio(fixed_point, (0.5,), points, len(points) - 1, (1.0,), begin=0.5)
     pairs = []
     for ratio in ratios:
         sources = (*points, *((x - 1.0) / ratio for x in points))
@@ -116,7 +115,6 @@ def predictor_of(fixed_point: FixedPointIteration) -> AdaptivePredictor:
         last=tuple(tuple(last for last, _ in line) for line in pairs),
         before=tuple(tuple(before for _, before in line) for line in pairs),
         inside=tuple(table for (table,) in inside),
-        second_half=second_half,
         growth=2.0 ** (fixed_point.error_power / LEVELS_PER_BINADE),
     )
 

@@ -438,7 +438,12 @@ def _rates_of_masses(system: MechanicalSystem, forms: Any) -> list[Any]:
 
 
 def _mass_growth(system: MechanicalSystem, stages: StageSystem) -> MassGrowth | None:
-    """Return the rates at which masses grow in steps whose unknowns are velocities; ``None`` if all are 0."""
+    """Return the rates at which masses grow in steps whose unknowns are velocities; ``None`` if all are 0.
+
+    The error of a step is the larger one of its curves of velocities and of momenta. Steps of accelerations a have that
+    of a alone, which is 0 at a terminal velocity v while momenta grow: the curve e^(r t) (a + r v) is not among what
+    they store.
+    """
     shape, forms = stages.shape, forms_of(system)
     if not (isinstance(shape, Velocities) and _moves(stages, shape)) or forms.one_form:
         return None

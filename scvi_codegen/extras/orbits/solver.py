@@ -165,11 +165,40 @@ class PeriodicOrbit:
     def multiplier_errors(self) -> NDArray[np.complex128]:
         """(2m,) errors of the multipliers, each minus the nearest one of the monodromy matrix without its error.
 
-        Rounding is no part of them; k equal multipliers, as of Kepler's orbits, change by the k-th root of it.
+        Rounding is no part of them: see :attr:`multiplier_bounds`.
         """
         exact = list(np.linalg.eigvals(self.monodromy - self.monodromy_error))
         nearest = (exact.pop(int(np.argmin(np.abs(np.array(exact) - value)))) for value in self.multipliers)
         return np.asarray(self.multipliers - np.fromiter(nearest, complex))
+
+    @cached_property
+    def multiplier_bounds(self) -> Array:
+        """(2m,) radii of discs about the multipliers that contain those of the system, with rounding errors.
+
+        A matrix within epsilon of another one, A, has as many eigenvalues in a part of the set where the least singular
+        value of A - z is at most epsilon as A has (L. N. Trefethen, M. Embree, Spectra and Pseudospectra, 2005, 2 and
+        52): k equal multipliers, as of Kepler's orbits, change by the k-th root of epsilon. It is the error of the
+        monodromy matrix and a rounding of it for each step, in coordinates that balance it.
+
+        Raises:
+            MethodError: as :attr:`monodromy_error`.
+        """
+        from scipy.linalg import matrix_balance  # imported on use, as in other functions of matrices
+
+        matrix, (scales, _) = matrix_balance(self.monodromy, permute=False, separate=True)
+        change = self.monodromy_error / scales[:, np.newaxis] * scales
+        epsilon = np.linalg.norm(change, 2) + len(self.sequence) * ROUNDOFF * np.linalg.norm(matrix, 2)
+        circle = np.exp(2j * np.pi * np.arange(CIRCLE) / CIRCLE)[:, np.newaxis, np.newaxis] * np.eye(len(matrix))
+
+        def radius(value: complex) -> float:
+            size = float(epsilon)
+            while (
+                np.linalg.svd(matrix - value * np.eye(len(matrix)) - size * circle, compute_uv=False).min() <= epsilon
+            ):
+                size *= 2.0
+            return size
+
+        return np.array([radius(value) for value in self.multipliers])
 
     @property
     def reciprocal_error(self) -> float:
@@ -260,6 +289,11 @@ def _symplectic_error(monodromy: Array) -> float:
     return float(np.abs(defect).max() / max(1.0, np.linalg.norm(monodromy, 2) ** 2))
 
 
+CONTRACTION = 0.25
+"""Largest ratio of successive residuals of the simplified Newton iteration that converges (P. Deuflhard, Newton Methods
+for Nonlinear Problems, 2004, 2.1.2)."""
+CIRCLE = 32
+"""Number of points of a circle at which singular values are computed: they change slowly along it."""
 MOST_ITERATIONS, MOST_HALVINGS = 50, 12
 EASY, GROWTH = 10.0, 4.0
 """Growth of tangent vectors in a period up to which one segment is enough, and that in each of more segments."""
@@ -946,36 +980,65 @@ class OrbitSearch:
             by_parameter=partials[:, -1],
         )
 
-    def _errors(self, z: Array, equations: ClosingEquations) -> tuple[float, ErrorsOfOrbit]:
-        """Return the error of a closed orbit and its entries, by the error of a run from its start."""
-        start, period, steps, m = z[:-1], float(z[-1]), self.steps, self.stepper.dimension
+    def _exact_end(self, z: Array) -> tuple[Array, Array, Array]:
+        """Return the states of a run from a start over its period, its exact end, and rounding errors of the end.
+
+        Raises:
+            ScviCodegenError: if the run fails, or its error is unknown.
+        """
+        period, steps = float(z[-1]), self.steps
         span = period * float(steps.ends[-1])
         plan: dict[str, Any] = {"h": span / len(steps), "steps": len(steps)}
         if steps.tolerance is not None:
             plan = {"t_end": self.t + span, "tolerance": steps.tolerance or None, "check_growth": False}
+        plan |= {"t": self.t, "parameters": self.parameters, "options": self.options}
+        with without_accuracy_warnings():
+            run = self.stepper.integrate(*np.split(z[:-1], 2), **plan)
+            error = run.error
+        end, own = (np.concatenate([part.q[-1], part.p[-1]]) for part in (run, error))
+        if not (np.isfinite(own).all() and error.lost is None):
+            raise StateError(error.reason or "the run of a period has no meaningful digits at its end: take more steps")
+        widths = np.concatenate([bounds[-1] for bounds in error.bounds]) - (np.abs(own) if error.signed else 0.0)
+        return np.hstack([run.q, run.p]), end - own if error.signed else end, widths
+
+    def _errors(self, z: Array, equations: ClosingEquations) -> tuple[float, ErrorsOfOrbit]:
+        """Return the error of a closed orbit and its entries, by the error of a run from its start.
+
+        They are two steps of Newton's method for the exact motion, the first of which must leave a small part of its
+        closing error.
+        """
+        m, size, last = self.stepper.dimension, self.reduced_sizes(equations.sizes), equations.segments[-1]
+
+        def closing(x: Array, at: Array) -> Array:
+            time = self.t + float(at[-1]) * float(self.steps.ends[-1])
+            return self._defect(replace(last, states=x[np.newaxis], end_time=time), at[:-1], closes=True)
+
         try:
-            with without_accuracy_warnings():
-                plan |= {"t": self.t, "parameters": self.parameters, "options": self.options}
-                run = self.stepper.integrate(*np.split(start, 2), **plan)
-                error = run.error
+            states, exact, widths = self._exact_end(z)
+            defects = np.array([closing(x, z) for x in (exact, *(exact + np.diag(widths))[widths > 0.0])])
+            inverse = self._inverse(equations)[:, : len(equations.returning)] @ equations.returning
+            changes = (equations.into @ inverse @ defects.T).T
+            errors, length = changes[0], float(np.linalg.norm(defects[0] / size))
+            rounding = float(np.linalg.norm((defects[1:] - defects[0]) / size))
+            growth = float(np.linalg.norm(equations.monodromy / size[:, np.newaxis] * size, 2))
+            second = np.zeros(len(z))
+            if length * growth > math.sqrt(ROUNDOFF):  # terms of the order of its square
+                moved = self.moved(z, -errors)
+                remainder = closing(self._exact_end(moved)[1], moved)
+                left = float(np.linalg.norm(remainder / size))
+                if not left <= CONTRACTION * length + rounding:
+                    raise StateError(
+                        f"the closing error is not linear in the errors of the orbit: without them {left:.1e} of "
+                        f"{length:.1e} is left. Take more steps, or adaptive steps (omit steps and h)"
+                    )
+                second = equations.into @ inverse @ remainder
         except (EventError, MethodError, StateError, StepFailedError) as failure:
             return math.inf, ErrorsOfOrbit.unknown(m, str(failure))
-        end, own = (np.concatenate([part.q[-1], part.p[-1]]) for part in (run, error))
-        if not np.isfinite(own).all():
-            return math.inf, ErrorsOfOrbit.unknown(m, error.reason or "the errors at the end of the period are unknown")
-        widths = np.concatenate([bounds[-1] for bounds in error.bounds]) - (np.abs(own) if error.signed else 0.0)
-        exact = end - own if error.signed else end
-        inverse = self._inverse(equations)[:, : len(equations.returning)] @ equations.returning
-        changes = []
-        for x in (exact, *(exact + np.diag(widths))[widths > 0.0]):
-            defect = self._defect(replace(equations.segments[-1], states=x[np.newaxis]), start, closes=True)
-            changes.append(equations.into @ inverse @ defect)
-        errors = changes[0]
-        bounds = np.abs(errors) + np.linalg.norm(np.array(changes) - errors, axis=0)
+        bounds = np.abs(errors) + np.abs(second) + np.linalg.norm(changes - errors, axis=0)
+        errors = errors + second
         bounds += np.where(bounds > 0.0, ROUNDOFF * np.abs(z), 0.0)  # fixed entries are exact
         q, p = (float(part.max()) for part in np.split(bounds[:-1], 2))
-        states = self._whole(np.hstack([run.q, run.p]))
-        relative = max(float(bounds[-1]) / period, self._size_of(states).error(q, p))
+        relative = max(float(bounds[-1]) / float(z[-1]), self._size_of(self._whole(states)).error(q, p))
         return relative, ErrorsOfOrbit(signed=errors, bounds=bounds)
 
     def independent_equations(self, starts: Array, segments: Sequence[_Segment], sizes: Array, error: float) -> Array:

@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.common.errors import AccuracyWarning, ScviCodegenError, StateError, StepFailedError, warn
 from scvi_codegen.runs.accuracy.narrow_forces import differences_in_pieces, longest_piece
-from scvi_codegen.runs.accuracy.run_error import DEVIATIONS, LOST, RunError, leave_out_rounding, relative_until
+from scvi_codegen.runs.accuracy.run_error import (
+    DEVIATIONS,
+    LOST,
+    ROUNDINGS,
+    RunError,
+    leave_out_rounding,
+    relative_until,
+)
 from scvi_codegen.runs.accuracy.size import relative, roundoff
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
 
@@ -25,14 +32,14 @@ Array = NDArray[np.float64]
 
 FIRST, GOAL = 0.01, 0.5
 """First local tolerance relative to the bound; part of it that the next tolerance aims at."""
-LEAST_REDUCTION, LARGE, LARGE_REDUCTION = 0.3, 0.05, 1e-3
-"""Largest ratio of successive tolerances; errors from which on they are not proportional to it, and its ratio then."""
+LEAST_REDUCTION, LARGE_REDUCTION = 0.3, 1e-3
+"""Largest ratio of successive tolerances; that where the error is ``LOST``, and not proportional to them."""
 MOST_RUNS, LEAST = 5, (1e-16, 1e-30)
 """Largest number of runs; tolerances of one and two words below which runs are at round-off."""
 MOST_EXAMINATIONS, FINER_PIECES = 2, 0.0625
 """Searches for narrow forces; ratio of their pieces, the second one where the first one finds some."""
-PART_OF_ERROR, ROUNDINGS = 0.01, 1024.0
-"""Differences in pieces that count: parts of the bound, which later steps may enlarge; roundings."""
+PART_OF_ERROR = 0.01
+"""Differences in pieces that count: parts of the bound, which later steps may enlarge, and ``ROUNDINGS``."""
 ROUNDINGS_OF_RESULT = 10.0
 """Smallest estimate in roundings."""
 UNEVEN = 30.0
@@ -266,7 +273,7 @@ class Runs:
 
     def _reduction(self, result: GlobalError | None) -> float:
         """Return the ratio of the next tolerance to that of a run, or of one that failed."""
-        if result is None or not result.estimate <= LARGE:
+        if result is None or not result.estimate < LOST:
             return LARGE_REDUCTION
         return float(min(LEAST_REDUCTION, GOAL * self.requested / result.estimate))
 

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.codegen.variants import Derivatives
-from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError, StepFailedError
+from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError
 from scvi_codegen.common.representation import with_uncertainty
 from scvi_codegen.common.thread_pool import run_jobs
 from scvi_codegen.runs.accuracy.size import (
@@ -60,7 +60,7 @@ Along the direction that grows all are multiples of one vector by normal numbers
 mean square of k is Student's t with k degrees of freedom, above 6 in 0.9 % for k = 3, above 4 in 16 % for k = 1.
 """
 ROUNDINGS = 1024.0
-"""Errors of coordinates that constraints determine below so many roundings are those of rounding."""
+"""Errors of coordinates that constraints determine, and differences, below so many roundings are those of rounding."""
 MOST_STEPS = 8192
 """Number of steps of one call of C, several times as long as the start of the threads that share such calls."""
 LEFT = 1e-6
@@ -74,8 +74,6 @@ CONVERGED = 1e-4
 Errors of orders r and R of one motion are d and about d^(R/r): a tenth of the defect where d is 10^(-r / (R - r)), and
 R - r is a quarter of r or more (``finer_method``).
 """
-AT_EVENT = 64.0
-"""Distance of a time from that of an event, in roundings of the largest time, within which a state is that of it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -176,8 +174,8 @@ class WithErrors:
     def error(self: Any) -> RunError:
         """Global errors of states since :attr:`initial`, with their signs (:class:`RunError`), made at first access.
 
-        One step of a finer method and products with the Jacobian of the step for each step, about seven times the cost
-        of the run and 0.4 ms, more where Newton's method solves it; a finer method is compiled once.
+        One step of a finer method and products with the Jacobian of the step for each step, about six times the cost
+        of the run and 0.3 ms, more with constraints; a finer method is compiled once.
         docs/steps.md lists which runs have signs, which are compared with a finer run, and which are refused.
 
         Raises:
@@ -416,11 +414,8 @@ class _Replay:
         t, end = map(float, self.run.t[row - 1 : row + 1])
         start, parameters = states[row - 1] - errors[:, row - 1], parameters_set_until(self.run, t)
         try:
-            if self.resolved[row]:
-                moved = self._ends(np.array([t]), steps_after(self.run, row - 1, row), start[None], parameters)[0]
-            else:
-                run = self.finer._run(*np.split(start, 2), plan=Adaptive(end), t=t, parameters=parameters)
-                moved = self._state(run._recorded(None, ALL_STATES), -1)
+            run = self.finer._run(*np.split(start, 2), plan=Adaptive(end), t=t, parameters=parameters)
+            moved = self._state(run._recorded(None, ALL_STATES), -1)
         except ScviCodegenError:
             return False
         apart = np.abs(states[row] - moved - errors[:, row])
@@ -456,9 +451,8 @@ class _Replay:
         t, h = np.ascontiguousarray(piece.t[begin:end]), np.ascontiguousarray(steps_after(piece, begin, end))
         q, p = (np.ascontiguousarray(np.asarray(column)[begin : end + 1]) for column in (piece.q, piece.p))
         starts, parameters = Starts(t, h, q, p), piece.parameters_on_sides(float(piece.t[begin]))
-        parts = [starts.part(k, k + MOST_STEPS) for k in range(0, len(h), MOST_STEPS)]
-        for k, (part, defects) in enumerate(zip(parts, self._defects(parts, parameters), strict=True)):
-            resolved, row = self._resolved(part, defects, parameters), begin + k * MOST_STEPS
+        for k, (part, defects) in enumerate(self._defects(starts, parameters)):
+            resolved, row = defects.parts > 0, begin + k * MOST_STEPS
             for start, stop in _alike(resolved):
                 if resolved[start]:
                     rows = slice(first + row + start + 1, first + row + stop + 1)
@@ -470,50 +464,22 @@ class _Replay:
                     self._by_run(piece, float(piece.t[j]), piece.q[j], piece.p[j], j + 1, steps=1.0)
                     self._store(first + j + 1)
 
-    def _defects(self, parts: list[Starts], parameters: Array) -> list[Any]:
-        """Return the defects of steps, or the error of one that fails; small are those of :data:`CONVERGED`."""
-        defects = list[Any]([None] * len(parts))
+    def _defects(self, starts: Starts, parameters: Array) -> list[tuple[Starts, Defects]]:
+        """Return parts of the steps and their defects, which threads share.
+
+        Steps are resolved where the error of the finer method's step is a tenth of the defect, or of rounding.
+        """
+        parts = [starts.part(k, k + MOST_STEPS) for k in range(0, len(starts.h), MOST_STEPS)]
+        limits, defects = np.array([CONVERGED, LOST, RESOLVED * self.u]), dict[int, Defects]()
 
         def find(k: int, _: object = None) -> None:
-            try:
-                defects[k] = self.finer._defects(parts[k], parameters, self.size, CONVERGED)
-            except ScviCodegenError as failure:
-                defects[k] = failure
+            defects[k] = self.finer._defects(parts[k], parameters, self.size, limits)
 
         if len(parts) == 1:
             find(0)
         else:
             run_jobs(len(parts), find, progress=None, threads=None)
-        return defects
-
-    def _resolved(self, starts: Starts, defects: Any, parameters: Array) -> NDArray[np.bool_]:
-        """Return (n,) whether errors of the finer method's steps are a tenth of their defects, or of rounding.
-
-        They are where a defect is small beside the change of momenta, the motion by forces. Of other steps the errors
-        are the differences from two steps of half the size (E. Hairer, S. P. Norsett, G. Wanner, Solving ODEs I, II.4).
-        """
-        if isinstance(defects, ScviCodegenError):
-            return np.zeros(len(starts.h), bool)
-        resolved = defects.small != 0
-        if resolved.all():
-            return np.asarray(resolved)
-        doubtful = np.flatnonzero(~resolved)
-        t, h = starts.t[doubtful], starts.h[doubtful] / 2.0
-        begin, end = (np.concatenate([starts.q[k], starts.p[k]], axis=1) for k in (doubtful, doubtful + 1))
-        try:
-            halves = self._ends(t + h, h, self._ends(t, h, begin, parameters), parameters)
-        except StepFailedError:
-            return np.asarray(resolved)
-        rounding = RESOLVED * self.u * (np.abs(begin) + np.abs(end - begin))
-        apart = np.maximum(np.abs(end - defects.misfits[doubtful] - halves) - rounding, 0.0)
-        resolved[doubtful] = lengths(apart, self.size) <= LOST * lengths(end - halves, self.size)
-        return np.asarray(resolved)
-
-    def _ends(self, t: Array, h: Array, states: Array, parameters: Array) -> Array:
-        """Return the (n, 2m) ends of steps of the finer method from n states, up to rounding."""
-        rows = np.concatenate([states, states[-1:]])
-        q, p = (np.ascontiguousarray(part) for part in np.split(rows, 2, axis=1))
-        return np.asarray(rows[1:] - self.finer._defects(Starts(t, h, q, p), parameters, self.size, CONVERGED).misfits)
+        return [(part, defects[k]) for k, part in enumerate(parts)]
 
     def _transport(
         self, starts: Starts, defects: Defects, results: Array, parameters: Array, steps: float = 1.0
@@ -541,17 +507,20 @@ class _Replay:
         plan, parameters = ending_at(Adaptive(stop), stop), parameters_set_until(piece, t)
         run = self.finer._run(np.asarray(q), np.asarray(p), plan=plan, t=t, parameters=parameters)
         fine = run._recorded(None, ALL_STATES)
-        if len(times_of_changes(fine)) or (fine.modes is not None and len(fine.modes.t)):
+        parts = list[tuple[Starts, Defects]]()
+        if not (len(times_of_changes(fine)) or (fine.modes is not None and len(fine.modes.t))):
+            h, sides = steps_after(fine, 0, len(fine) - 1), fine.parameters_on_sides(t)
+            times, h, x, y = (np.ascontiguousarray(of) for of in (fine.t, h, fine.q, fine.p))
+            parts = self._defects(Starts(times, h, x, y), sides)  # of rounding, as states have no low words
+        if parts and all(defects.parts.all() for _, defects in parts):
+            for part, defects in parts:
+                results = np.empty((2, 2 * self.m, len(part.h)))  # of the states in between
+                self._transport(part, defects, results, sides, steps / len(h))
+        else:
             self.now = np.ascontiguousarray(fine.tangent(self.now.T)[-1].T)
             self.calls += 1
             normal = np.random.default_rng(self.calls).standard_normal((SAMPLES, 2 * self.m))
             self.now[1:] += math.sqrt(steps) * self.u * normal * np.abs(self._state(piece, end))
-        else:
-            times, h, x, y = (np.ascontiguousarray(of) for of in (fine.t, np.diff(fine.t), fine.q, fine.p))
-            starts, sides = Starts(times, h, x, y), fine.parameters_on_sides(t)
-            results = np.empty((2, 2 * self.m, len(h)))  # of the states in between
-            defects = self.finer._defects(starts, sides, self.size, CONVERGED)  # as states have no low words
-            self._transport(starts, defects, results, sides, steps / len(h))
         self.now[0] += self._state(piece, end) - self._state(fine, -1)
 
     @staticmethod
@@ -575,7 +544,7 @@ def _rows_between(states: Any, special: Array) -> NDArray[np.intp]:
     """Return the rows of the first state and of those at none of the times ``special``."""
     t, kept = np.asarray(states.t), np.ones(len(states), bool)
     if len(special):
-        near = AT_EVENT * np.finfo(float).eps * max(np.abs(t).max(), np.abs(special).max())
+        near = 2.0 * RESOLVED * roundoff(1) * max(np.abs(t).max(), np.abs(special).max())
         order = np.sort(special)
         after = np.minimum(np.searchsorted(order, t), len(order) - 1)
         apart = np.minimum(np.abs(order[after] - t), np.abs(order[np.maximum(after - 1, 0)] - t))

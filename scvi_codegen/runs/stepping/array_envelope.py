@@ -5,6 +5,7 @@ matrix has one (envelope: A. Jennings, Comput. J. 9 (1966), 281). Coordinates of
 Hamiltonian with their momenta, are interleaved; those that are coupled across a periodic boundary are last.
 """
 
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -107,15 +108,14 @@ def _coupled_pairs(layout: ArrayLayout, arrays: RunSizes, most: int) -> NDArray[
     firsts = dict(zip(shapes, starts, strict=False))
     firsts |= {name + DOT: first for name, first in firsts.items()}
     shapes |= {name + DOT: shape for name, shape in shapes.items()}
-    groups: list[NDArray[np.int64]] = []
-    count = 0
+    groups, count = list[NDArray[np.int64]](), 0
     for term in layout.couplings:
         targets = () if isinstance(term, ArrayTerm) else term.targets
         slots = [*(access for _, access in term.slots), *(access for access, _ in targets)]
         accesses = [access for access in slots if access.array.name in firsts]
         if any(access.sums for access in accesses):  # all entries of these arrays are taken as coupled
-            names = {access.array.name for access in accesses}
-            entries = np.concatenate([firsts[name] + np.arange(int(np.prod(shapes[name]))) for name in sorted(names)])
+            names = sorted({access.array.name for access in accesses})
+            entries = np.concatenate([firsts[name] + np.arange(int(np.prod(shapes[name]))) for name in names])
             count += len(entries) ** 2
             if count > MOST_COUPLINGS or len(entries) * (len(entries) - 1) > 2 * most:
                 return None
@@ -126,17 +126,26 @@ def _coupled_pairs(layout: ArrayLayout, arrays: RunSizes, most: int) -> NDArray[
         all_pairs = any(loop.behind for loop in term.loops) and len(accesses) > 1
         if count > MOST_COUPLINGS or (all_pairs and size > 4 * most):
             return None
-        elements = Elements(term.loops, arrays.sizes, arrays.places)
-        rows = next((len(index) for index in elements.index.values()), 1)
-        places = [_flat(elements.of(access), shapes[access.array.name], rows) for access in accesses]
-        indices = [place + firsts[access.array.name] for place, access in zip(places, accesses, strict=True)]
-        groups += [np.stack([a, b]) for k, a in enumerate(indices) for b in indices[k + 1 :]]
+        groups += _pairs_in_loops(Elements(term.loops, arrays.sizes, arrays.places), accesses, firsts, shapes)
     pairs = np.concatenate([np.zeros((2, 0), np.int64), *groups], axis=1)
-    if layout.momenta:  # the rate of an unknown is a derivative with respect to its conjugate
-        n = int(starts[-1]) // 2
-        pairs = np.concatenate([pairs, [range(n), range(n, 2 * n)]], axis=1) % n
-        pairs = np.concatenate([pairs + np.array([[a], [b]]) for a in (0, n) for b in (0, n)], axis=1)
-    return pairs
+    return _with_conjugates(pairs, int(starts[-1]) // 2) if layout.momenta else pairs
+
+
+def _pairs_in_loops(
+    elements: Any, accesses: Sequence[Any], firsts: Mapping[str, int], shapes: Mapping[str, tuple[int, ...]]
+) -> list[NDArray[np.int64]]:
+    """Return the pairs of coordinates that occur in the same element of loops, (2, n) for each pair of accesses."""
+    rows = next((len(index) for index in elements.index.values()), 1)
+    names = [access.array.name for access in accesses]
+    places = [_flat(elements.of(access), shapes[name], rows) for access, name in zip(accesses, names, strict=True)]
+    indices = [place + firsts[name] for place, name in zip(places, names, strict=True)]
+    return [np.stack([a, b]) for k, a in enumerate(indices) for b in indices[k + 1 :]]
+
+
+def _with_conjugates(pairs: NDArray[np.int64], n: int) -> NDArray[np.int64]:
+    """Return pairs of positions and momenta: rates are derivatives by the conjugates, which are n places apart."""
+    pairs = np.concatenate([pairs, [range(n), range(n, 2 * n)]], axis=1) % n
+    return np.concatenate([pairs + np.array([[a], [b]]) for a in (0, n) for b in (0, n)], axis=1)
 
 
 def _flat(index: tuple[Any, ...], shape: tuple[int, ...], count: int) -> NDArray[np.int64]:

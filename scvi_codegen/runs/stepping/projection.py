@@ -334,8 +334,8 @@ def rank_deficiency(names: Sequence[str], q: Array, at: Jacobian, *, nearest: bo
     if not (np.isfinite(g).all() and np.isfinite(jacobian).all()):
         return None
     free = tangent_space(jacobian)
-    rows = np.flatnonzero(np.abs(free.conditions).max(axis=1, initial=0.0) > NAMED_SHARE)
-    if not len(rows):
+    rows = np.flatnonzero(np.abs(free.conditions).max(axis=1, initial=0.0) > NAMED_SHARE).tolist()
+    if not rows:
         return None
     listed = " and ".join(f"'{names[int(k)]}'" for k in rows) if len(rows) < 5 else f"{len(rows)} of them"
     rests = ", ".join(f"{g[k]:.3g}" for k in rows[:4])

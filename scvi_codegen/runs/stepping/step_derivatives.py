@@ -97,18 +97,15 @@ class Defects:
 
     Attributes:
         misfits: (n, 2m) defects of positions and momenta.
-        small: (n,) 1 where a defect is small beside the change of momenta in the step, else 0.
-        parts: (n,) numbers of equal parts in which the other method takes each step.
+        parts: (n,) numbers of equal parts in which the other method takes each step; 0 where it does not resolve it.
     """
 
     misfits: Array
-    small: NDArray[np.int32]
     parts: NDArray[np.int32]
 
     def part(self, first: int, last: int) -> Defects:
         """Return a view of those of the steps ``first`` to ``last`` - 1."""
-        rows = slice(first, last)
-        return Defects(self.misfits[rows], self.small[rows], self.parts[rows])
+        return Defects(self.misfits[first:last], self.parts[first:last])
 
 
 class LinearisedMethod(StateFunctions):
@@ -313,20 +310,22 @@ class LinearisedMethod(StateFunctions):
             raise step_failure(status, report, step=failed, h=float(starts.h[failed]))
         return q1, p1
 
-    def _defects(self, starts: Starts, parameters: Array, sizes: Array, part: float) -> Defects:
+    def _defects(self, starts: Starts, parameters: Array, sizes: Array, limits: Array) -> Defects:
         """Return the defects of n steps along a run of another method.
 
         Args:
             starts: the steps and the states of the run.
             parameters: as of :meth:`_propagate`.
             sizes: (2m,) sizes of positions and momenta.
-            part: of the change of momenta in a step, below which a defect is small.
+            limits: defects relative to changes of momenta, and differences of defects by halved steps relative to
+                them and in addition to the state, below which they are resolved.
         """
         count = len(starts.h)
-        defects = Defects(np.empty((count, 2 * self.dimension)), *np.empty((2, count), np.int32))
-        given = map(self.binding.pointer, (starts.t, starts.h, starts.q, starts.p, sizes))
-        results = [self.binding.pointer(of) for of in (defects.misfits, defects.small, defects.parts)]
-        status, report = self._call_steps("defects", parameters, None, count, *given, part, *results)
+        defects = Defects(np.empty((count, 2 * self.dimension)), np.empty(count, np.int32))
+        arrays = starts.t, starts.h, starts.q, starts.p, sizes, limits, defects.misfits
+        pointers = map(self.binding.pointer, arrays)
+        into = self.binding.pointer(defects.parts)
+        status, report = self._call_steps("defects", parameters, None, count, *pointers, into)
         if status:
             raise step_failure(status, report, step=0, h=float(starts.h[0]))
         return defects

@@ -44,7 +44,7 @@ static long long numbers_of_factors(const int *pattern, long long n)
 
 static envelope envelope_of(const linear_system *of)
 {
-  double *memory = of->step->first >= COMPARISON ? of->run->compared_factors : of->run->factors;
+  double *memory = of->step->first == COMPARISON ? of->run->compared_factors : of->run->factors;
   envelope all = envelope_in(of->run->pattern, of->n);
   all.valid_for = memory;
   all.unknown = (complex_shifts *)(memory + 8);

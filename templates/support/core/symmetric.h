@@ -1,8 +1,9 @@
-/* Symmetric systems by L D L^T without pivots, which exist for definite matrices and those with a definite real part
- * (Golub & Van Loan, Matrix Computations, sec. 4.1.2 and 4.3.6; N. J. Higham, Math. Comp. 67 (1998), 1591): of every lane,
- * or of COMPLEX_SYSTEMS, every shift. Rows of the lower triangle, of a full matrix or within `reach` of the diagonal:
- * entry (k, j) is l[first + k stride + j]. The factors replace it, D^-1 on the diagonal; singular matrices lead to
- * solutions that are not finite. Requires: lanes, or shifts.h. */
+/* Symmetric systems by L D L^T without pivots, which exists for definite matrices and those with a definite real part,
+ * of which no leading block is singular (Golub & Van Loan, Matrix Computations, sec. 4.1.2 and 4.3.6; N. J. Higham,
+ * Math. Comp. 67 (1998), 1591): of every lane or, with COMPLEX_SYSTEMS, every shift. Rows of the lower triangle, of a
+ * full matrix or within `reach` of the diagonal: entry (k, j) is l[first + k stride + j], first = reach for a band. The
+ * factors replace it, D^-1 on the diagonal; singular matrices lead to solutions that are not finite. Requires: lanes,
+ * or shifts.h. */
 #ifdef COMPLEX_SYSTEMS
 typedef complex_shifts symmetric_entry;
 #define MINUS(a, x, y) minus_product(a, x, y)
@@ -15,7 +16,8 @@ typedef lanes symmetric_entry;
 #define INVERSE(x) (1 / (x))
 #endif
 
-static inline __attribute__((always_inline)) void factorise_symmetric(symmetric_entry *l, int count, int reach, int stride)
+static inline __attribute__((always_inline)) void factorise_symmetric(symmetric_entry *l, int count, int reach,
+    int stride)
 {
   l += stride > reach ? 0 : reach;
   for (int k = 0; k < count; k++) {

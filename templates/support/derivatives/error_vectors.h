@@ -1,5 +1,6 @@
 /* Vectors of a transported global error: the first is the error, to which the defect of each state is added; the others
- * are samples of rounding errors (Hairer, Norsett & Wanner, Solving ODEs I, II.3 and II.4). Requires: real, M. */
+ * are samples of rounding errors (Hairer, Norsett & Wanner, Solving ODEs I, II.3 and II.4). Requires: real, M; no
+ * macros of numbers.h, which packages omit. */
 
 typedef struct {
   int count;
@@ -23,18 +24,19 @@ static inline void receive_errors(error_vectors *of, long long k, const real *q,
 {
   for (int i = 0; i < 2 * M; i++) {
     const real x = i < M ? q[i] : p[i - M];
-    real largest = REAL_MIN, sum = 0;
+    real largest = 0, sum = 0;
     vectors[i] += of->defects ? of->defects[k * 2 * M + i] : 0;
     for (int j = 1; j < of->count; j++) {
       real *to = vectors + j * of->apart + i;
       *to += (next_random(&of->random) >> 63 ? of->rounding : -of->rounding) * x;
-      largest = MATH(fabs)(*to) > largest ? MATH(fabs)(*to) : largest;
+      const real size = *to < 0 ? -*to : *to;
+      largest = size > largest ? size : largest;
     }
-    for (int j = 1; j < of->count; j++) {
+    for (int j = 1; largest > 0 && j < of->count; j++) {
       const real part = vectors[j * of->apart + i] / largest;
       sum += part * part;
     }
     of->errors[i * of->stride + k] = vectors[i];
-    of->deviations[i * of->stride + k] = largest * MATH(sqrt)(sum / (of->count - 1));
+    of->deviations[i * of->stride + k] = largest * (real)sqrt(sum / (of->count - 1));
   }
 }

@@ -5,8 +5,9 @@
 /* Linear part of the forces, F(q) = -K q + .. with constant K, solved implicitly: the correction d of the points X by
  * their residual r is the solution of (1 + h^2 P (x) M^-1 K) d = r, a simplified Newton iteration, so that fast linear
  * vibrations limit neither convergence nor the step size (E. Hairer & G. Wanner, Solving ODEs II, sec. IV.8). Its
- * systems m + mu h^2 K are complex symmetric band matrices, factored once for each step size. Requires: LINEAR_ENTRIES and LINEAR_ENTRY of -K, i >= j in the order of LINEAR_COORDINATE; LINEAR_BAND,
- * their largest distance; and linear_forces, the derivatives of the forces at q = 0. */
+ * systems m + mu h^2 K are complex symmetric band matrices, factored once for each step size. Requires: LINEAR_ENTRIES
+ * and LINEAR_ENTRY of -K, i >= j in the order of LINEAR_COORDINATE; LINEAR_BAND, their largest distance; and
+ * linear_forces, the derivatives of the forces at q = 0. */
 
 #define FAST_VIBRATIONS 16.0 /* (h omega)^2, from which on the iteration of all forces takes longer */
 

@@ -1,8 +1,8 @@
 #include "../core/points.h"
 #include "../core/step.h"
 
-/* Predictor tables for steps of different sizes. Requires: PREDICTOR_INSIDE, PREDICTOR_SECOND_HALF, PREDICTOR_ALONE,
- * PREDICTOR_LAST, PREDICTOR_BEFORE.
+/* Predictor tables for steps of different sizes. Requires: PREDICTOR_INSIDE, PREDICTOR_ALONE, PREDICTOR_LAST,
+ * PREDICTOR_BEFORE.
  *
  * Step sizes are roots of 2 to the power of a level, so that few tables extrapolate the curve of former steps: from the
  * last step, one for each change of level; from the last two, one for each pair of changes. After a rejected step, from

@@ -2,13 +2,13 @@
 #include "step_size_levels.h"
 
 /* Adaptive steps: trials of a step until its error estimate is admissible (Hairer, Norsett & Wanner, Solving ODEs I,
- * sec. II.4), with comparisons with two half steps. The equations of a trial are solved by fixed-point iteration, by
+ * sec. II.4), with comparisons with parts of it. The equations of a trial are solved by fixed-point iteration, by
  * Newton's method (NEWTON_ALONE) or, for arrays, by Newton-GMRES (NEWTON_KRYLOV). Requires: run.h or array_step.h,
  * and next_change of a step-size controller. */
 
 #define ONE_COEFFICIENT (GROWTH < REAL(1.5)) /* of the curve, which vanishes where forces do */
-#define ALLOWED_TO_HALVES (ONE_COEFFICIENT ? 1 : 100) /* admissible difference of the half steps, relative to the
-                                                       * admissible error estimate */
+#define ALLOWED_TO_PARTS (ONE_COEFFICIENT ? 1 : 100) /* admissible difference of parts, relative to the error
+                                                      * estimate that is */
 #define SPURIOUS REAL(1e-8) /* relative to the motion: spurious solutions of the equations differ by more */
 #define MANY_ITERATIONS 10 /* of a step, after which the next one is not larger */
 #define TOO_MANY_ITERATIONS 13 /* the next one is smaller: about ten iterations take the least time per unit of time */
@@ -31,17 +31,12 @@
 #define TRIED_AGAIN (-1) /* run->avoiding of the step after those by Newton's method */
 #define COST_OF_NEWTON (10LL * M * KEPT) /* of an update, in iterations: measured 1 to 10 times M KEPT */
 #define UPDATES 4 /* of a step by Newton's method from a straight line */
-#define UNBENT REAL(1e-11) /* leading coefficients of the velocities of a free flight relative to their change */
-#define LEAP 2 /* levels by which a step is larger than the one before, whose end is then examined */
-#define MOST_EXAMINED 8 /* trials, each up to four times shorter, until no force sets in at the end of a step */
-#define BEYOND_END REAL(0.125) /* of the step: part behind its end whose forces are examined */
-#define EQUAL_FORCES REAL(1e-2) /* relative difference of the force in both halves of a free flight */
-#define NO_FORCE REAL(1e-12) /* impulse relative to the largest momentum: coordinates that motion has not reached yet */
+#define LEAP 2 /* levels by which a free flight is larger than the step before */
+#define PARTS_OF_LEAP 16
+#define BEYOND_END REAL(0.125) /* of the step: part behind its end whose force is examined */
 #define OTHER_FORCE REAL(0.5) /* relative difference beyond which another force sets in */
-#define PIECES 256 /* of a free flight to the end of the run, .. */
-#define LEAST_PIECES 4 /* .. and least number of others, shorter ones are not examined */
-#define UNEVEN REAL(0.5) /* of a piece: range of its irregular end, as forces may be periodic in time */
-#define GOLDEN REAL(0.6180339887498949)
+#define NO_FORCE REAL(1e-12) /* impulse relative to the largest momentum: coordinates that motion has not reached yet */
+#define PARTS_OF_RUN 256 /* of the time that is left: a pulse between the points of a leap is seen by parts as short */
 
 #ifdef ARRAYS
 /* State of a run: vectors of the caller. */
@@ -87,7 +82,7 @@ typedef struct {
 #else
   real dq[2 * M], dp[2 * M]; /* increments, then their low words */
 #endif
-  real apart; /* error estimate by two half steps, in the measure of `error`; 0 if they were not computed */
+  real apart; /* error estimate by parts, in the measure of `error`; 0 if they were not computed */
   long long guess, grid_level; /* level of the step size */
   long long change; /* of the level, from the previous step to this */
   long long iterations; /* of the last trial */
@@ -365,24 +360,6 @@ static SELDOM int changes_little(const trial *now)
 {
   real size;
   return largest_change(&now->step, now->at.p, now->dp, &size) < SMALL_PART * size;
-}
-
-/* Compares a trial with two half steps, in momenta too if requested: integrals of its defect where they begin at its
- * curve and end at once. Their equations are solved to the tolerance of the step, as differences count beside it. */
-static SELDOM int compare_trial(const trial *now, int momenta, const solver_options *options, real *apart)
-{
-  const step_data *step = &now->step;
-  solver_options few = *options;
-  VECTORS(first, 1, step);
-  few.tolerance = larger(few.tolerance, now->control->tolerance);
-#ifdef NEWTON_ALONE
-  const half_tables *tables = NULL;
-#else
-  const struct predictor_tables_of to_first = {PREDICTOR_INSIDE[LEVELS_PER_BINADE - 1], NULL, NULL};
-  const struct predictor_tables_of to_second = {PREDICTOR_SECOND_HALF, NULL, NULL};
-  const half_tables of_curve = {&to_first, &to_second}, *tables = by_newton(now) ? NULL : &of_curve;
-#endif
-  return compare_with_halves(step, step->h, now->dq, momenta ? now->dp : NULL, tables, &few, first, apart);
 }
 
 /* Number of levels, at most `most`, by which the step size may be increased without exceeding the largest one. */
@@ -669,56 +646,36 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
   return now->status;
 }
 
-#ifdef NEWTON_ALONE
-/* Returns 1 if the force on some coordinate is nearly constant along the stages, as in free flight. */
-static SELDOM int stages_fly(const real *z)
-{
-  for (int i = 0; i < M; i++) {
-    real bend = 0, slope = 0;
-    for (int b = 0; b < B; b++) {
-      bend += STAGE_HIGHEST[b] * z[i * B + b];
-      slope += STAGE_CURVATURE[b] * z[i * B + b];
-    }
-    if (MATH(fabs)(bend) <= UNBENT * MATH(fabs)(slope))
-      return 1;
-  }
-  return 0;
-}
-#else
-#define NEARLY_CONSTANT REAL(1e-3) /* relative change of the force of a free flight along a step */
-
-/* Returns 1 if the force on some coordinate is nearly constant along the curve, as in free flight. */
-static SELDOM int is_free_flight(const step_data *step, stored_values of)
-{
-  sums all;
-  EACH_BLOCK (all, step) {
-    int flies = 0;
-    for (long long i = all.here.first; i < all.here.end; i++) {
-      const double start = stored_at(of, i, 0), middle = stored_at(of, i, KEPT / 2), end = stored_at(of, i, KEPT - 1);
-      const double bend = fabs(RESOLVED * coefficient(HIGHEST, of, i)) + fabs(NEXT_RESOLVED * coefficient(NEXT, of, i));
-      const double change = fabs(end - start) + fabs(middle - start);
-      flies |= KEPT_VELOCITIES ? bend <= UNBENT * change : change <= NEARLY_CONSTANT * (fabs(start) + fabs(end));
-    }
-    add_block(&all, (real)flies, 0.0);
-  }
-  meet(step);
-  return largest_over(&all, 0) > 0.0;
-}
-#endif
-
-/* Returns 1 for a free flight whose size is far from that of the step before: much larger, or shortened at once. */
+/* Returns 1 for a free flight in doubt, as the error of its curve is rounding: one that is much larger or smaller than
+ * the step before, or after a step that was wrong. Estimates see forces only at the points of a step, and a wall or a
+ * pulse may lie between them. */
 static inline int is_leap(const run_memory *run, const trial *now)
 {
-  if (by_newton(now))
+  const int doubtful = now->change >= LEAP || now->change <= -LEVELS_PER_BINADE || run->steps_to_compare > 0;
+  if (!doubtful || now->error > now->limits.least)
     return 0;
-  if (now->change < LEAP && now->change > -LEVELS_PER_BINADE)
-    return 0;
-#ifdef NEWTON_ALONE
-  return stages_fly(run->memory);
+  return by_newton(now) ? now->change >= LEVELS_PER_BINADE : estimate(run, now, 0) <= LEAST_UNRESOLVED;
+}
+
+/* Number of parts with which a leap is compared. */
+static inline int parts_of_leap(const trial *now)
+{
+#ifdef LOCALISED_FORCES
+  const real of_run = PARTS_OF_RUN * MATH(fabs)(now->step.h / (now->t_end - now->at.t));
+  return of_run > PARTS_OF_LEAP ? (int)of_run : PARTS_OF_LEAP;
 #else
-  return is_free_flight(&now->step, STORED(run, &now->step));
+  return PARTS_OF_LEAP;
 #endif
 }
+
+/* Friction at a rate c ends the transient of a start at another velocity, by d, than the slow motion has, within 1/c,
+ * and displaces by d/c. Gauss stages of h >> 1/c are those of the slow motion, while the velocity at the end keeps +-d
+ * (Hairer & Wanner, Solving ODEs II, sec. IV.15): parts of about 1/c show both. */
+#if defined(FRICTION) && defined(NEWTON_ALONE)
+#define HAS_TRANSIENT(run) ((run)->error_before == 0)
+#else
+#define HAS_TRANSIENT(run) 0
+#endif
 
 /* Returns 1 if the momenta of a step are compared, too: after a step that was wrong, and where the step size fell by a
  * factor of two or more although the momenta change little. Near a singular time or a nonsmooth force the coefficients
@@ -730,40 +687,26 @@ static inline int needs_momenta(const run_memory *run, const trial *now)
   return DOUBTS && !by_newton(now) && (run->steps_to_compare > 0 || (shorter && changes_little(now)));
 }
 
-/* Solves a part of a step without a predictor, and adds its increments. */
-static SELDOM int add_part(step_data *part, const solver_options *options, real *dq, real *dp)
-{
-  MEMORY_OF_HALVES(memory, part);
-  return add_step(part, memory, 0, options, dq, dp);
-}
-
-/* Returns 1 if a force that is nearly constant along a step is another one at its end. Estimates see forces only at the
- * points of a step: after a free flight steps grow, and a wall, or a force that sets in, may lie between the last point
- * of one step and the first of the next. Momenta of three parts give mean forces: of both halves, and of a short step
- * from the end. A force that displaces the short step by no more than rounding is none: at rest on constraints all are
- * what rounding leaves of forces that cancel. */
+/* Returns 1 if the force beyond the end of a flight is another one: a wall, or a force that sets in, may lie between the
+ * last point of a step and the first of the next. A smaller impulse than NO_FORCE is what rounding
+ * leaves, and so is one that displaces by no more: at rest on constraints all are. */
 static SELDOM int force_sets_in(const trial *now, const solver_options *options)
 {
   const step_data *step = &now->step;
-  step_data part = part_of_step(step, step->h / 2);
-  real least, largest, rounded;
+  step_data part = part_of_step(step);
+  real largest, least, rounded;
   sums all;
   VECTORS(nothing, 1, step);
   VECTORS(q, 1, step);
   VECTORS(p, 1, step);
-  VECTORS(halves, 1, step);
+  VECTORS(moved, 1, step);
   VECTORS(changes, 1, step);
-  VECTORS(whole, 1, step);
-  VECTORS(first, 1, step);
-  set_zero(step, nothing), set_zero(step, halves), set_zero(step, changes);
-  set_zero(step, whole), set_zero(step, first);
-  if (add_part(&part, options, halves, changes) != OK)
-    return 0;
+  MEMORY_OF_PARTS(memory, step);
+  set_zero(step, nothing), set_zero(step, moved), set_zero(step, changes);
+  begin_part(&part, step, now->dq, now->dp, q, p, nothing);
   part.h = BEYOND_END * step->h;
   part.t = step->t + step->h;
-  begin_part(&part, step, now->dq, now->dp, q, p, nothing);
-  part.first = SECOND_HALF;
-  if (add_part(&part, options, whole, first) != OK)
+  if (add_part(&part, memory, 0, options, moved, changes) != OK)
     return 0;
   least = largest_change(step, p, now->dp, &largest);
   least = NO_FORCE * (least + largest);
@@ -771,13 +714,10 @@ static SELDOM int force_sets_in(const trial *now, const solver_options *options)
   EACH_BLOCK (all, step) {
     int sets_in = 0;
     for (long long i = all.here.first; i < all.here.end; i++) {
-      const real early = 2 * changes[i], late = 2 * (now->dp[i] - changes[i]), beyond = first[i] / BEYOND_END;
-      const real force = larger(MATH(fabs)(early), MATH(fabs)(late)), change = MATH(fabs)(beyond - late);
-      const real bend = 4 * (now->dq[i] - 2 * halves[i]); /* h^2 a, by a constant acceleration a */
-      const real flight = BEYOND_END * (now->dq[i] + bend * (1 + BEYOND_END) / 2);
-      sets_in |= MATH(fabs)(early - late) <= EQUAL_FORCES * force && change > OTHER_FORCE * force &&
-          MATH(fabs)(whole[i] - flight) > ROUNDING_OF_HALVES * (MATH(fabs)(q[i]) + rounded) &&
-          change > SPURIOUS * (MATH(fabs)(p[i]) + MATH(fabs)(now->dp[i])) + least;
+      const real change = MATH(fabs)(changes[i] / BEYOND_END - now->dp[i]);
+      sets_in |= change > OTHER_FORCE * MATH(fabs)(now->dp[i]) &&
+          change > SPURIOUS * (MATH(fabs)(p[i]) + MATH(fabs)(now->dp[i])) + least &&
+          MATH(fabs)(moved[i]) * BEYOND_END * change > 2 * ROUNDING_OF_PARTS * MATH(fabs)(p[i]) * (MATH(fabs)(q[i]) + rounded);
     }
     add_block(&all, (real)sets_in, 0);
   }
@@ -785,96 +725,24 @@ static SELDOM int force_sets_in(const trial *now, const solver_options *options)
   return largest_over(&all, 0) > 0;
 }
 
-/* Returns 1 if a free flight ends elsewhere in irregular pieces: a force that is narrow in time or space lies between
- * the points of the step. */
-static SELDOM int passes_over_force(const trial *now, real allowed, const solver_options *options)
-{
-#ifdef LOCALISED_FORCES
-  const step_data *step = &now->step;
-  step_data part = part_of_step(step, 0);
-  const int count = (int)(PIECES * MATH(fabs)(step->h / (now->t_end - now->at.t)));
-  real begin = 0, far = 0;
-  VECTORS(nothing, 1, step);
-  VECTORS(q, 1, step);
-  VECTORS(p, 1, step);
-  VECTORS(halves, 1, step);
-  VECTORS(changes, 1, step);
-  if (count < LEAST_PIECES)
-    return 0;
-  set_zero(step, nothing), set_zero(step, halves), set_zero(step, changes);
-  for (int k = 1; k <= count; k++) {
-    const real turn = GOLDEN * (real)k - MATH(floor)(GOLDEN * (real)k);
-    const real end = k < count ? ((real)k + UNEVEN * (turn - REAL(0.5))) / (real)count : 1;
-    part.h = (end - begin) * step->h;
-    if (add_part(&part, options, halves, changes) != OK)
-      return 0;
-    begin_part(&part, step, halves, changes, q, p, nothing);
-    begin = end;
-  }
-  return difference(step, step->h, step->q0, now->dq, halves, &far) > allowed;
-#else
-  return 0;
-#endif
-}
-
-#if defined(FRICTION) && defined(NEWTON_ALONE)
-#define PART_OF_TRANSIENT 16 /* ratio of the parts of a step in which its transient is sought */
-#define UNSEEN_PARTS 2 /* successive ones whose differences are rounding: then there is none */
-
-/* Error by the transient at the start of a step: of positions relative to the motion of the step, of momenta relative
- * to their size. Friction at a rate c ends
- * the transient of a start at another velocity, by d, than the slow motion has, within 1/c, and displaces by d/c. Gauss
- * stages of h >> 1/c are those of the slow motion, and a step and its halves differ by only about 12 d/(c^2 h), but
- * parts of about 1/c differ by d/c (Hairer & Wanner, Solving ODEs II, sec. IV.15). So parts of h/16, h/256, .. are
- * compared with their halves, as long as the difference, relative to the whole step, increases. */
-static SELDOM real transient_error(const trial *now, const solver_options *options)
-{
-  const step_data *step = &now->step;
-  real h = step->h, largest = 0, of_momenta = 0;
-  real whole[M], halves[M], impulse[M], changes[M], first[M];
-  for (int unseen = 0; unseen < UNSEEN_PARTS;) {
-    real apart, far = 0;
-    h /= PART_OF_TRANSIENT;
-    step_data part = part_of_step(step, h);
-    set_zero(step, whole), set_zero(step, impulse);
-    if (add_part(&part, options, whole, impulse) != OK ||
-        solve_halves(step, h, NULL, options, halves, changes, first) != OK)
-      break;
-    apart = difference(step, h, step->q0, whole, halves, &far) * (h / step->h);
-    if (largest > 0 && apart <= largest)
-      break;
-    unseen += !(apart > 0);
-    largest = larger(largest, apart);
-    of_momenta = larger(of_momenta, difference(step, h, step->p0, impulse, changes, &far));
-  }
-  return larger(largest, of_momenta);
-}
-#else
-#define transient_error(now, options) 0
-#endif
-
-/* Compares a step with its half steps and shortens it while the difference is far above its error estimate, or, a
- * limited number of times, a force sets in at its end or is passed over. A first step is shortened, too, while the
- * transient at its start is above the tolerance. */
-static SELDOM int compare_step(run_memory *run, trial *now, int steps_to_compare, const solver_options *options,
+/* Compares a step with parts of it, and shortens it while the difference is far above its error estimate. */
+static SELDOM int compare_step(run_memory *run, trial *now, int parts, int momenta, const solver_options *options,
     solver_report *report)
 {
-  int examined = run->steps_to_compare > 0 || is_leap(run, now) ? MOST_EXAMINED : 0;
-  const int begins = run->error_before == 0;
-  const real tolerance = larger(MATH(pow)(now->limits.most, ERROR_POWER), ROUNDOFF_LEVEL);
-  const real allowed = larger(
-      ALLOWED_TO_HALVES * MATH(pow)(now->limits.most, ERROR_POWER),
-      ONE_COEFFICIENT || steps_to_compare ? ROUNDOFF_LEVEL : SPURIOUS);
+  const real allowed = larger((parts == HALVED ? 1 : ALLOWED_TO_PARTS) * MATH(pow)(now->limits.most, ERROR_POWER),
+      ONE_COEFFICIENT || momenta ? ROUNDOFF_LEVEL : SPURIOUS);
+#ifdef NEWTON_ALONE
+  const struct predictor_tables_of *half = NULL;
+#else
+  const struct predictor_tables_of of_curve = {PREDICTOR_INSIDE[LEVELS_PER_BINADE - 1], NULL, NULL};
+  const struct predictor_tables_of *half = parts == 2 && !by_newton(now) ? &of_curve : NULL;
+#endif
   for (;;) {
     real apart;
-    const int status = compare_trial(now, steps_to_compare, options, &apart);
+    const int status = compare_with_parts(&now->step, parts, now->dq, momenta ? now->dp : NULL, half, options, &apart);
     if (status > STATUS(SPURIOUS_SOLUTION))
       return status;
-    if (begins)
-      apart = larger(apart, transient_error(now, options) * (allowed / tolerance));
-    if (status == OK && apart <= allowed &&
-        !(examined-- > 0 &&
-            (force_sets_in(now, options) || passes_over_force(now, allowed, options)))) {
+    if (status == OK && apart <= allowed && !(parts > 2 && parts != HALVED && force_sets_in(now, options))) {
       now->apart = MATH(pow)(apart, 1 / ERROR_POWER);
       run->steps_to_compare -= run->steps_to_compare > 0;
       return OK;
@@ -889,14 +757,14 @@ static SELDOM int compare_step(run_memory *run, trial *now, int steps_to_compare
   }
 }
 
-/* Compares the first step, one of COMPARED later, leaps, and those in doubt. */
+/* Compares steps in doubt: the first one, leaps, and those of which the momenta are. */
 static inline int confirm_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
-  const int steps_to_compare = needs_momenta(run, now);
+  const int leaps = is_leap(run, now), begins = HAS_TRANSIENT(run), momenta = begins || needs_momenta(run, now);
+  const int parts = begins ? HALVED : leaps ? parts_of_leap(now)
+                                            : 2;
   now->apart = 0;
-  const int is_confirmed = steps_to_compare || run->step % COMPARED == 0 ||
-      (by_newton(now) && now->change >= LEVELS_PER_BINADE) || is_leap(run, now);
-  return is_confirmed ? compare_step(run, now, steps_to_compare, options, report) : OK;
+  return leaps || momenta || run->step == 0 ? compare_step(run, now, parts, momenta, options, report) : OK;
 }
 
 /* Largest change of level after the iterations of a step. Where they are many, as in lattices whose waves are fast, the

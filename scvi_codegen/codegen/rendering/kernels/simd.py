@@ -370,7 +370,7 @@ def lane_table(
 def predictor_text(predictor: AdaptivePredictor) -> str:
     """Return the header of the tables from stored values to predicted ones.
 
-    They are of a rejected step, one and its second half, the last one, and each of the last two.
+    They are of a rejected step, the last one, and each of the last two.
     """
     text = (
         "/* Predictor tables from former steps to the next, by changes of the step-size level. Requires: points.h. */\n"
@@ -378,7 +378,6 @@ def predictor_text(predictor: AdaptivePredictor) -> str:
     changes, size = len(predictor.alone), "[POINTS * GROUPS]"
     for name, tables in (("INSIDE", predictor.inside), ("ALONE", predictor.alone)):
         text += table(f"static const lanes PREDICTOR_{name}[{len(tables)}]{size}", list(map(_columns, tables))) + "\n"
-    text += table(f"static const lanes PREDICTOR_SECOND_HALF{size}", _columns(predictor.second_half)) + "\n"
     for name, lines in (("LAST", predictor.last), ("BEFORE", predictor.before)):
         rows = [[f"{{{', '.join(_columns(numbers))}}}" for numbers in line] for line in lines]
         text += table(f"static const lanes PREDICTOR_{name}[{changes}][{changes}]{size}", rows) + "\n"
