@@ -55,8 +55,8 @@ class GlobalError:
         requested: requested bound of the relative global error.
         tolerance: local tolerance of the returned run; ``None`` for round-off.
         h: step of tau of a run in transformed time, else ``None``.
-        estimate: largest relative error of the run with its rounding errors, ``run.error.relative`` at the end, at
-            least ten roundings; an order of magnitude only above 0.01, infinite where it is unknown.
+        estimate: largest relative error of the run, of first order, with its rounding errors, ``run.error.relative`` at
+            the end, at least ten roundings; an order of magnitude only above 0.01, infinite where it is unknown.
         confirmed_until: last of the times up to which the error, relative to the size of the motion until then, is at
             most the requested one.
         runs: number of runs.

@@ -136,17 +136,12 @@ static inline real motion_of_step(const step_data *step, real h, real displaceme
 }
 
 #ifndef EXPLICIT_RUN
-/* Leaves coordinates whose velocity a pilot doubles at least, |dq_i| <= 3/2 h^2 A_i, out of its error, unless they move
- * most. Relative to its own motion, the error of a motion that begins is the same at all step sizes, until the pilot is
- * so large that V_i shows the size that this motion reaches. */
-static inline void leave_out_starts(const step_data *step, const real *dq, const real *curvature, real *size)
+/* Returns 1 for a motion whose velocity a pilot doubles at least, |dq_i| <= 3/2 h^2 A_i. Relative to its own motion,
+ * the error of a curve of one or two coefficients is then the same at all step sizes, or falls with the first power,
+ * until the pilot is so large that V_i shows the size that the motion reaches: smaller ones leave it out. */
+static inline int starts(const step_data *step, real displacement, real curvature)
 {
-  real largest = 0;
-  for (int i = 0; step->is_pilot && i < M; i++)
-    largest = larger(largest, size[i]);
-  for (int i = 0; step->is_pilot && i < M; i++)
-    if (size[i] < largest && MATH(fabs)(dq[i]) <= REAL(1.5) * curvature[i])
-      size[i] = largest / REAL_EPSILON;
+  return step->is_pilot && displacement <= REAL(1.5) * curvature;
 }
 #endif
 

@@ -62,6 +62,8 @@ static real error_of_stages(const step_data *step, const real *z, const real *v,
     of.rounding[i] = rounding_of_force(step->q0[i], curvature_size(step->motion_of, step->h, curvature, i), motion);
 #ifdef FEW_STAGE_COEFFICIENTS
     of.size[i] = size_for_few(step->motion_of, step->h, motion, of.curvature[i], i);
+    if (starts(step, MATH(fabs)(dq[i]), of.curvature[i]))
+      of.rounding[i] = INFINITY;
 #endif
     fastest = larger(fastest, MATH(fabs)(dq[i]));
     farthest = larger(farthest, MATH(fabs)(step->q0[i]) + MATH(fabs)(dq[i]));
@@ -70,7 +72,6 @@ static real error_of_stages(const step_data *step, const real *z, const real *v,
   for (int i = 0; i < M; i++)
     of.largest = larger(of.largest, of.size[i]);
   enlarge_to_arrays(of.size);
-  leave_out_starts(step, dq, of.curvature, of.size);
   error = error_beyond(step, z, &of, SITES > M ? farthest : fastest, share, decay, least);
   if (SITES > M && error > doubtful) {
     real lengths[M];

@@ -617,10 +617,10 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
 #ifdef CONSTRAINED
   now->pilots_above = run->error_before > 0 ? (real)INFINITY : 0;
 #endif
-  now->step.is_pilot = !(run->error_before > 0);
   if (run->error_before > 0)
     try_step(run, now, least, options, report);
   else {
+    now->step.is_pilot = 1;
     try_first_step(run, now, options, report);
     now->step.is_pilot = 0;
     if (now->error < INFINITY && !by_newton(now))
