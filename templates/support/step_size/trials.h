@@ -687,8 +687,8 @@ static inline int needs_momenta(const run_memory *run, const trial *now)
   return DOUBTS && !by_newton(now) && (run->steps_to_compare > 0 || (shorter && changes_little(now)));
 }
 
-/* Returns 1 if the force beyond the end of a flight is another one: a wall, or a force that sets in, may lie between the
- * last point of a step and the first of the next. A smaller impulse than NO_FORCE is what rounding
+/* Returns 1 if the force beyond the end of a flight is another one: a wall, or a force that sets in, may lie between
+ * the last point of a step and the first of the next. A smaller impulse than NO_FORCE is what rounding
  * leaves, and so is one that displaces by no more: at rest on constraints all are. */
 static SELDOM int force_sets_in(const trial *now, const solver_options *options)
 {
@@ -717,7 +717,8 @@ static SELDOM int force_sets_in(const trial *now, const solver_options *options)
       const real change = MATH(fabs)(changes[i] / BEYOND_END - now->dp[i]);
       sets_in |= change > OTHER_FORCE * MATH(fabs)(now->dp[i]) &&
           change > SPURIOUS * (MATH(fabs)(p[i]) + MATH(fabs)(now->dp[i])) + least &&
-          MATH(fabs)(moved[i]) * BEYOND_END * change > 2 * ROUNDING_OF_PARTS * MATH(fabs)(p[i]) * (MATH(fabs)(q[i]) + rounded);
+          MATH(fabs)(moved[i]) * BEYOND_END * change >
+              2 * ROUNDING_OF_PARTS * MATH(fabs)(p[i]) * (MATH(fabs)(q[i]) + rounded);
     }
     add_block(&all, (real)sets_in, 0);
   }
