@@ -346,7 +346,7 @@ def family(
             orbit is found next to it.
         StateError: if a name or number is invalid.
     """
-    stepper.require("periodic_orbit")
+    stepper.products.require("periodic_orbit")
     if start.stepper.interface != stepper.interface:
         raise StateError(f"the start is one of '{start.stepper.title}', not of '{stepper.title}'")
     if parameter is not None and parameter not in stepper.parameters:
