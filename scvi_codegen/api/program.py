@@ -7,9 +7,12 @@
     constraints, rotations, sizes of arrays.
 ``Derivation(system, method)``
     How a step is derived: the form that is discretised, statements, the lowered program and its C. MethodError.
+``checked_integrator(model, prefix)``
+    Source and interface of a ``Model``, as of generated programs; a prefix begins its functions. ModelFileError.
 """
 
 from scvi_codegen.codegen.derivation import Derivation
 from scvi_codegen.codegen.rendering.source import Interface, Source
+from scvi_codegen.interfaces.models.packages.package import checked_integrator
 
-__all__ = ["Derivation", "Interface", "Source"]
+__all__ = ["Derivation", "Interface", "Source", "checked_integrator"]

@@ -22,7 +22,7 @@ from scvi_codegen.runs.accuracy.local_error import warn_of_energy_errors
 from scvi_codegen.runs.accuracy.resolution import warn_of_unresolved_members
 from scvi_codegen.runs.accuracy.run_error import LOST
 from scvi_codegen.runs.accuracy.size import RESOLVED
-from scvi_codegen.runs.accuracy.warning_switch import warn_of_failed_check
+from scvi_codegen.runs.accuracy.warning_switch import warn_of_failed_check, warnings_wanted
 from scvi_codegen.runs.derivatives.actions import actions_of_steps
 from scvi_codegen.runs.driver.segments import Input, checked_inputs, parameters_of
 from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings, momenta_of_each, start_of_ensemble
@@ -53,13 +53,12 @@ from scvi_codegen.systems.event import Event
 if TYPE_CHECKING:
     from scvi_codegen.codegen.rendering.events import EventFormulas
     from scvi_codegen.runs.driver.run import Run
-    from scvi_codegen.runs.stepper import Stepper
 
 
 class Products:
     """Checks, reduced states, inputs and blocks of ensembles of a stepper, ``stepper.products``."""
 
-    def __init__(self, stepper: Stepper) -> None:
+    def __init__(self, stepper: Any) -> None:
         self.stepper = stepper
 
     RESOLVED = RESOLVED
@@ -78,6 +77,11 @@ class Products:
     def check_given(self, parameters: Parameters, *, step: bool = False) -> None:
         """Raise StateError if an input has no value; of a single ``step`` ContactError for unknown modes, too."""
         (check_step_given if step else check_inputs_given)(self.stepper.interface, parameters)
+
+    @staticmethod
+    def warnings_wanted() -> bool:
+        """Return whether an AccuracyWarning would be seen."""
+        return warnings_wanted()
 
     @staticmethod
     def with_uncertainty(value: float, error: float) -> str:

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.api.checks import checked_count, checks_arguments
-from scvi_codegen.api.runs import Products, warnings_wanted, without_accuracy_warnings
+from scvi_codegen.api.runs import Products, without_accuracy_warnings
 from scvi_codegen.api.states import Array, Fixed, Parameters, Reduction, checked_number
 from scvi_codegen.api.text import summary
 from scvi_codegen.codegen.native.options import SolverOptions
@@ -1101,7 +1101,7 @@ def _listed(values: Array) -> str:
 
 def _warn_of_discretisation(orbit: PeriodicOrbit, bound: float) -> None:
     """Warn if the error of an orbit exceeds a bound."""
-    if not warnings_wanted() or orbit.error <= bound:
+    if not Products.warnings_wanted() or orbit.error <= bound:
         return
     remedy = "Omit steps and h, for adaptive steps, or take more steps"
     if orbit.sequence.tolerance is not None:

@@ -24,7 +24,7 @@ import sympy
 
 from scvi_codegen.api.checks import Kind, checks_arguments
 from scvi_codegen.api.formulas import Rotation, RotationNames, input_parameters, parse_expression, symbol
-from scvi_codegen.api.program import Interface, Source
+from scvi_codegen.api.program import Interface, Source, checked_integrator
 from scvi_codegen.api.systems import ArraySystem, MechanicalSystem
 from scvi_codegen.api.text import Typeset, summary, write_text
 from scvi_codegen.common.errors import ArgumentError, ExpressionError, MethodError, StateError, closest
@@ -308,7 +308,7 @@ class Page:
 
 def _integrator(model: Model) -> tuple[Source, Interface]:
     """Return the C of the integrator, and its interface; of arrays without conserved quantities."""
-    source, interface = model.integrator(PREFIX)
+    source, interface = checked_integrator(model, PREFIX)
     if model.array_system is not None:
         interface = replace(interface, momentum_names=(), map_names=(), constraints=())
     return source, interface

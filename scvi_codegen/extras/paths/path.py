@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.api.checks import checked_count
-from scvi_codegen.api.runs import warnings_wanted
+from scvi_codegen.api.runs import Products
 from scvi_codegen.api.states import Array, Parameters, States, checked_number, real_array
 from scvi_codegen.api.text import summary
 from scvi_codegen.codegen.native.options import SolverOptions
@@ -433,7 +433,7 @@ def _described(
     if M is not None:
         repetitions = _order(M)
         zero_modes = 0 if forced else int((~solution.factors.kept).sum())
-    if not comparison.error <= TOLERABLE_ERROR and warnings_wanted():
+    if not comparison.error <= TOLERABLE_ERROR and Products.warnings_wanted():
         remedy = f"take more steps than {count}, or a method of higher degree"
         known = f"about {comparison.error:.1e} (relative): {remedy}"
         warn(f"the discretisation error of the path is {comparison.reason or known}", AccuracyWarning)

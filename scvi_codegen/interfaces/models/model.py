@@ -38,7 +38,7 @@ from scvi_codegen.systems.system import MechanicalSystem
 
 if TYPE_CHECKING:
     from scvi_codegen.codegen.native.options import SolverOptions
-    from scvi_codegen.codegen.rendering.source import Interface, Source
+    from scvi_codegen.codegen.rendering.source import Interface
     from scvi_codegen.interfaces.models.input_tables import InputTable
     from scvi_codegen.runs.accuracy.global_error import GlobalError
     from scvi_codegen.runs.driver.run import Run
@@ -354,19 +354,6 @@ class Model(TimeSpan):
             require(stepper, "action")
             stepper = stepper.acting
         return stepper.with_events(self.events) if self.events else stepper
-
-    def integrator(self, prefix: str) -> tuple[Source, Interface]:
-        """Return the C of the steps, in readable files, and its interface, as of generated programs.
-
-        A prefix begins the names of functions. ModelFileError, MethodError: options that those do not have.
-        """
-        from scvi_codegen.interfaces.models.packages.example import check_example
-        from scvi_codegen.interfaces.models.packages.package import integrator_of
-
-        source, interface = integrator_of(self, prefix)
-        source = source.readable()
-        check_example(self, controlled="advance_to" in source.contents.functions)
-        return source, interface
 
     def momenta(self, stepper: Stepper) -> Array:
         """Return the (m,) initial momenta: ``p``, or the Legendre transform of the velocities."""

@@ -345,6 +345,20 @@ def integrator_of(model: Model, prefix: str, *, embedded: Embedded | None = None
     return source, interface
 
 
+def checked_integrator(model: Model, prefix: str) -> tuple[Source, Interface]:
+    """Return the C of the steps of a model, in readable files, and its interface; see :func:`integrator_of`.
+
+    Raises:
+        ModelFileError, MethodError: for options that generated programs do not have.
+    """
+    from scvi_codegen.interfaces.models.packages.example import check_example
+
+    source, interface = integrator_of(model, prefix)
+    source = source.readable()
+    check_example(model, controlled="advance_to" in source.contents.functions)
+    return source, interface
+
+
 def _texts_of_arrays(model: Model, prefix: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:
     from scvi_codegen.codegen.rendering.program_source import render_example
     from scvi_codegen.interfaces.models.model_files.model_file import model_texts
