@@ -1,4 +1,4 @@
-"""States, their checks, steps and rounding; ``ForProducts`` in ``runs/products.py`` says what a stepper does.
+"""States, their checks, steps and rounding.
 
 ``Array``
     ``numpy.ndarray`` of binary64.

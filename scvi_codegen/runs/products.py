@@ -22,7 +22,7 @@ from scvi_codegen.runs.accuracy.local_error import warn_of_energy_errors
 from scvi_codegen.runs.accuracy.resolution import warn_of_unresolved_members
 from scvi_codegen.runs.accuracy.run_error import LOST
 from scvi_codegen.runs.accuracy.size import RESOLVED
-from scvi_codegen.runs.accuracy.warning_switch import warn_of_failed_check
+from scvi_codegen.runs.accuracy.warning_switch import warn_of_failed_check, warnings_wanted
 from scvi_codegen.runs.derivatives.actions import actions_of_steps
 from scvi_codegen.runs.driver.segments import Input, checked_inputs, parameters_of
 from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings, momenta_of_each, start_of_ensemble
@@ -45,7 +45,6 @@ from scvi_codegen.runs.states.validation import (
 )
 from scvi_codegen.runs.stepping.array_interface import RunArrays, check_accesses, read_arrays
 from scvi_codegen.runs.stepping.features import require
-from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.projection import linearised
 from scvi_codegen.runs.stepping.step_derivatives import Starts
 from scvi_codegen.runs.stepping.step_plan import ErrorControl, StepPlan
@@ -56,8 +55,11 @@ if TYPE_CHECKING:
     from scvi_codegen.runs.driver.run import Run
 
 
-class ForProducts(Integrator):
-    """Checks, reduced states, inputs and blocks of ensembles of a stepper."""
+class Products:
+    """Checks, reduced states, inputs and blocks of ensembles of a stepper, ``stepper.products``."""
+
+    def __init__(self, stepper: Any) -> None:
+        self.stepper = stepper
 
     RESOLVED = RESOLVED
     """Number of roundings of the largest value from which a difference counts as resolved."""
@@ -70,11 +72,16 @@ class ForProducts(Integrator):
 
         ``scvi_codegen.runs.stepping.features`` lists the operations. MethodError names the remedy.
         """
-        require(self, operation, *together)
+        require(self.stepper, operation, *together)
 
     def check_given(self, parameters: Parameters, *, step: bool = False) -> None:
         """Raise StateError if an input has no value; of a single ``step`` ContactError for unknown modes, too."""
-        (check_step_given if step else check_inputs_given)(self.interface, parameters)
+        (check_step_given if step else check_inputs_given)(self.stepper.interface, parameters)
+
+    @staticmethod
+    def warnings_wanted() -> bool:
+        """Return whether an AccuracyWarning would be seen."""
+        return warnings_wanted()
 
     @staticmethod
     def with_uncertainty(value: float, error: float) -> str:
@@ -84,19 +91,23 @@ class ForProducts(Integrator):
     @property
     def reduction(self) -> Reduction:
         """Maps between tangent vectors (.., 2m) of (q, p) and those of the space reduced by norms of quaternions."""
-        return Reduction(self.interface)
+        return Reduction(self.stepper.interface)
 
     @cached_property
     def members(self) -> tuple[Member, ...]:
         """Rotations, directions and spins with the columns of their coordinates."""
-        return members_of(self.dimension, self.interface.rotations) if self.interface.rotations else ()
+        return (
+            members_of(self.stepper.dimension, self.stepper.interface.rotations)
+            if self.stepper.interface.rotations
+            else ()
+        )
 
     @property
     def finer(self) -> Any:
         """Stepper of the finer method of ``run.error``, compiled once; MethodError without the system."""
         from scvi_codegen.runs.accuracy.run_error import finer_of
 
-        return finer_of(self)
+        return finer_of(self.stepper)
 
     def run_by(
         self,
@@ -109,7 +120,7 @@ class ForProducts(Integrator):
         options: SolverOptions | None = None,
     ) -> Run:
         """Return a run from (q, p) at t by steps of a plan, such as ``Fixed(h)``; raises as :meth:`Stepper.start`."""
-        run: Run = self._started(InitialData(q, p, None, t, parameters, options), plan)  # type: ignore[attr-defined]
+        run: Run = self.stepper._started(InitialData(q, p, None, t, parameters, options), plan)
         return run
 
     def largest_step(self, max_step: float | None) -> float:
@@ -118,7 +129,7 @@ class ForProducts(Integrator):
 
     def library(self, source: Source, flags: Sequence[str] = ()) -> building.Library:
         """Return a source of its steps, compiled once with these flags, too: ``path``, ``ffi`` and ``lib``."""
-        return building.load(source, flags=(*self.flags, *flags))
+        return building.load(source, flags=(*self.stepper.flags, *flags))
 
     def compiled(self, source: Source) -> Binding:
         """Return the functions of a source of its steps."""
@@ -126,7 +137,7 @@ class ForProducts(Integrator):
 
     def fingerprint(self, source: Source, flags: Sequence[str] = ()) -> str:
         """Return what identifies :meth:`library` on this machine."""
-        return building.fingerprint(source, flags=(*self.flags, *flags))
+        return building.fingerprint(source, flags=(*self.stepper.flags, *flags))
 
     @staticmethod
     def with_headers(source: Source, text: str, headers: Sequence[str], declarations: str, *, second: bool) -> Source:
@@ -137,44 +148,44 @@ class ForProducts(Integrator):
 
     def constraint_jacobian(self, q: Array, t: float, parameters: Array) -> Array:
         """Return (c, m) derivatives of the constraints by positions, by velocities if they are nonholonomic."""
-        return linearised(self, t, parameters)(q)[1]
+        return linearised(self.stepper, t, parameters)(q)[1]
 
     def check_sides(self, states: Array, t: Sequence[float], h: float, parameters: Array) -> None:
         """Raise StateError if states (n, 2m) at n times rest at a kink beside which steps of h differ."""
-        check_sides(self, states, t, h, parameters)
+        check_sides(self.stepper, states, t, h, parameters)
 
     def actions(self, starts: Starts, parameters: Array, options: SolverOptions | None) -> Array:
         """Return the (n,) actions of n steps without forces and constraints."""
-        return actions_of_steps(self, starts, parameters, options)[0]
+        return actions_of_steps(self.stepper, starts, parameters, options)[0]
 
     def inputs_of(self, inputs: Mapping[str, Any] | None) -> dict[str, Input]:
         """Return inputs of :meth:`Stepper.integrate` as piecewise cubic functions of time with their breakpoints."""
-        return checked_inputs(self.interface, inputs)
+        return checked_inputs(self.stepper.interface, inputs)
 
     @property
     def input_columns(self) -> list[int]:
         """Indices of the parameters of inputs: coefficients by power, and the breakpoint they refer to."""
-        return columns_of_inputs(self.interface)
+        return columns_of_inputs(self.stepper.interface)
 
     def parameters_at(self, t: float, parameters: Parameters, inputs: Mapping[str, Input]) -> Array:
         """Return the (k,) parameters at a time, those of inputs by their pieces."""
-        return parameters_of(self, parameters, inputs)(t)
+        return parameters_of(self.stepper, parameters, inputs)(t)
 
     def run_arrays(
         self, q: Any, parameters: Mapping[str, ArrayLike] | None, tables: Mapping[str, ArrayLike] | None
     ) -> RunArrays:
         """Return sizes, state, fields and tables of arrays of run-time sizes; StateError if they do not agree."""
-        return read_arrays(self.interface, q, parameters, tables)
+        return read_arrays(self.stepper.interface, q, parameters, tables)
 
     def check_accesses(self, sizes: Mapping[str, int], tables: Mapping[str, Any]) -> None:
         """Raise StateError if an access leaves its array, or an index its table, for these sizes and tables."""
-        check_accesses(self.interface.layout, sizes, tables)
+        check_accesses(self.stepper.interface.layout, sizes, tables)
 
     def event_formulas(self, events: Sequence[Event]) -> EventFormulas:
         """Return the functions of events, and the formulas of their changes of the state."""
         from scvi_codegen.codegen.rendering.events import EventFormulas  # imports SymPy
 
-        return EventFormulas(self.interface, events)
+        return EventFormulas(self.stepper.interface, events)
 
     @staticmethod
     def in_threads(
@@ -193,18 +204,18 @@ class ForProducts(Integrator):
     @property
     def observable_names(self) -> tuple[str, ...]:
         """Names of the entries of rotations, directions and spins, and of their angular momenta."""
-        return observable_names(self.interface)
+        return observable_names(self.stepper.interface)
 
     def observables(self, states: Array) -> tuple[Array, Array]:
         """Return the (n, k) values of ``observable_names`` at states (n, 2m), and (n, k, 2m) derivatives."""
-        return observables(self.interface, states), observable_derivatives(self.interface, states)
+        return observables(self.stepper.interface, states), observable_derivatives(self.stepper.interface, states)
 
     def ensemble_start(
         self, q: States, p: States | None, velocity: States | None, *, t: float, parameters: Parameters
     ) -> tuple[Array, Array, Array]:
         """Return (k, m) positions and momenta on constraints, and the parameters, of k states with p or velocity."""
-        momenta = momenta_of_each(self, q, p, velocity, t, parameters)
-        return start_of_ensemble(self, q, momenta, t, parameters)
+        momenta = momenta_of_each(self.stepper, q, p, velocity, t, parameters)
+        return start_of_ensemble(self.stepper, q, momenta, t, parameters)
 
     def ensemble_runs(
         self,
@@ -222,7 +233,7 @@ class ForProducts(Integrator):
             settings: its other arguments by name, or those of a block, ``runs.ensemble.settings_of(part)``.
         """
         settings = EnsembleSettings(**settings) if isinstance(settings, Mapping) else settings
-        ensemble = self._ensemble(q, p, settings, velocity=velocity, action=action)  # type: ignore[attr-defined]
+        ensemble = self.stepper._ensemble(q, p, settings, velocity=velocity, action=action)
         return runs_of(ensemble)
 
     def ensemble_result(self, runs: CommonRuns | IndividualRuns) -> EnsembleTrajectory:
@@ -261,11 +272,11 @@ class ForProducts(Integrator):
             saved: (saved states, n, quantities, k) for the growth at saved states.
             h, t, steps, save_every, parameters, options: of the steps.
         """
-        source = self._variants[TangentVectors(saved.shape[-1])]
+        source = self.stepper._variants[TangentVectors(saved.shape[-1])]
         if source is None:
             return None
         binding = self.compiled(source)
         plan, settings = CommonSteps(t, h, save_every, steps), EnsembleSettings(options=options)
         start: dict[str, Any] = {"t0": plan.t0, "q": q, "p": p, "parameters": np.asarray(parameters)}
-        ensemble = Ensemble(stepper=self, settings=settings, **start, fixed=plan)
+        ensemble = Ensemble(stepper=self.stepper, settings=settings, **start, fixed=plan)
         return LaneRuns(binding, ensemble, {"positions": saved, "growth": growth})

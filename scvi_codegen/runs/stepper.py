@@ -12,7 +12,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial, wraps
 from math import isfinite
-from typing import Any, ClassVar, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,7 +39,6 @@ from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
 from scvi_codegen.runs.events.contacts import in_first_modes
 from scvi_codegen.runs.events.refinement import WithEventsInDouble, constantly
 from scvi_codegen.runs.forwarding import Forwarded, OfSteppers
-from scvi_codegen.runs.products import ForProducts
 from scvi_codegen.runs.results.dense_output import check_has_end, times_of_run
 from scvi_codegen.runs.results.output import ALL_STATES, Output
 from scvi_codegen.runs.states.layout import InitialData
@@ -49,6 +48,7 @@ from scvi_codegen.runs.states.words import check_doubles, hashed
 from scvi_codegen.runs.stepping.array_interface import RunSizes, interface_of_sizes, shapes_of_call, sizes_of_run
 from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.runs.stepping.features import check_together, require
+from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise, with_sequences
 from scvi_codegen.runs.stepping.projection import consistent, constraint_values, multipliers, projected
 from scvi_codegen.runs.stepping.saving import read_checkpoint
@@ -70,10 +70,13 @@ from scvi_codegen.runs.trajectory import Trajectory
 from scvi_codegen.systems.event import Event, EventLike
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
 
+if TYPE_CHECKING:
+    from scvi_codegen.runs.products import Products
+
 Called = TypeVar("Called", bound=Callable[..., Any])
 
 
-class Stepper(WithEventsInDouble, OfSteppers, ForProducts):
+class Stepper(WithEventsInDouble, OfSteppers, Integrator):
     """Compiled integrator of one system: :class:`Integrator` with integrations, runs, ensembles and projections."""
 
     KIND: ClassVar[ArgumentType]
@@ -383,6 +386,13 @@ class Stepper(WithEventsInDouble, OfSteppers, ForProducts):
             return q, p
         return consistent(self, q, p, t, parameters)
 
+    @property
+    def products(self) -> Products:
+        """What a product on top of the :mod:`scvi_codegen.api` does with the stepper."""
+        from scvi_codegen.runs.products import Products
+
+        return Products(self)
+
     @cached_property
     def _begins_by(self) -> int | None:
         """How a C call begins a run by momenta; ``None`` if the state is always converted before."""
@@ -536,9 +546,9 @@ class Stepper(WithEventsInDouble, OfSteppers, ForProducts):
         errors: Any = {"tolerance": tolerance, "absolute_tolerance": absolute_tolerance, "error": error}
         others: Any = {"inputs": inputs, "parameters": parameters, "seed": seed, "metropolis": metropolis}
         settings = EnsembleSettings(**times, **errors, **others, observe=observe, precision=precision)
-        runs = self.ensemble_runs(q, p, settings, velocity=velocity, action=action)
+        runs = self.products.ensemble_runs(q, p, settings, velocity=velocity, action=action)
         runs.run(progress=progress, threads=threads)
-        return self.ensemble_result(runs)
+        return self.products.ensemble_result(runs)
 
     def _ensemble(
         self,

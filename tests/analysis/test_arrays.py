@@ -3,7 +3,6 @@
 import json
 import re
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,7 +21,8 @@ from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.extras.verification.arrays import small_start
 from scvi_codegen.extras.verification.arrays.whole import WholeStart
 from scvi_codegen.runs import compiler
-from scvi_codegen.runs.stepping.array_interface import check_accesses, read_arrays
+from scvi_codegen.runs.products import Products
+from scvi_codegen.runs.stepping.array_interface import read_arrays
 
 RANDOM = np.random.default_rng(3)
 BOND = "(r[bonds[b, 0], a] - r[bonds[b, 1], a])"
@@ -201,7 +201,7 @@ def test_small_systems_are_cut_out_where_the_motion_is_largest(place: int) -> No
         start = WholeStart(
             system=system,
             method=sc.as_method("svi:2"),
-            stepper=SimpleNamespace(interface=interface, check_accesses=partial(check_accesses, interface.layout)),
+            stepper=SimpleNamespace(interface=interface, products=Products(SimpleNamespace(interface=interface))),
             arrays=read_arrays(interface, {"q": q}, None, None),
             p={"q": p},
             h=0.1,

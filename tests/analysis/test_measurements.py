@@ -265,7 +265,7 @@ def test_constrained_arrays_are_certified_as_rattle(monkeypatch: pytest.MonkeyPa
     sizes.numbers, interface = (), SimpleNamespace(parameters=())
     stepper = SimpleNamespace(run_time_sizes=True, start=lambda *_, **__: run, interface=interface, source=None)
     stepper.events, stepper.with_events = (), lambda _: stepper
-    stepper.run_arrays = lambda *_: sizes
+    stepper.products = SimpleNamespace(run_arrays=lambda *_: sizes)
     arguments: dict[str, Any] = {"tolerance": None, "parameters": None, "tables": None}
     arguments["of_known_sizes"] = lambda system, *state, **how: (system.dimension, *state, how["h"], how["t"])
     swings, method = golden_cells.swings(), sc.StoermerVerlet()

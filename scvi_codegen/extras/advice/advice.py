@@ -17,7 +17,7 @@ import numpy as np
 
 from scvi_codegen.api.checks import checks_arguments
 from scvi_codegen.api.methods import Discretisation, Method
-from scvi_codegen.api.runs import without_accuracy_warnings
+from scvi_codegen.api.runs import Products, without_accuracy_warnings
 from scvi_codegen.api.states import Parameters, States, checked_number
 from scvi_codegen.api.systems import MechanicalSystem
 from scvi_codegen.api.text import Html, summary
@@ -319,7 +319,7 @@ class _Pilot(NamedTuple):
             lasted = abs(failure.t - self.settings["t"])
             return _Trial(n, h, covered=abs(h) * steps, duration=lasted, failure=failure.status)
         price = {"seconds": (time.perf_counter() - began) / abs(h * steps), "iterations": run.iterations.sum() / steps}
-        if largest_range(np.asarray(run.q)) <= Stepper.RESOLVED * ROUNDOFF * np.abs(np.asarray(run.q)).max():
+        if largest_range(np.asarray(run.q)) <= Products.RESOLVED * ROUNDOFF * np.abs(np.asarray(run.q)).max():
             raise StateError(
                 f"the motion is at rest over t = {abs(h) * steps:.3g}: errors relative to its size are undefined; give "
                 "an initial state that moves, or choose h below the shortest period"
@@ -330,8 +330,8 @@ class _Pilot(NamedTuple):
     def judged(self, run: Any, trial: _Trial) -> _Trial:
         """Return a pilot run with its errors."""
         error, t = run.error, np.abs(np.asarray(run.t) - run.t[0])
-        lost = not error.relative[-1] < Stepper.LOST
-        rows = int(np.flatnonzero(error.relative < Stepper.LOST)[-1]) + 1
+        lost = not error.relative[-1] < Products.LOST
+        rows = int(np.flatnonzero(error.relative < Products.LOST)[-1]) + 1
         sizes, errors = error.relative_until(rows)
         roundings = np.maximum.accumulate(error.roundings(sizes)[:rows])
         row = int(np.flatnonzero(SAFETY * roundings <= self.tolerance)[-1]) if lost else rows - 1
@@ -341,7 +341,7 @@ class _Pilot(NamedTuple):
         power = powers[1] if lost else powers[0]  # neighbours leave each other as rounding errors grow
         grown = [k * (2.0 * (ratio - 1.0) if power > EXPONENTIAL else math.log2(ratio)) for k in powers]
         ends = [float(x[row]) * 2.0 ** min(k, 1000.0) for x, k in zip((errors, roundings), grown, strict=True)]
-        if not lost and ends[1] >= Stepper.LOST:  # rounding alone exceeds it later: the run is judged as far as it goes
+        if not lost and ends[1] >= Products.LOST:  # rounding alone exceeds it later: judged as far as it goes
             lost, power, ends = True, powers[1], [float(errors[row]), float(roundings[row])]
         if lost and (row == 0 or row == rows - 1 < len(t) - 1):  # errors are those of the steps, not of rounding
             ends[0] = math.inf
@@ -363,7 +363,7 @@ class _Pilot(NamedTuple):
             if not worst < n < (best or math.inf):
                 n = max(1, math.ceil(math.sqrt(worst * best))) if best else FACTOR * worst
             if n > self.most and not best:
-                if any(k.error < Stepper.LOST and not k.lost for k in trials):
+                if any(k.error < Products.LOST and not k.lost for k in trials):
                     break
                 # Digits are lost at once at an encounter or a singularity, by and by where neighbours diverge.
                 at_once = trial.until > (1.0 - 1.0 / FACTOR**2) * trial.duration
@@ -432,7 +432,7 @@ def _starts(stepper: Stepper, q: States, state: dict[str, Any]) -> tuple[list[tu
     if stepper._states.axes(q) != 2:
         start = stepper.start(q, p, velocity=velocity, t=t, parameters=parameters, h=1.0)  # checks the arguments
         return [(start.q, start.p, parameters)], ()
-    together = stepper.ensemble_start(q, p, velocity, t=t, parameters=parameters)
+    together = stepper.products.ensemble_start(q, p, velocity, t=t, parameters=parameters)
     by_name = (lambda values: values) if stepper.interface.words > 1 else stepper.parameters_by_name
     return [(x, y, by_name(values)) for x, y, values in zip(*together, strict=True)], together
 

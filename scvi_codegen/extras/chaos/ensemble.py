@@ -54,7 +54,7 @@ class ChaosIndicatorsEnsemble:
         parameters: Parameters,
         options: SolverOptions | None,
     ) -> None:
-        stepper.require("chaos_ensemble")
+        stepper.products.require("chaos_ensemble")
         self.stepper, self.options = stepper, options
         self.h, steps = Fixed.checked(h).h, checked_count(steps, "steps", least=1)
         self.save_every = steps if save_every is None else checked_count(save_every, "save_every", least=1)
@@ -64,7 +64,9 @@ class ChaosIndicatorsEnsemble:
             )
         start = checked_number(t, "the time t")
         self.t = Fixed(self.h).times(start, np.arange(steps + 1))
-        self.q, self.p, self.parameters = stepper.ensemble_start(q, p, velocity, t=start, parameters=parameters)
+        self.q, self.p, self.parameters = stepper.products.ensemble_start(
+            q, p, velocity, t=start, parameters=parameters
+        )
         self.changes = InitialTangents.checked(stepper, count, directions)
         self.status = np.full(len(self.q), OK, dtype="<U32")
         self.values = np.full((len(SERIES), len(self.t[:: self.save_every]), len(self.q), self._width()), np.nan)
@@ -79,7 +81,7 @@ class ChaosIndicatorsEnsemble:
         if len(left):
             self.stepper.tangent  # noqa: B018  (compiled once, before threads ask for it)
             before = len(self.q) - len(left)
-            self.stepper.in_threads(
+            self.stepper.products.in_threads(
                 len(left),
                 lambda k, check_stop: self._follow(int(left[k]), check_stop),
                 progress=lambda done: report(before + done),
@@ -116,7 +118,7 @@ class ChaosIndicatorsEnsemble:
         saved[0] = growth[: len(SERIES) * k].reshape(len(SERIES), k)
         plan: dict[str, Any] = {"h": self.h, "t": self.t[0], "steps": steps, "save_every": self.save_every}
         settings: dict[str, Any] = {"parameters": self.parameters, "options": self.options}
-        runs = self.stepper.tangent_lanes(q, p, growth, saved, **plan, **settings)
+        runs = self.stepper.products.tangent_lanes(q, p, growth, saved, **plan, **settings)
         if runs is None:
             return np.arange(count)
         runs.run(progress=lambda _: report(int(np.count_nonzero(runs.status == 0))), threads=threads)

@@ -219,8 +219,8 @@ class InitialTangents:
     def checked(cls, stepper: Stepper, count: int | None, directions: ArrayLike | None) -> InitialTangents:
         """Construct from user arguments; raise :class:`StateError` for invalid numbers or directions."""
         size = 2 * stepper.dimension
-        stepper.require("chaos")
-        reduction = stepper.reduction if stepper.interface.rotations else None
+        stepper.products.require("chaos")
+        reduction = stepper.products.reduction if stepper.interface.rotations else None
         if directions is None:
             most = reduction.size if reduction else size
             count = None if count is None else checked_count(count, "count", least=1, most=most)

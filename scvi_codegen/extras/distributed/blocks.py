@@ -62,12 +62,12 @@ def integrate_ensemble(
     _check_arguments(stepper, arguments)
     velocity, action = arguments.pop("velocity", None), arguments.pop("action", False)
     settings = {name: value for name, value in arguments.items() if name != "threads"}
-    runs = stepper.ensemble_runs(q, p, settings, velocity=velocity, action=action)
+    runs = stepper.products.ensemble_runs(q, p, settings, velocity=velocity, action=action)
     blocks = None if blocks is None else checked_count(blocks, "blocks", least=1)
     with _client(address) as client:
         count = blocks or BLOCKS_A_THREAD * sum(client.ncores().values())
         _gather(client, runs, list(_slices(len(runs.ensemble), count)), progress)
-    return stepper.ensemble_result(runs)
+    return stepper.products.ensemble_result(runs)
 
 
 def _check_arguments(stepper: Stepper, arguments: dict[str, Any]) -> None:
@@ -136,7 +136,7 @@ def _gather(client: Any, runs: Any, parts: list[slice], progress: Callable[[int]
 
 def _integrate(pickled: bytes, arguments: tuple[Array, Array, Any]) -> EnsembleTrajectory:
     """Integrate one slice on a single worker thread; return its results without stepper and functions."""
-    runs = _stepper(pickled).ensemble_runs(*arguments)
+    runs = _stepper(pickled).products.ensemble_runs(*arguments)
     runs.run(threads=1)
     return replace(runs.result(), stepper=cast(Any, None), spans=())
 

@@ -162,7 +162,9 @@ def fit(
     """
     stepper = stepper.bind(q, parameters)[0]._known_with_events
     q, p, velocity = stepper._states.start(q, p, velocity)
-    measurements = Measurements.checked(stepper, t, measured, observed, deviations, start, h, stepper.inputs_of(inputs))
+    measurements = Measurements.checked(
+        stepper, t, measured, observed, deviations, start, h, stepper.products.inputs_of(inputs)
+    )
     model = _Model.checked(measurements, q, p, velocity, parameters, unknown, fit_initial_state=fit_initial_state)
     if measurements.used.sum() < len(model.names):
         raise FitError(f"{int(measurements.used.sum())} measurements do not determine {len(model.names)} unknowns")
@@ -226,7 +228,7 @@ class _Model:
     ) -> _Model:
         """Construct from validated arguments of :func:`fit`."""
         stepper, m = measurements.stepper, measurements.stepper.dimension
-        fixed = stepper.input_columns
+        fixed = stepper.products.input_columns
         estimable = [name for k, name in enumerate(stepper.parameters) if k not in fixed]
         estimated = tuple(estimable) if unknown is None else distinct(unknown, "unknown")
         for name in estimated:

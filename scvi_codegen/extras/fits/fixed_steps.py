@@ -49,7 +49,9 @@ def tangents_along(
         if size_variations is not None:
             tangents = np.concatenate([tangents[:, :-1], size_variations[first][:, np.newaxis]], axis=1)
         plan = Fixed(length)
-        run = stepper.run_by(plan, start[:m], start[m:], t=float(t[first]), parameters=parameters, options=options)
+        run = stepper.products.run_by(
+            plan, start[:m], start[m:], t=float(t[first]), parameters=parameters, options=options
+        )
         trajectory = run._recorded(last - first)
         ends = plan.times(float(t[first]), np.arange(1, last - first + 1))
         if trajectory.t[-1] < ends[-1] - 0.5 * length:

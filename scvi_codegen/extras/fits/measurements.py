@@ -55,7 +55,7 @@ class Measurements:
         inputs: Mapping[str, Any],
     ) -> Measurements:
         """Construct from validated arguments of :func:`~scvi_codegen.fit`."""
-        stepper.require("fit")
+        stepper.products.require("fit")
         times, values = real_array(t, "t"), real_array(measured, "measured")
         for time in times[~np.isfinite(times)]:
             checked_number(float(time), "a value in t")
@@ -121,7 +121,7 @@ class Measurements:
         values, derivatives = self._observed(state[np.newaxis], tangents[np.newaxis])  # where no step follows
         values, derivatives = np.tile(values, (len(self.t), 1)), np.tile(derivatives, (len(self.t), 1, 1))
         for t, h in self.pieces:
-            at = self.stepper.parameters_at(float(t[0]) + 0.5 * float(h[0]), parameters, self.inputs)
+            at = self.stepper.products.parameters_at(float(t[0]) + 0.5 * float(h[0]), parameters, self.inputs)
             states, vectors, tangents = tangents_along(self.stepper, state, t, h, tangents, at)
             here = np.flatnonzero((self.step_numbers >= done) & (self.step_numbers <= done + len(h)))
             rows = self.step_numbers[here] - done
@@ -133,7 +133,7 @@ class Measurements:
         """Return the (n, c) measured quantities of states (n, 2m), and their (n, c, k) derivatives by vectors."""
         interface, size = self.stepper.interface, states.shape[1]
         if interface.rotations:
-            observed, by_states = self.stepper.observables(states)
+            observed, by_states = self.stepper.products.observables(states)
             states = np.concatenate([states, observed], axis=1)
             vectors = np.concatenate([vectors[..., :size], vectors[..., :size] @ by_states.swapaxes(1, 2)], axis=2)
         return states[:, self.columns], vectors[:, :, self.columns].transpose(0, 2, 1)
@@ -171,7 +171,7 @@ def distinct(names: Sequence[str], kind: str) -> tuple[str, ...]:
 
 
 def _column(stepper: Stepper, name: str) -> int:
-    names = (*state_names(stepper), *stepper.observable_names)
+    names = (*state_names(stepper), *stepper.products.observable_names)
     if name not in names:
         raise StateError(f"'{name}' cannot be observed{closest(name, names)} Possible: {', '.join(names[:99])}")
     return names.index(name)

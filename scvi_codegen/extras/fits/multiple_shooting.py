@@ -139,7 +139,7 @@ class Chain:
         if not stepper.interface.rotations or size - 1 not in self.unknown_indices:
             return np.zeros(0), np.zeros((0, len(x)))
         weight = GAUGE / min(float(part.deviations.min()) for part in self.parts)
-        values, rows = stepper.reduction.gauge(self.values(x)[:size], self.prior[:size])
+        values, rows = stepper.products.reduction.gauge(self.values(x)[:size], self.prior[:size])
         by_all = np.zeros((len(values), len(self.prior)))
         by_all[:, :size] = rows
         jacobian = np.zeros((len(values), len(x)))
@@ -179,7 +179,7 @@ def _node_states_from_measurements(whole: Measurements, parts: Sequence[Measurem
         return _node_states_from_guess(parts, prior)
     states = []
     for part in parts[1:]:
-        values = whole.stepper.parameters_at(part.start, prior[2 * m :], whole.inputs)
+        values = whole.stepper.products.parameters_at(part.start, prior[2 * m :], whole.inputs)
         parabolas = [_parabola(whole, int(columns[0]), part.start) for columns in measured_columns]
         q, v = np.array(parabolas).T
         states.append(np.concatenate([q, whole.stepper.momentum(q, v, part.start, values)]))

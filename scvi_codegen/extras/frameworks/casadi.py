@@ -65,7 +65,7 @@ def casadi_flow(stepper: Stepper, *, steps: int, save_every: int | None = None, 
     ca = imported("casadi", "casadi")
     derivatives = flow.second_derivatives if hessian else flow.derivatives
     source = with_casadi_flow(derivatives, flow.steps, flow.spacing, second=hessian)
-    library = stepper.library(source)
+    library = stepper.products.library(source)
     name, m = casadi_name(source.prefix), stepper.dimension
     sizes = (m, m, len(stepper.interface.parameters), 1, 1)
     arguments = [ca.MX.sym(word, size) for word, size in zip(FLOW_ARGUMENTS, sizes, strict=True)]

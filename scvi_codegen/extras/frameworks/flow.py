@@ -40,7 +40,7 @@ class Flow:
     @classmethod
     def checked(cls, stepper: Stepper, steps: int, save_every: int | None) -> Self:
         """Return a flow; MethodError without derivatives or fixed steps, StateError for invalid numbers of steps."""
-        stepper.require("flow")
+        stepper.products.require("flow")
         stepper = stepper.known
         steps = checked_count(steps, "steps", least=1)
         if save_every is not None and steps % (save_every := checked_count(save_every, "save_every", least=1)):
@@ -83,7 +83,7 @@ class Flow:
     def parameter_values(self, parameters: Any) -> Any:
         """Return all parameters in order as a list, or, unless passed by name, unchanged."""
         interface = self.stepper.interface
-        self.stepper.check_given(parameters)
+        self.stepper.products.check_given(parameters)
         if parameters is not None and not isinstance(parameters, Mapping):
             return parameters
         values: list[Any] = list(interface.defaults)
@@ -161,13 +161,13 @@ class FlowOfRows(Flow):
     def library(self) -> Any:
         """Values and derivatives, compiled on first use."""
         source = with_flow_of_rows(self.derivatives)
-        return self.stepper.compiled(source)
+        return self.stepper.products.compiled(source)
 
     @cached_property
     def second_library(self) -> Any:
         """Values and derivatives up to second order, compiled on first use."""
         source = with_flow_of_rows(self.second_derivatives, second=True)
-        return self.stepper.compiled(source)
+        return self.stepper.products.compiled(source)
 
 
 _registered: set[str] = set()
@@ -232,9 +232,9 @@ class JaxFlow(ArrayFlow):
         import jax
 
         flags = [f"-I{jax.ffi.include_dir()}"]
-        name = f"scvi_{self.stepper.fingerprint(source, flags)}"
+        name = f"scvi_{self.stepper.products.fingerprint(source, flags)}"
         if name not in _registered:
-            library = self.stepper.library(source, flags)
+            library = self.stepper.products.library(source, flags)
             for part in parts:
                 function = getattr(library.lib, f"{source.prefix}_xla_{part}")
                 address = int(library.ffi.cast("uintptr_t", function))

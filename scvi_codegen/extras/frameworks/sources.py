@@ -1,7 +1,7 @@
 """C sources of flows, with derivatives, for JAX, PyTorch and CasADi."""
 
 from scvi_codegen.api.program import Source
-from scvi_codegen.runs.stepper import Stepper
+from scvi_codegen.api.runs import Products
 
 XLA_PARTS = ("states", "jvp", "vjp")
 """XLA handlers: states, tangent vectors of states (JVP), gradients with respect to inputs (VJP)."""
@@ -20,7 +20,7 @@ def with_xla_flow(derivatives: Source, version: str, *, second: bool = False) ->
     parts = (*XLA_PARTS, *([XLA_SECOND_ORDER] if second else ()))
     handlers = "".join(f"void *{derivatives.prefix}_xla_{part}(void *frame);\n" for part in parts)
     headers = ("flow", "xla_flow")
-    return Stepper.with_headers(derivatives, f"\n/* For jaxlib {version}. */\n", headers, handlers, second=second)
+    return Products.with_headers(derivatives, f"\n/* For jaxlib {version}. */\n", headers, handlers, second=second)
 
 
 def with_flow_of_rows(derivatives: Source, *, second: bool = False) -> Source:
@@ -32,7 +32,7 @@ def with_flow_of_rows(derivatives: Source, *, second: bool = False) -> Source:
     if second:
         declared += f"int {prefix}_hessian_rows({shape}, const double *x, "
         declared += f"const double *partials, const double *changes, {rest});\n"
-    return Stepper.with_headers(derivatives, "\n#define FLOW_OF_ROWS\n", ("flow",), declared, second=second)
+    return Products.with_headers(derivatives, "\n#define FLOW_OF_ROWS\n", ("flow",), declared, second=second)
 
 
 def casadi_name(prefix: str) -> str:
@@ -51,6 +51,6 @@ def with_casadi_flow(derivatives: Source, steps: int, save_every: int, *, second
     name = casadi_name(derivatives.prefix)
     fixed = f"\nenum {{\n  FLOW_STEPS = {steps},\n  FLOW_EVERY = {save_every}\n}};\n\n"
     headers = ("flow", "casadi_flow")
-    return Stepper.with_headers(
+    return Products.with_headers(
         derivatives, f"{fixed}#define EXTERNAL(before, after) before##{name}##after\n\n", headers, "", second=second
     )

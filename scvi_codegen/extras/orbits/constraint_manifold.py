@@ -21,7 +21,7 @@ MOMENT = 2.0**-30
 def reduction_of(stepper: Stepper, t: float, parameters: Array) -> Reduction:
     """Return the maps to the tangent spaces of a system without gauge directions and on its constraints."""
     if len(stepper.interface.constraints) == stepper.interface.masked:
-        return stepper.reduction
+        return stepper.products.reduction
     return ConstraintManifold(stepper, t, parameters)
 
 
@@ -30,7 +30,7 @@ class ConstraintManifold(Reduction):
 
     def __init__(self, stepper: Stepper, t: float, parameters: Array) -> None:
         super().__init__(stepper.interface)
-        self.stepper, self.t, self.parameters, self.free = stepper, t, parameters, stepper.reduction
+        self.stepper, self.t, self.parameters, self.free = stepper, t, parameters, stepper.products.reduction
         self.count = len(stepper.interface.constraints) - stepper.interface.masked
         self.size -= 2 * self.count
 
@@ -66,7 +66,7 @@ class ConstraintManifold(Reduction):
 
     def _jacobian(self, q: Array) -> Array:
         """Return G."""
-        return self.stepper.constraint_jacobian(q, self.t, self.parameters)[: self.count]
+        return self.stepper.products.constraint_jacobian(q, self.t, self.parameters)[: self.count]
 
     def _basis(self, q: Array, p: Array) -> Array:
         """Return the orthonormal basis B."""

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.api.formulas import Tape, mp, parse_expression, symbol
-from scvi_codegen.api.runs import without_accuracy_warnings
+from scvi_codegen.api.runs import Products, without_accuracy_warnings
 from scvi_codegen.api.states import Array
 from scvi_codegen.common.errors import EventError, OrbitError, StepFailedError
 from scvi_codegen.extras.orbits.equilibrium import Equilibrium
@@ -51,7 +51,6 @@ from scvi_codegen.extras.orbits.solver import (
 )
 from scvi_codegen.extras.orbits.step_sequence import StepSequence
 from scvi_codegen.extras.paths.size import ROUNDOFF
-from scvi_codegen.runs.stepper import Stepper
 
 MOST_CORRECTIONS, FEW_CORRECTIONS, CONTRACTION = 10, 4, 0.7
 """Newton iterations after which a prediction was too far, those up to which the next one may be farther, and the factor
@@ -581,9 +580,9 @@ class Continuation:
         effect = float(np.linalg.norm(column))
         if self.period_of is not None:
             effect += abs(self._period(search)[1]) * 2.0 * math.pi / float(z[-1])
-        if effect * abs(y[-1]) <= Stepper.RESOLVED * ROUNDOFF:  # the orbit may stay, but not its multipliers
+        if effect * abs(y[-1]) <= Products.RESOLVED * ROUNDOFF:  # the orbit may stay, but not its multipliers
             unit = self._unit_of_multipliers(search, y, closing, effect)
-            effect = effect if effect * unit > Stepper.RESOLVED * ROUNDOFF else 1.0 / unit
+            effect = effect if effect * unit > Products.RESOLVED * ROUNDOFF else 1.0 / unit
         return replace(self, parameter_unit=1.0 / effect)
 
     def _unit_of_multipliers(self, search: OrbitSearch, y: Array, closing: ClosingEquations, effect: float) -> float:

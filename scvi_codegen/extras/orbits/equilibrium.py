@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.api.checks import checks_arguments
+from scvi_codegen.api.runs import Products
 from scvi_codegen.api.states import Array, Parameters, Reduction
 from scvi_codegen.api.text import summary
 from scvi_codegen.common.errors import OrbitError, StateError, StepFailedError
@@ -99,8 +100,8 @@ def equilibrium(stepper: Stepper, q: ArrayLike, *, t: float = 0.0, parameters: P
         StateError: if a shape, name or number is invalid, or the equilibrium is at a kink, beside which motions differ.
     """
     stepper = stepper.bind(q, parameters)[0]._known_with_events
-    stepper.require("periodic_orbit")
-    stepper.check_given(parameters, step=True)
+    stepper.products.require("periodic_orbit")
+    stepper.products.check_given(parameters, step=True)
     values, rest = stepper._parameters(parameters), np.zeros(stepper.dimension)
     positions, _, velocity = stepper._states.start(q, None, rest)
     momenta = stepper._initial_momenta(positions, None, velocity, t, values)
@@ -121,14 +122,14 @@ def equilibrium(stepper: Stepper, q: ArrayLike, *, t: float = 0.0, parameters: P
         force = np.abs(balanced @ (change / units) + defect / units).max()  # in directions in which the system is free
         largest = max(largest, np.abs(defect / units).max())
         sizes = np.abs(reduction.outward(*np.split(state, 2))) @ np.abs(state) / units
-        at_rest = force <= max(SAME * largest, Stepper.RESOLVED * ROUNDOFF * sizes.max())
+        at_rest = force <= max(SAME * largest, Products.RESOLVED * ROUNDOFF * sizes.max())
         state = np.ravel(reduction.normalised(*np.split(state + reduction.inward(*np.split(state, 2)) @ change, 2)))
         # The derivative of the step, which the change of the state hardly changes, gives the scale of a small change.
         strength = np.abs(factors - 1).max()
         begun = begun or strength
         converged = np.abs(np.sort(factors) - np.sort(former)).max() <= SAME * strength
         if converged and at_rest and strength >= FLAT * begun:
-            stepper.check_sides(np.array([guess, state]), (t, t), motion.h, values)
+            stepper.products.check_sides(np.array([guess, state]), (t, t), motion.h, values)
             return motion.at_rest(state)
     raise OrbitError(
         f"no equilibrium of '{stepper.title}' was found near q = {np.asarray(q)}: {MOST_ITERATIONS} iterations did not "

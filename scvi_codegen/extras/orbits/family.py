@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.api.checks import Kind, checked_count, checks_arguments
-from scvi_codegen.api.runs import warnings_wanted
+from scvi_codegen.api.runs import Products
 from scvi_codegen.api.states import Array, checked_number
 from scvi_codegen.api.text import counted, summary, write_atomically
 from scvi_codegen.codegen.native.options import SolverOptions
@@ -346,7 +346,7 @@ def family(
             orbit is found next to it.
         StateError: if a name or number is invalid.
     """
-    stepper.require("periodic_orbit")
+    stepper.products.require("periodic_orbit")
     if start.stepper.interface != stepper.interface:
         raise StateError(f"the start is one of '{start.stepper.title}', not of '{stepper.title}'")
     if parameter is not None and parameter not in stepper.parameters:
@@ -454,7 +454,7 @@ def _reason(until: Until, stepper: Stepper) -> Callable[[PeriodicOrbit], str]:
 
 def _warn_of_errors(orbits: Sequence[PeriodicOrbit], bound: float) -> None:
     worst = max(orbits, key=lambda orbit: orbit.error)
-    if worst.error > bound and warnings_wanted():
+    if worst.error > bound and Products.warnings_wanted():
         warn(
             f"orbits of the family have discretisation errors up to {worst.error:.1e} (period {worst.period:.6g}), "
             f"above the bound {bound:.1e}: use a method of higher degree or a larger error=",

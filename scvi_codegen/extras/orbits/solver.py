@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.api.checks import checked_count, checks_arguments
-from scvi_codegen.api.runs import warnings_wanted, without_accuracy_warnings
+from scvi_codegen.api.runs import Products, without_accuracy_warnings
 from scvi_codegen.api.states import Array, Fixed, Parameters, Reduction, checked_number
 from scvi_codegen.api.text import summary
 from scvi_codegen.codegen.native.options import SolverOptions
@@ -111,7 +111,7 @@ class PeriodicOrbit:
         """Return start and period, with the uncertain digits in parentheses."""
         names, values = [*state_names(self.stepper), "period"], [*self.q, *self.p, self.period]
         rows = zip(names, values, self.errors.bounds, strict=True)
-        lines = [f"{name} = {Stepper.with_uncertainty(value, bound)}" for name, value, bound in rows]
+        lines = [f"{name} = {Products.with_uncertainty(value, bound)}" for name, value, bound in rows]
         return "\n".join([*lines, f"relative error {self.error:.1e}", *filter(None, [self.errors.reason])])
 
     def run(self, *, save_every: int = 1) -> Trajectory:
@@ -144,7 +144,7 @@ class PeriodicOrbit:
         Raises:
             MethodError: if the stepper has no finer method (it was loaded without its system).
         """
-        finer = self.stepper.finer.with_events(self.stepper.events if self.stepper.changes_states else ())
+        finer = self.stepper.products.finer.with_events(self.stepper.events if self.stepper.changes_states else ())
         rest: dict[str, Any] = {"sequence": self.sequence, "fixed_indices": (), "energy": None, "options": self.options}
         exact = np.concatenate([self.q, self.p, [self.period]]) - np.nan_to_num(self.errors.signed)
         z, none = exact[:-1], np.zeros(len(self.q))
@@ -399,17 +399,17 @@ def periodic_orbit(
     """
     stepper = stepper.bind(q, parameters)[0]._known_with_events
     q, p, velocity = stepper._states.start(q, p, velocity)
-    stepper.require("periodic_orbit")
-    stepper.check_given(parameters)
+    stepper.products.require("periodic_orbit")
+    stepper.products.check_given(parameters)
     if energy is not None:
-        stepper.require("energy")
+        stepper.products.require("energy")
     if (period := checked_number(period, "the period")) <= 0.0:
         raise StateError(f"the period must be positive, not {period:g}")
-    sequence, largest = _equal_steps(period, steps, h), stepper.largest_step(max_step)
+    sequence, largest = _equal_steps(period, steps, h), stepper.products.largest_step(max_step)
     if sequence is not None and largest < math.inf:
         raise StateError(f"max_step={max_step:g} requires adaptive steps: omit it, or steps and h")
     if sequence is None:
-        stepper.require("adaptive")
+        stepper.products.require("adaptive")
     t, values = checked_number(t, "the time t"), stepper._parameters(parameters)
     momenta = stepper._initial_momenta(q, p, velocity, t, values)
     start = np.concatenate(stepper._states.pair(q, momenta))
@@ -629,7 +629,7 @@ class OrbitSearch:
         """Return the orbit at the end of the iteration, after all checks; raise OrbitError if there is none."""
         m, motion, steps = self.stepper.dimension, equations.motion, self.of_reversor(None).steps
         sizes, reduced = equations.sizes, self.reduced_sizes(equations.sizes)
-        rounding = Stepper.RESOLVED * ROUNDOFF * float((np.abs(z[:-1]) / sizes).max())
+        rounding = Products.RESOLVED * ROUNDOFF * float((np.abs(z[:-1]) / sizes).max())
         scaled_norm = float(np.linalg.norm(equations.monodromy / reduced[:, np.newaxis] * reduced, 2))
         allowed = (CLOSED + rounding) * max(1.0, scaled_norm)
         if OPEN < equations.relative_error <= allowed:
@@ -670,7 +670,7 @@ class OrbitSearch:
         ranges, distances = (
             sizes.reshape(2, m).max(axis=1) for sizes in (np.ptp(motion.states, axis=0), abs(z - guess)[:-1])
         )
-        rounding = Stepper.RESOLVED * ROUNDOFF * np.abs(z[:m]).max()
+        rounding = Products.RESOLVED * ROUNDOFF * np.abs(z[:m]).max()
         at_rest = (ranges < EQUILIBRIUM_MOTION * distances).any() and not self.gain.any()  # momenta may be constant
         if at_rest or ranges[0] <= rounding:
             raise OrbitError(
@@ -755,7 +755,7 @@ class OrbitSearch:
         forward_only = self.stepper.interface.contacts or any(event.changes for event in self.stepper.events)
         if self.steps.tolerance is None and not forward_only:
             settings: dict[str, Any] = {"t": self.t, "parameters": self.parameters, "options": self.options}
-            run = self.stepper.run_by(plan, q, p, **settings)
+            run = self.stepper.products.run_by(plan, q, p, **settings)
             with suppress(EventError, StepFailedError):
                 motion, ends = run._recorded(steps), self.t + plan.h * np.arange(1, steps + 1)
                 rows = np.searchsorted(-motion.t, -ends + 0.5**30 * period, side="right") - 1
@@ -780,7 +780,7 @@ class OrbitSearch:
         if self.energy is None:
             return
         away, row = float(equations.defects[-1]), float(self.row_units(equations)[-1])
-        if not abs(away) <= allowed * row + Stepper.RESOLVED * ROUNDOFF * abs(self.energy):
+        if not abs(away) <= allowed * row + Products.RESOLVED * ROUNDOFF * abs(self.energy):
             raise OrbitError(
                 f"the periodic orbit near the guess has the energy {self.energy + away:.10g}, not {self.energy:.10g}: "
                 "fix fewer entries of the state, or give a better initial guess"
@@ -888,7 +888,7 @@ class OrbitSearch:
     def sizes_of(self, states: Array) -> Array:
         """Return the (2m,) sizes of positions and momenta along states, at least their rounding errors."""
         size = self._size_of(states)
-        least = (Stepper.RESOLVED * rounding or LEAST_SIZE for rounding in size.rounding)
+        least = (Products.RESOLVED * rounding or LEAST_SIZE for rounding in size.rounding)
         return np.repeat(list(map(max, (size.position, size.momentum), least)), self.stepper.dimension)
 
     def closing_equations(self, z: Array) -> ClosingEquations:
@@ -1101,7 +1101,7 @@ def _listed(values: Array) -> str:
 
 def _warn_of_discretisation(orbit: PeriodicOrbit, bound: float) -> None:
     """Warn if the error of an orbit exceeds a bound."""
-    if not warnings_wanted() or orbit.error <= bound:
+    if not Products.warnings_wanted() or orbit.error <= bound:
         return
     remedy = "Omit steps and h, for adaptive steps, or take more steps"
     if orbit.sequence.tolerance is not None:

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from scvi_codegen.api.runs import Products
 from scvi_codegen.api.states import Array
 from scvi_codegen.common.errors import MethodError, StepFailedError
 from scvi_codegen.extras.paths.intervals import Intervals
 from scvi_codegen.extras.paths.size import ROUNDOFF
 from scvi_codegen.extras.paths.solver import Solution
-from scvi_codegen.runs.stepper import Stepper
 
 ENERGY_OF_NO_MOTION = 0.5
 """Relative change of a conserved energy from node to node, from which a stationary point of
@@ -47,7 +47,7 @@ class Discretisation:
     @property
     def is_motion(self) -> bool:
         """True if the path approximates a motion of the system."""
-        return not self.error >= Stepper.LOST and self.energy_change < ENERGY_OF_NO_MOTION
+        return not self.error >= Products.LOST and self.energy_change < ENERGY_OF_NO_MOTION
 
 
 def discretisation_of(solution: Solution) -> Discretisation:
@@ -96,7 +96,7 @@ def _energy_change(solution: Solution) -> float:
     velocities = stepper.velocity(q, momenta, t, intervals.parameters)
     kinetic = np.abs(np.sum(momenta * velocities, axis=1)).max()
     of_momenta = np.abs(q).max() * np.abs(solution.at.blocks).max() * np.abs(velocities).max()
-    rounding = Stepper.RESOLVED * ROUNDOFF * (np.abs(energies).max() + of_momenta)
+    rounding = Products.RESOLVED * ROUNDOFF * (np.abs(energies).max() + of_momenta)
     return float(max(np.ptp(energies) - rounding, 0.0) / kinetic) if kinetic else 0.0
 
 

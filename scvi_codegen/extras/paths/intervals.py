@@ -138,7 +138,7 @@ class Intervals:
             MethodError: if the stepper has no finer method (it was loaded without its system).
         """
         finer = copy(self)
-        finer.stepper = self.stepper.finer
+        finer.stepper = self.stepper.products.finer
         finer.binding = finer.stepper.tangent
         return finer._stepped(self.t, self.h, np.ascontiguousarray(q[:-1]), np.ascontiguousarray(p0))
 
@@ -219,7 +219,7 @@ class ReducedIntervals(Intervals):
 
     def __init__(self, stepper: Any, t: Array, h: Array, parameters: Array, options: SolverOptions | None) -> None:
         super().__init__(stepper, t, h, parameters, options)
-        self.members = stepper.members
+        self.members = stepper.products.members
         self._bases: list[Array] = []
 
     def _parameters_of(self, k: int) -> Array:
@@ -382,4 +382,4 @@ class ReducedIntervals(Intervals):
 
     def _action(self, q: Array, p: Array, step: dict[str, Any]) -> float:
         rows = Starts(np.array([step["t"]]), np.array([step["h"]]), q[np.newaxis].copy(), p[np.newaxis].copy())
-        return float(self.stepper.actions(rows, step["parameters"], self.options)[0])
+        return float(self.stepper.products.actions(rows, step["parameters"], self.options)[0])

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.api.checks import checked_count
-from scvi_codegen.api.runs import warnings_wanted
+from scvi_codegen.api.runs import Products
 from scvi_codegen.api.states import Array, Parameters, States, checked_number, real_array
 from scvi_codegen.api.text import summary
 from scvi_codegen.codegen.native.options import SolverOptions
@@ -182,7 +182,7 @@ def path_of(
     options: SolverOptions | None,
 ) -> Path:
     """Return the path of :meth:`scvi_codegen.Stepper.path`."""
-    stepper.require("path")
+    stepper.products.require("path")
     count = checked_count(steps, "steps", least=2)
     duration, begin = _checked_duration(T), checked_number(t, "the time t")
     kind = _kind_of_intervals(stepper, closed=closed is not None, energy=energy is not None)
@@ -433,7 +433,7 @@ def _described(
     if M is not None:
         repetitions = _order(M)
         zero_modes = 0 if forced else int((~solution.factors.kept).sum())
-    if not comparison.error <= TOLERABLE_ERROR and warnings_wanted():
+    if not comparison.error <= TOLERABLE_ERROR and Products.warnings_wanted():
         remedy = f"take more steps than {count}, or a method of higher degree"
         known = f"about {comparison.error:.1e} (relative): {remedy}"
         warn(f"the discretisation error of the path is {comparison.reason or known}", AccuracyWarning)
@@ -461,11 +461,11 @@ def _described(
 def _parameters_of_steps(stepper: Any, parameters: Parameters, inputs: Mapping[str, Any] | None, times: Array) -> Array:
     """Return the (k,) parameters of all steps, or (N, k) with inputs, those of the piece in the middle of each step."""
     if inputs is None:
-        stepper.check_given(parameters)
+        stepper.products.check_given(parameters)
         return np.ascontiguousarray(stepper._parameters(parameters))
-    functions = stepper.inputs_of(inputs)
+    functions = stepper.products.inputs_of(inputs)
     values = np.tile(stepper._parameters(parameters), (len(times), 1))
-    columns = stepper.input_columns
+    columns = stepper.products.input_columns
     for k, time in enumerate(times.tolist()):
         values[k, columns] = np.concatenate([functions[name].parameters(time) for name in stepper.interface.inputs])
     return values

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from scvi_codegen.api.runs import Products
 from scvi_codegen.api.states import Array
 from scvi_codegen.common.errors import PathError, StateError, StepFailedError
 from scvi_codegen.extras.paths.equations import Bordered, BorderedClosed, Closed, closed_residual, factors_of
 from scvi_codegen.extras.paths.intervals import Intervals, Linearised
 from scvi_codegen.extras.paths.size import ROUNDOFF, SizeOfMotion, largest_range, size_for_updates
-from scvi_codegen.runs.stepper import Stepper
 
 TOLERANCE = 1e-11
 """Newton correction, relative to the range of the path, at which the iteration ends."""
@@ -58,7 +58,7 @@ class Solution:
     @cached_property
     def at_rest(self) -> bool:
         """True if all positions are equal, up to rounding or relative to the start of the search."""
-        rounding = Stepper.RESOLVED * ROUNDOFF * float(np.abs(self.q).max())
+        rounding = Products.RESOLVED * ROUNDOFF * float(np.abs(self.q).max())
         return largest_range(self.q) <= max(AT_REST * self.intervals.range_of_start, rounding)
 
     @property

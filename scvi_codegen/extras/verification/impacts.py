@@ -106,7 +106,7 @@ def _event_functions(run: Trajectory) -> Iterator[tuple[Crossings, Callable[...,
         for crossings in run.events
         for k, event in enumerate(run.stepper._events_of_entries(crossings.event))
     ]
-    formulas = cast(Any, run.stepper).event_formulas([event for _, event in scalar_events])
+    formulas = cast(Any, run.stepper).products.event_formulas([event for _, event in scalar_events])
     arguments = (*formulas.q, *formulas.p, *formulas.v, symbol(TIME), *formulas.parameters)
     for (crossings, _), g, (_, values) in zip(scalar_events, formulas.functions, formulas.changes, strict=True):
         if not g.free_symbols.isdisjoint(formulas.multipliers):
@@ -251,7 +251,7 @@ class RunInModes:
     @cached_property
     def functions(self) -> Tape:
         """Functions of kinks and transitions by (q, p, v, t, parameters, multipliers)."""
-        of = cast(Any, self.run.stepper).event_formulas(self.run.stepper.searched)
+        of = cast(Any, self.run.stepper).products.event_formulas(self.run.stepper.searched)
         return Tape(of.functions, (*of.q, *of.p, *of.v, symbol(TIME), *of.parameters, *of.multipliers))
 
     def values(self, x: Numbers, parameters: Array) -> Numbers:

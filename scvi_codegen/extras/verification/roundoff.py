@@ -171,7 +171,7 @@ def _lanes(tested: SystemUnderTest, starts: list[State], steps: int, carry: Arra
     q, p = (np.array([getattr(start, name) for start in starts]) for name in "qp")
     first, m = starts[0], len(carry) // 2
     settings = {"h": first.h, "steps": steps, "t": first.t, "parameters": tested.parameters}
-    work: Any = tested.stepper.ensemble_runs(q, p, settings)
+    work: Any = tested.stepper.products.ensemble_runs(q, p, settings)
     batch = work.batch()
     block = batch.part(0, min(batch.width, len(starts)))
     block.begin()

@@ -93,7 +93,7 @@ def _normalised_states(tested: SystemUnderTest, reduction: Reduction) -> list[St
 
 def _reduced_symplecticity(tested: SystemUnderTest) -> Finding:
     """Return the largest defect of the symplectic form in canonical coordinates of the reduced space."""
-    reduction, worst = tested.stepper.reduction, 0.0
+    reduction, worst = tested.stepper.products.reduction, 0.0
     form = canonical_form(reduction.size // 2)
     for state in _normalised_states(tested, reduction):
         derivative = tested.stepper.jacobian(state.q, state.p, state.h, state.t, tested.parameters)
@@ -104,7 +104,7 @@ def _reduced_symplecticity(tested: SystemUnderTest) -> Finding:
 
 
 def _gauge_invariance(tested: SystemUnderTest) -> Finding:
-    reduction, worst = tested.stepper.reduction, 0.0
+    reduction, worst = tested.stepper.products.reduction, 0.0
     for state in _normalised_states(tested, reduction):
         z = state.q + 1j * state.p
         for member in reduction.members:

@@ -64,7 +64,7 @@ def verify_arrays(
     q, p, h, t = state
     stepper = with_events.with_events(())
     run = stepper.start(q, p, h=h, t=t, **arrays_of_run)
-    arrays = stepper.run_arrays(q, arrays_of_run["parameters"], arrays_of_run["tables"])
+    arrays = stepper.products.run_arrays(q, arrays_of_run["parameters"], arrays_of_run["tables"])
     if stepper.source is None or system.coupled_terms or tolerance is not None or system.constraints:
         initial = State(run.q, run.p, run.t, run._step_size)
         return _at_known_sizes(system, method, with_events, arrays, initial, of_known_sizes)
@@ -185,7 +185,7 @@ def small_start(start: WholeStart) -> WholeStart:
             indices[name] = np.union1d(in_tables, further[: max(0, window - len(in_tables))])
         small = _cut(start, indices)
         try:
-            start.stepper.check_accesses(small.arrays.sizes, small.arrays.places)
+            start.stepper.products.check_accesses(small.arrays.sizes, small.arrays.places)
         except StateError:
             continue
         count = sum(values.size for values in small.arrays.state.values())
