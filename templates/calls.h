@@ -304,8 +304,8 @@ int NAME(call_defects)(NAME(call) *c, long long count, const double *t, const do
 }
 
 /* Transports vectors of global errors, from `before` to `now`, over the steps phi of call_defects by differences: phi(x
- * + s v) - phi(x) = s D phi v + O(s^2), with s v of a size of the root of rounding errors (W. H. Press et al.,
- * Numerical Recipes, 5.7). */
+ * + s v) - phi(x) = s D phi v + O(s^2), with s v_i = sqrt(u |x_i| size_i) at most, where rounding errors and the
+ * terms in s^2 are alike (W. H. Press et al., Numerical Recipes, 5.7). */
 int NAME(call_differences)(NAME(call) *c, long long count, const double *t, const double *h, const double *q,
     const double *p, const double *size, const double *defects, const int *parts, int vectors, double rounding,
     unsigned long long seed, const double *before, double *now, long long stride, double *errors, double *deviations)
@@ -321,7 +321,7 @@ int NAME(call_differences)(NAME(call) *c, long long count, const double *t, cons
     for (int j = 0; j < vectors && !status; j++) {
       double *v = now + j * 2 * M, largest = 0.0;
       for (int i = 0; i < 2 * M; i++)
-        largest = fmax(largest, fabs(v[i]) / size[i]);
+        largest = fmax(largest, fabs(v[i]) / sqrt(size[i]) / sqrt(fmax(size[i], fabs(i < M ? q[i] : p[i - M]))));
       if (largest == 0.0)
         continue;
       const double factor = sqrt(DBL_EPSILON) / largest;

@@ -341,8 +341,14 @@ class LinearisedMethod(StateFunctions):
         rounding: float,
         seed: int,
     ) -> None:
-        """As :meth:`_transport_errors`, by the steps of :meth:`_defects` from neighbouring states; (2m,) sizes."""
+        """As :meth:`_transport_errors`, by the steps of :meth:`_defects` from neighbouring states; (2m,) sizes.
+
+        Positions on a constraint are functions of each other, with the size of the motion of all, and so are momenta:
+        the height of a pendulum moves by the square of the swing.
+        """
         sizes = np.where(sizes > 0.0, sizes, sizes.max() or 1.0)
+        if self.interface.constraints:
+            sizes = np.repeat(sizes.reshape(2, -1).max(axis=1), self.dimension)
         pointer, after = self.binding.pointer, np.empty_like(vectors)
         steps = starts.t, starts.h, starts.q, starts.p
         given = (*map(pointer, (*steps, sizes, defects.misfits)), pointer(defects.parts))
