@@ -98,15 +98,8 @@ class Advice:
             ("expected error", Html.plain(f"{self.expected_error:.1e}")),
             *(("warning", Html.plain(warning)) for warning in self.warnings),
         ]
-        rows = [
-            (
-                Html.plain(f"{h:.4g}"),
-                Html.plain(f"{error:.1e}"),
-                Html.plain(f"{iterations:.1f}"),
-                Html.plain(f"{seconds:.2e}"),
-            )
-            for h, error, iterations, seconds in self.evidence
-        ]
+        formats = "{:.4g}", "{:.1e}", "{:.1f}", "{:.2e}"
+        rows = [tuple(map(Html.plain, map(str.format, formats, row))) for row in self.evidence]
         head = ("h", "error at the end", "iterations per step", "seconds per unit of time")
         pilots = Html.grid(rows, head=head, caption="Pilot runs") if rows else Html("")
         return Html.card(f"Advice: {self.method.title}", facts, pilots)
