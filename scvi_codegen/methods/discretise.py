@@ -28,13 +28,14 @@ from scvi_codegen.systems.first_order import FirstOrderSystem
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
 from scvi_codegen.systems.formulas.intermediates import intermediate, symbols_of
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
-from scvi_codegen.systems.kinks import check_continuity, warn_of_formulas
+from scvi_codegen.systems.kinks import check_continuity
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 from scvi_codegen.systems.legendre.of_rotations import hamiltonian_of_rotations
 from scvi_codegen.systems.splittings.axial import Turn, axial_turns, frame_potential, rotated
 from scvi_codegen.systems.splittings.kinetic import kinetic_splitting
 from scvi_codegen.systems.system import MechanicalSystem
 from scvi_codegen.systems.time_transformation import reparametrise, time_rescaling_function
+from scvi_codegen.systems.unlocated_kinks import warn_of_formulas
 
 NUMBERS = {"34a": "35a", "34c": "35c", "34d": "35d", "34e": "35e"}
 """Equation numbers of the paper for the shooting method in phase space, by those for Lagrangians."""

@@ -48,8 +48,8 @@ from scvi_codegen.systems.contact import ContactLike
 from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.event import Event, EventLike, as_events
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
-from scvi_codegen.systems.kinks import warn_of_formulas
 from scvi_codegen.systems.system import MechanicalSystem
+from scvi_codegen.systems.unlocated_kinks import warn_of_formulas
 
 if TYPE_CHECKING:
     from sympy import Expr

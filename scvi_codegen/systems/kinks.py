@@ -14,8 +14,7 @@ from collections.abc import Container, Iterable, Mapping
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
-from scvi_codegen.common.errors import MethodError, MethodWarning, warn
-from scvi_codegen.common.representation import clipped
+from scvi_codegen.common.errors import MethodError
 from scvi_codegen.systems.checks.continuity import MOST_SURFACES, jump_message, jumps_of
 from scvi_codegen.systems.event import Kink, Refraction
 from scvi_codegen.systems.formulas.expressions import parts_of_type
@@ -151,18 +150,3 @@ def _domains() -> tuple[type, ...]:
 
 def _is_whole_power(part: Any) -> bool:
     return bool(part.is_Pow and part.exp.is_Integer and part.exp > 0)
-
-
-def warn_of_formulas(of: Any, subject: str) -> None:
-    """Warn that steps do not end at kinks of a system or an interface, other than rint and cutoffs of lists."""
-    kinks = [u for u in of.kinks if not (u.startswith("cos(pi*") or of.lengths)]
-    if kinks:
-        u, loop, indices = kinks[0].partition(" for ")
-        remedy = "Use short steps (h=, max_step=), or sizes= with at most 256 switching functions"
-        if getattr(of, "temperature", None) is not None:
-            remedy = "Use short steps (h=) or, with named coordinates, metropolis=True: its averages have no error of h"
-        warn(
-            f"{subject} does not locate the kinks of this system, such as {clipped(u, 60)} = 0{loop}{indices}: steps "
-            f"across them use the formulas as they are and lose order. {remedy}",
-            MethodWarning,
-        )
