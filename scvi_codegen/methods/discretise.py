@@ -23,6 +23,7 @@ from scvi_codegen.methods.constraints import with_constraints
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table, Velocities
 from scvi_codegen.methods.tables.basis import identity_matrix, next_step
+from scvi_codegen.systems.checks.unlocated_kinks import warn_of_formulas
 from scvi_codegen.systems.derived_expressions import auxiliary_multipliers, forms_of
 from scvi_codegen.systems.first_order import FirstOrderSystem
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
@@ -35,7 +36,6 @@ from scvi_codegen.systems.splittings.axial import Turn, axial_turns, frame_poten
 from scvi_codegen.systems.splittings.kinetic import kinetic_splitting
 from scvi_codegen.systems.system import MechanicalSystem
 from scvi_codegen.systems.time_transformation import reparametrise, time_rescaling_function
-from scvi_codegen.systems.unlocated_kinks import warn_of_formulas
 
 NUMBERS = {"34a": "35a", "34c": "35c", "34d": "35d", "34e": "35e"}
 """Equation numbers of the paper for the shooting method in phase space, by those for Lagrangians."""

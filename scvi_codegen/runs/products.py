@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.codegen.native import building
+from scvi_codegen.codegen.native.announcements import tell
 from scvi_codegen.codegen.native.binding import Binding
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import Source
@@ -77,6 +78,11 @@ class Products:
     def check_given(self, parameters: Parameters, *, step: bool = False) -> None:
         """Raise StateError if an input has no value; of a single ``step`` ContactError for unknown modes, too."""
         (check_step_given if step else check_inputs_given)(self.stepper.interface, parameters)
+
+    @staticmethod
+    def announce(message: str) -> None:
+        """Announce a message now, e.g. the expected duration of a computation."""
+        tell(message)
 
     @staticmethod
     def warnings_wanted() -> bool:

@@ -150,7 +150,7 @@ class TestTolerances:
         words = "run kepler --q 1.999,0 --velocity 0,0.022366272 --span 18.849555921538759"
         assert re.search(r"q1 =\s+1\.99", output_of(words, "--tolerance", "1e-9"))
         refused = error_of(words, "--advise", "1e-9", status=1)
-        assert re.search(r"tolerance 1e-09 is missed: the error is \S+; use adaptive step size", refused)
+        assert re.search(r"(is missed: the error is \S+|have a close encounter); use adaptive step size", refused)
 
     @pytest.mark.rotated
     @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """System under test: the stepper, a stepper with Newton's method alone, generic states, and rounding of a step."""
 
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,9 +8,9 @@ import numpy as np
 
 from scvi_codegen.api.formulas import Number, mp
 from scvi_codegen.api.methods import Method
+from scvi_codegen.api.runs import Products
 from scvi_codegen.api.states import Array
 from scvi_codegen.api.systems import MechanicalSystem
-from scvi_codegen.api.text import announced
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import EventError, StateError, StepFailedError
 from scvi_codegen.extras.exact.solution import ExactMotion, exact_motion, numbers
@@ -346,8 +345,9 @@ class SystemUnderTest:
             start = state.q, state.p, state.h, state.t
             seconds = 0.0 if self._solved else REFERENCE_STEPS * derived.seconds(*start)
             text = f"{derived.unknowns} unknowns per step are solved in 60 digits, which takes about {seconds:.0f} s"
-            with announced(text) if seconds > ANNOUNCED_SECONDS else nullcontext():
-                self._solved[index] = derived(*start)
+            if seconds > ANNOUNCED_SECONDS:
+                Products.announce(text)
+            self._solved[index] = derived(*start)
         return self._solved[index]
 
     def in_roundings(self, difference: Array, state: State) -> float:

@@ -6,8 +6,8 @@ from typing import Any
 
 from scvi_codegen.codegen.variants import Derivatives
 from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError, closest
+from scvi_codegen.systems.checks.unlocated_kinks import warn_of_formulas
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
-from scvi_codegen.systems.unlocated_kinks import warn_of_formulas
 
 OPERATIONS = {
     "adaptive": "adaptive step size (t_end without h)",

@@ -119,6 +119,16 @@ static inline void enlarge_to_absolute(const step_data *step, section here, real
     size[i - here.first] = larger(size[i - here.first], step->absolute[i]);
 }
 
+#ifndef EXPLICIT_RUN
+/* Returns 1 for a motion whose velocity a pilot doubles at least, |dq_i| <= 3/2 h^2 A_i. Relative to its own motion,
+ * the error of a curve of one or two coefficients is then the same at all step sizes, or falls with the first power,
+ * until the pilot is so large that V_i shows the size that the motion reaches: smaller ones leave it out. */
+static inline int starts(const step_data *step, real displacement, real curvature)
+{
+  return step->is_pilot && displacement <= REAL(1.5) * curvature;
+}
+#endif
+
 #ifdef ARRAYS
 /* mu_i of a step of h, with the largest V and A of all arrays. */
 static inline real motion_of_step(const step_data *step, real h, real displacement, real curvature, long long i)
@@ -134,16 +144,6 @@ static inline real motion_of_step(const step_data *step, real h, real displaceme
 {
   return motion_size(step->motion_of, h, displacement, curvature, (int)i);
 }
-
-#ifndef EXPLICIT_RUN
-/* Returns 1 for a motion whose velocity a pilot doubles at least, |dq_i| <= 3/2 h^2 A_i. Relative to its own motion,
- * the error of a curve of one or two coefficients is then the same at all step sizes, or falls with the first power,
- * until the pilot is so large that V_i shows the size that the motion reaches: smaller ones leave it out. */
-static inline int starts(const step_data *step, real displacement, real curvature)
-{
-  return step->is_pilot && displacement <= REAL(1.5) * curvature;
-}
-#endif
 
 /* Replaces the sizes of the elements of an array of known size by the largest of it. */
 static inline void enlarge_to_arrays(real *size)

@@ -147,7 +147,7 @@ static int propagate_steps(propagation *over, long long first, long long end)
     if (over->errors)
       memset(vectors_at(over, k + 1), 0, sizeof(real) * (size_t)(over->count * STEP_INPUTS));
     const int carried = iterated ? propagate_by_iteration(over, k, stored_of(over, k - first)) : 0;
-    if (carried < over->count)
+    if (!iterated || carried < over->count)
       status = over->errors ? NOT_CONVERGED : vectors_by_newton(over, k, carried);
     else if (!all_finite(vectors_at(over, k + !over->back), over->count * STEP_INPUTS))
       status = NOT_FINITE;
