@@ -74,6 +74,7 @@ def tangent_space(rows: Array) -> TangentSpace:
 
 def unit_rows(rows: Array) -> Array:
     """Return a matrix with its rows scaled to length 1, unless they are 0."""
-    with np.errstate(over="ignore"):
-        sizes = np.linalg.norm(rows, axis=1, keepdims=True)
-    return np.asarray(rows / np.where(sizes > 0.0, sizes, 1.0))
+    largest = np.abs(rows).max(axis=1, keepdims=True, initial=0.0)  # squares of entries overflow and underflow
+    scaled = rows / np.where(largest > 0.0, largest, 1.0)
+    lengths = np.linalg.norm(scaled, axis=1, keepdims=True)
+    return np.asarray(scaled / np.where(lengths > 0.0, lengths, 1.0))
