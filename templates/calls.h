@@ -209,7 +209,7 @@ int NAME(call_pieces)(NAME(call) *c, long long count, const double *t, const dou
 #else
 #define LACKS_NEWTON(status) 0
 #endif
-#define MOST_PARTS 16 /* of a step, which take as long as its solution by Newton's method */
+#define MOST_PARTS 16 /* of a step that the iteration does not solve, before Newton's method is loaded */
 
 /* Length of a vector in units of sizes; infinite where a component other than 0 has the size 0. */
 static double NAME(relative_length)(int count, const double *x, const double *size)

@@ -39,8 +39,8 @@ def tokens(code: str) -> Iterator[str]:
 
 def words(code: str) -> frozenset[str]:
     """Return the names that occur in a text other than as members, and the ends of pasted ones."""
-    found = (match[0] for match in TOKEN.finditer(code) if match.lastgroup in ("word", "pasted"))
-    return frozenset(word.removeprefix("##") for word in found)
+    tokens = (match[0] for match in TOKEN.finditer(code) if match.lastgroup in ("word", "pasted"))
+    return frozenset(word.removeprefix("##") for word in tokens)
 
 
 def is_name(token: str) -> bool:

@@ -204,8 +204,8 @@ def _for_readers(comment: str) -> str:
 
 def _alternatives(comment: str) -> frozenset[str]:
     """Return the names of alternatives or numbers in a comment."""
-    found = words(comment.strip("/*"))
-    return frozenset(w for w in found if w.isupper() and w.replace("_", "").isalpha() and len(w.split("_")[0]) > 3)
+    in_comment = words(comment.strip("/*"))
+    return frozenset(w for w in in_comment if w.isupper() and w.replace("_", "").isalpha() and len(w.split("_")[0]) > 3)
 
 
 @dataclass(frozen=True, slots=True)
