@@ -124,6 +124,19 @@ static int NAME(call_begin)(const NAME(call) *c)
   return 0;
 }
 
+/* Returns 1 for a run of which there may be a warning: of a large step, or a changed energy, both unless certainly below
+ * `tolerable`, or of errors that grow. */
+static int NAME(call_remarks)(const NAME(call) *c)
+{
+  const double *e = c->energies, change = fabs(e[1] - e[0]);
+  const int is_accurate = c->error >= 0.0 && c->error <= c->tolerable;
+#ifdef HAS_MEASURES_GROWTH
+  if (c->measures_growth && !(c->run->tangent_steps && c->run->growth <= c->run->growth_limit))
+    return 1;
+#endif
+  return !(is_accurate && (!c->has_energies || !c->control || change <= 0.5 * c->tolerable * fmax(fabs(e[0]), fabs(e[1]))));
+}
+
 /* Starts a run, takes steps and stores states, the initial one first; returns IN_DOUBT where call_begin is. */
 int NAME(call_integrate)(NAME(call) *c, long long steps, long long every)
 {
@@ -150,13 +163,14 @@ int NAME(call_integrate)(NAME(call) *c, long long steps, long long every)
   if (c->control && c->sizes)
     for (long long k = 0; k < c->stored; k++)
       c->sizes[k] = c->t[k + 1] - c->t[k];
-  if (status || !c->control || !c->has_energies)
-    return status;
   long long last = c->stored, row = last * c->coordinates;
-  if (NAME(energies)(1 + (last == 1), c->t, c->q, c->p, c->parameters, c->energies, c->workspace) ||
-      (last != 1 && NAME(energies)(1, c->t + last, c->q + row, c->p + row, c->parameters, c->energies + 1, c->workspace)))
+  if (!status && c->control && c->has_energies &&
+      (NAME(energies)(1 + (last == 1), c->t, c->q, c->p, c->parameters, c->energies, c->workspace) ||
+          (last != 1 &&
+              NAME(energies)(1, c->t + last, c->q + row, c->p + row, c->parameters, c->energies + 1, c->workspace))))
     c->energies[0] = c->energies[1] = 0.0; /* undefined */
-  return 0;
+  c->remarks = NAME(call_remarks)(c);
+  return status;
 }
 
 #ifdef HAS_DEFECTS

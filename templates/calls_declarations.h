@@ -14,8 +14,9 @@ typedef struct {
   const struct NAME(step_control) *control; /* adaptive steps to t_end; NULL: fixed steps of h */
   double h, t_end;
   long long words, coordinates, measures_growth, has_energies, begins_by; /* velocities: 1; on constraints: 2 more */
+  double tolerable; /* error of a step, or change of energy, without a warning */
   double error, error_t, energies[2];
-  long long stored, steps, rejected, fallback_steps;
+  long long stored, steps, rejected, fallback_steps, remarks; /* remarks: 1 if there may be a warning */
 } NAME(call);
 int NAME(call_advance)(const NAME(call) *call, long long steps, long long every);
 int NAME(call_integrate)(NAME(call) *call, long long steps, long long every);

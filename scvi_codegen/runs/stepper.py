@@ -40,7 +40,7 @@ from scvi_codegen.runs.events.contacts import in_first_modes
 from scvi_codegen.runs.events.refinement import WithEventsInDouble, constantly
 from scvi_codegen.runs.forwarding import Forwarded, OfSteppers
 from scvi_codegen.runs.results.dense_output import check_has_end, times_of_run
-from scvi_codegen.runs.results.output import ALL_STATES, Output
+from scvi_codegen.runs.results.output import Output, every
 from scvi_codegen.runs.states.layout import InitialData
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import Array, Parameters, States, check_step_given, flat_state
@@ -246,11 +246,13 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
             stepper, plan, count = stepper._planned.__wrapped__(*schedule)
         if max_step is not None:
             check_max_step(plan, t, interface.words)
-        segments, output = None, ALL_STATES
+        segments = None
         if inputs is not None:
             segments = InputSegments(stepper, inputs, parameters, t, final_time(t, h, steps, t_end))
             plan, parameters = segments.plan(plan), segments.first
-        if not (save_every == 1 and t_eval is None and observe is None and progress is None):
+        if t_eval is None and observe is None and progress is None:
+            output = every(save_every)
+        else:
             times = None if t_eval is None else stepper._output_times(t_eval, t, plan, count)
             output = Output(save_every, times, observe, progress)
         initial = tuple.__new__(InitialData, (q, p, velocity, t, parameters, options))  # without a call of Python
@@ -288,13 +290,14 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
         else:
             run._start_from(initial, begins_by, growth)
             trajectory = segments.record(run, output.save_every, output.progress)
-        try:
-            if segments is None:
-                warn_of_inaccuracy(trajectory, run)
-            if growth:
-                warn_of_error_growth(run, float(trajectory.t[-1]), requested=check_growth is True)
-        except Exception as failure:  # noqa: BLE001  (the run is complete)
-            warn_of_failed_check(failure)
+        if segments is not None or run._remarks:
+            try:
+                if segments is None:
+                    warn_of_inaccuracy(trajectory, run)
+                if growth:
+                    warn_of_error_growth(run, float(trajectory.t[-1]), requested=check_growth is True)
+            except Exception as failure:  # noqa: BLE001  (the run is complete)
+                warn_of_failed_check(failure)
         if run._rows is not None:  # large memory is freed instead
             self._released_runs.append(run)
         return trajectory

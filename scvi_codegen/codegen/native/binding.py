@@ -30,7 +30,7 @@ from scvi_codegen.common.cache import template_folder
 from scvi_codegen.common.errors import MethodError, StepFailedError
 from scvi_codegen.common.tangent_space import DEPENDENT
 
-RESULTS, FIRST_RESULT = Struct("=4d4q"), "error"
+RESULTS, FIRST_RESULT = Struct("=4d5q"), "error"
 """Format of the last fields of the struct (``calls_declarations.h``), and the first of them."""
 LIMITS_ON_CONSTRAINTS = (
     f"#define HAS_CONSTRAINTS\n#define DEPENDENT {DEPENDENT!r}\n#define INPUT_PRECISION {INPUT_PRECISION!r}\n"

@@ -18,6 +18,9 @@ from scvi_codegen.runs.stepping.step_plan import Adaptive, FixedSteps
 TOLERABLE_ERROR: Final = 1e-3
 """Largest relative error of a step, and largest relative change of the energy of a run, without a warning."""
 
+SUMMED: Final = 10.0
+"""Tolerances of an adaptive run by which its energy may change without a warning: errors of some steps that add up."""
+
 ADAPTIVE_REMEDY: Final = ", or use adaptive steps (t_end= without h)"
 
 GROSS_ERROR: Final = 0.5
@@ -34,6 +37,11 @@ FIXED_STEP_REMEDY: Final = (
     "although the system conserves it: h is too large for the fastest part of the motion. Reduce h, or use an SVI with "
     "adaptive steps (t_end=)"
 )
+
+
+def tolerable_change(plan: Any) -> float:
+    """Return the largest relative change of the energy of a run, or error of its fixed steps, without a warning."""
+    return max(TOLERABLE_ERROR, SUMMED * (getattr(plan, "tolerance", None) or 0.0))
 
 
 def warn_of_inaccuracy(trajectory: SavedStates, run: Memory, *, before: float = 0.0) -> None:
@@ -74,14 +82,14 @@ def warn_of_energy_error(trajectory: SavedStates, run: Memory) -> None:
             return
     if not stepper.interface.conserves_energy or not warnings_wanted():
         return
-    ends = run._end_energies(trajectory.t, trajectory.q, trajectory.p)
-    if ends is None or not abs(ends[1] - ends[0]) > 0.5 * TOLERABLE_ERROR * max(abs(ends[0]), abs(ends[1])):
+    ends, tolerable = run._end_energies(trajectory.t, trajectory.q, trajectory.p), tolerable_change(plan)
+    if ends is None or not abs(ends[1] - ends[0]) > 0.5 * tolerable * max(abs(ends[0]), abs(ends[1])):
         return
     if getattr(trajectory, "modes", None) is not None or stepper.in_tau:
         ends = None  # of the modes of the last state, or divided by rates
-    if not energy_reason(stepper) and (energies := _changed_energies(trajectory, ends)):
+    if not energy_reason(stepper) and (energies := _changed_energies(trajectory, ends, tolerable)):
         if is_adaptive:
-            warn_of_energies(*energies)
+            warn_of_energies(*energies, tolerable=tolerable)
         else:
             warn_of_energies(*energies, tolerable=GROSS_ERROR, why=FIXED_STEP_REMEDY)
 
@@ -94,17 +102,17 @@ def warn_of_energy_errors(ensemble: Any, ends: Array | None = None) -> None:
     plans, stepper = ensemble.plans, ensemble.stepper
     if energy_reason(stepper) or not (plans and stepper.interface.conserves_energy and warnings_wanted()):
         return
-    by_trajectory, stride = {}, -(-len(plans) // MOST_CHECKED)
+    by_trajectory, stride, tolerable = {}, -(-len(plans) // MOST_CHECKED), tolerable_change(plans[0])
     checked = np.arange(0, len(plans), stride)
     if ends is not None:
         first, last = np.abs(ends[checked]).T, np.abs(np.diff(ends[checked])[:, 0])
-        checked = checked[~(last <= 0.5 * TOLERABLE_ERROR * np.maximum(first[0], first[1]))]
+        checked = checked[~(last <= 0.5 * tolerable * np.maximum(first[0], first[1]))]
     for j in checked.tolist():
-        if ensemble._reached(j).any() and (energies := _changed_energies(ensemble[j])):
+        if ensemble._reached(j).any() and (energies := _changed_energies(ensemble[j], None, tolerable)):
             by_trajectory[j] = energies
     worst = max(by_trajectory, key=lambda j: relative_energy_change(*by_trajectory[j]), default=None)
     if worst is not None:
-        warn_of_energies(*by_trajectory[worst], where=f" of trajectory {worst}")
+        warn_of_energies(*by_trajectory[worst], tolerable=tolerable, where=f" of trajectory {worst}")
 
 
 def warn_of_energies(
@@ -136,7 +144,7 @@ def relative_energy_change(first: float, last: float, size: float) -> float:
 
 
 def _changed_energies(
-    states: SavedStates, ends: tuple[float, float] | None = None
+    states: SavedStates, ends: tuple[float, float] | None, tolerable: float
 ) -> tuple[float, float, float] | None:
     """Return the first and the last energy and the largest |p.v| if the energy changed; ``None`` otherwise.
 
@@ -150,7 +158,7 @@ def _changed_energies(
             float(stepper._energies_of(states.t[[k]], states.q[[k]], states.p[[k]], parameters)[0])
             for k, parameters in sides
         )
-        if not relative_energy_change(first, last, 0.0) > TOLERABLE_ERROR:
+        if not relative_energy_change(first, last, 0.0) > tolerable:
             return None
         if (np.ptp(q, axis=0) <= RESOLVED * roundoff(stepper.interface.words) * np.abs(q).max(axis=0)).all():
             return None

@@ -37,6 +37,7 @@ class Run(Memory, AttitudeHistory, OfMethod):
     def __init__(self, stepper: Integrator) -> None:
         super().__init__(stepper)
         self._untimed &= not stepper.divides_steps
+        self._remarks: int = True  # whether there may be a warning of the last run by `_integrated`
 
     def __repr__(self) -> str:
         return describe_run(self)
@@ -110,6 +111,7 @@ class Run(Memory, AttitudeHistory, OfMethod):
         fits = steps is None if h is None else steps is not None and steps <= most
         special = self._takes_noise or short is None or self._has_tau or self._unset_inputs or self.stepper.searched
         is_plain = output is ALL_STATES or output.has_states_alone
+        self._remarks = True
         if special or not (fits and is_plain and (isinstance(plan, Fixed) or initial.t != plan.t_end)):
             self._start_from(initial, begins_by, growth)
             return self._recorded(steps, output)
@@ -120,6 +122,8 @@ class Run(Memory, AttitudeHistory, OfMethod):
             short.begin(t, q, velocity, "velocity")
         if (growth, begins_by) != short.way:
             short.way = short.call.measures_growth, short.call.begins_by = growth, begins_by
+        if plan is not short.plan:
+            short.set_plan(plan)
         size = most if steps is None else steps
         status = short.integrate(size, save_every)
         if status == IN_DOUBT:
@@ -127,11 +131,12 @@ class Run(Memory, AttitudeHistory, OfMethod):
             short.way = growth, 0
             short.call.begins_by = 0
             status = short.integrate(size, save_every)
-        error, error_t, first, last, stored, done, rejected, fallbacks = short.results()
+        error, error_t, first, last, stored, done, rejected, fallbacks, remarks = short.results()
         if status or (steps is None and done == size):
             return record(self, steps, save_every=save_every, filled=1 + stored, status=status)
         if h is None:
             self._ends = first, last
+        self._remarks = remarks or short.has_mesh
         states, sizes = short.recorded(1 + stored, h, save_every)
         return plain_trajectory(self, states, sizes, done, error, error_t, rejected, fallbacks)
 

@@ -14,6 +14,7 @@ from scvi_codegen.codegen.native.arguments import BINARY64, empty_array
 from scvi_codegen.codegen.native.capacity import room_for_states, too_many_states
 from scvi_codegen.common.errors import ScviCodegenError, StepFailedError
 from scvi_codegen.common.validation import checked_count
+from scvi_codegen.runs.accuracy.local_error import tolerable_change
 from scvi_codegen.runs.driver.singular_time import ProgressWatch, check_energy_surface
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import FEW, NUMBERS, SEQUENCES, Array, evaluation
@@ -21,7 +22,7 @@ from scvi_codegen.runs.states.words import block_of, from_block
 from scvi_codegen.runs.stepping.chunks import drive
 from scvi_codegen.runs.stepping.memory import Memory
 from scvi_codegen.runs.stepping.noise import report_of
-from scvi_codegen.runs.stepping.step_plan import Adaptive, FixedSteps, InTau
+from scvi_codegen.runs.stepping.step_plan import Adaptive, FixedSteps, InTau, StepPlan
 from scvi_codegen.runs.trajectory import Trajectory
 from scvi_codegen.systems.event import Crossings
 from scvi_codegen.systems.formulas.symbols import DOT
@@ -161,6 +162,7 @@ class ShortRuns(StateRows):
         self.way = 0, 0  # measures_growth and begins_by of the call
         self.call.start, self.call.sizes = stepper.binding.pointers(self._start, self._sizes)
         self.call.has_energies = stepper.interface.conserves_energy and not stepper.changes_states
+        self.has_mesh, self.plan = stepper.interface.layout.mesh is not None, cast("StepPlan | None", None)
         self.integrate = stepper.binding.call("integrate", self.call)
         self.results = stepper.binding.results(self.call)
 
@@ -181,6 +183,10 @@ class ShortRuns(StateRows):
             pass
         self._start[0], self._start[1:] = t, np.concatenate(self._states.pair(q, p, name))
 
+    def set_plan(self, plan: StepPlan) -> None:
+        """Set the changes of the energy, or errors of steps, of which C makes a remark."""
+        self.plan, self.call.tolerable = plan, tolerable_change(plan)
+
     def recorded(self, count: int, h: float | None, save_every: int) -> tuple[States, Array]:
         """Return copies of the first states and of the steps that follow them."""
         if (count, h) != self._kind:
@@ -188,8 +194,10 @@ class ShortRuns(StateRows):
             self._sizes_of_kind = _repeated(h, count) if h is not None else self._sizes[:count]
         (t, q, p, iterations), sizes = self._views, self._sizes_of_kind
         if h is None:
+            if save_every != 1:
+                return (t.copy(), q.copy(), p.copy(), iterations.copy()), _repeated(math.nan, count)
             sizes[-1] = math.nan
-            sizes = sizes.copy() if save_every == 1 else np.full(count, math.nan)
+            sizes = sizes.copy()
         return (t.copy(), q.copy(), p.copy(), iterations.copy()), sizes
 
 
@@ -335,12 +343,11 @@ def _repeated(value: float, count: int) -> Array:
 
 def _differences(t: Array, *, whole: bool) -> Array:
     """Return the steps that follow states, NaN for the last one and unless all states are saved."""
+    if not whole:
+        return _repeated(math.nan, len(t))
     step_sizes = np.empty(len(t))
-    if whole:
-        np.subtract(t[1:], t[:-1], step_sizes[:-1])
-        step_sizes[-1] = math.nan
-    else:
-        step_sizes.fill(math.nan)
+    np.subtract(t[1:], t[:-1], step_sizes[:-1])
+    step_sizes[-1] = math.nan
     return step_sizes
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 from scvi_codegen.runs.states.validation import Array
@@ -31,3 +32,9 @@ class Output:
 
 ALL_STATES = Output()
 """Output of all states, without calls."""
+
+
+@lru_cache(maxsize=64)
+def every(save_every: int) -> Output:
+    """Return the output of every k-th state, the same object for one k."""
+    return ALL_STATES if save_every == 1 else Output(save_every)

@@ -18,12 +18,10 @@
 #define SHORT_PART REAL(0.125) /* of the time in which a state changes by its size, or of the span: early trial */
 #ifdef COSTLY_POINTS
 #define LEVELS_OUTSIDE MOST_UP /* by which the curve of a pilot is extrapolated */
-#define GROWTH_OF_PILOTS (GROWTH * REAL(0.84)) /* of their errors, which grow with a lower power of the step size, .. */
-#define LEAST_RISE 4 /* .. or, divided by as much, until they are rounding */
+#define GROWTH_OF_PILOTS (GROWTH * REAL(0.84)) /* of their errors, which grow with a lower power of the step size */
 #else
 #define LEVELS_OUTSIDE 0
 #define GROWTH_OF_PILOTS GROWTH
-#define LEAST_RISE 2
 #endif
 #define SHORT_LAST REAL(0.5) /* of the step before: a last step so short is made longer, and that one shorter */
 #define AT_START (-NEVER_FAILED) /* trial->inside of the shortest one, whose increments are the rates at its start */
@@ -460,12 +458,10 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
   }
   while (!now->last && up > 0) {
     const int failed = !(now->error < INFINITY), small = now->error <= now->limits.most;
-    const real least = error_at(shorter, up / LEAST_RISE), most = error_at(shorter, up + up / 2 + 1);
-    const int as_expected = now->error > least && now->error < most;
-    const int rises = failed ? !SHORT_STEPS_FAIL : as_expected;
+    const int rises = failed ? !SHORT_STEPS_FAIL : now->error > shorter;
     found = found || small;
     up = small ? levels_up(run, now) : 0;
-    if (LEVELS_OUTSIDE && up > 0 && up < LEVELS_PER_BINADE)
+    if (up > 0 && up < LEVELS_PER_BINADE) /* a further trial takes as long as a step */
       return;
     up -= LEVELS_OUTSIDE ? up % LEVELS_PER_BINADE : 0;
     if (up == 0)
@@ -651,8 +647,8 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
  * pulse may lie between them. */
 static inline int is_leap(const run_memory *run, const trial *now)
 {
-  const int doubtful = now->change >= LEAP || now->change <= -LEVELS_PER_BINADE || run->steps_to_compare > 0;
-  if (!doubtful || now->error > now->limits.least)
+  const int changes = run->step == 0 || now->change >= LEAP || now->change <= -LEVELS_PER_BINADE;
+  if (!(changes || run->steps_to_compare > 0) || now->error > now->limits.least)
     return 0;
   return by_newton(now) ? now->change >= LEVELS_PER_BINADE : estimate(run, now, 0) <= LEAST_UNRESOLVED;
 }
@@ -765,7 +761,7 @@ static inline int confirm_step(run_memory *run, trial *now, const solver_options
   const int parts = begins ? HALVED : leaps ? parts_of_leap(now)
                                             : 2;
   now->apart = 0;
-  return leaps || momenta || run->step == 0 ? compare_step(run, now, parts, momenta, options, report) : OK;
+  return leaps || momenta ? compare_step(run, now, parts, momenta, options, report) : OK;
 }
 
 /* Largest change of level after the iterations of a step. Where they are many, as in lattices whose waves are fast, the
