@@ -18,10 +18,8 @@
 #define SHORT_PART REAL(0.125) /* of the time in which a state changes by its size, or of the span: early trial */
 #ifdef COSTLY_POINTS
 #define LEVELS_OUTSIDE MOST_UP /* by which the curve of a pilot is extrapolated */
-#define GROWTH_OF_PILOTS (GROWTH * REAL(0.84)) /* of their errors, which grow with a lower power of the step size */
 #else
 #define LEVELS_OUTSIDE 0
-#define GROWTH_OF_PILOTS GROWTH
 #endif
 #define SHORT_LAST REAL(0.5) /* of the step before: a last step so short is made longer, and that one shorter */
 #define AT_START (-NEVER_FAILED) /* trial->inside of the shortest one, whose increments are the rates at its start */
@@ -116,7 +114,6 @@ static inline real estimate(const run_memory *run, const trial *now, real least)
 }
 
 #ifdef NEWTON_ALONE
-#define EVENED LEVELS_PER_BINADE /* by which the step before the last one may be shorter */
 #define HOT static
 #define AMPLIFIED 1e-14 /* last update beyond which unknowns do not resolve errors in two words */
 #define SHORT_STEPS_FAIL 0
@@ -148,11 +145,6 @@ static real attempt(run_memory *run, trial *now, real least, const solver_option
 #define LEVELS_INSIDE 0 /* the stored curves are those of accepted steps */
 #else
 #define LEVELS_INSIDE INSIDE
-#endif
-#ifdef COSTLY_POINTS
-#define EVENED REACH
-#else
-#define EVENED 0
 #endif
 #define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */
 
@@ -374,8 +366,8 @@ static int levels_up(const run_memory *run, const trial *now)
   real error = now->error;
   int up = 0;
   if (error < now->limits.fewer)
-    for (; up < most && error * GROWTH_OF_PILOTS <= now->limits.most; up++)
-      error *= GROWTH_OF_PILOTS;
+    for (; up < most && error * GROWTH <= now->limits.most; up++)
+      error *= GROWTH;
   return up;
 }
 
@@ -463,7 +455,6 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
     up = small ? levels_up(run, now) : 0;
     if (up > 0 && up < LEVELS_PER_BINADE) /* a further trial takes as long as a step */
       return;
-    up -= LEVELS_OUTSIDE ? up % LEVELS_PER_BINADE : 0;
     if (up == 0)
       up = found && rises ? 0 : levels_within(run, now, MOST_UP);
     shorter = now->error;
@@ -789,18 +780,22 @@ static inline int limit_by_iterations(run_memory *run, const trial *now)
   return most;
 }
 
-/* Change of level, as far as it has a predictor, that divides what is left of a run evenly where its last step would be
- * short: both steps then need as few iterations as possible. What a step of Newton's method leaves of stiff vibrations,
- * however small beside its motion, is large beside that of a short step, which would resolve them. */
+#ifdef NEWTON_ALONE
+/* Change of level that divides what is left of a run evenly where its last step would be short: what a step of Newton's
+ * method leaves of stiff vibrations, however small beside its motion, is large beside that of a short step, which would
+ * resolve them. */
 static inline int even_out(const run_memory *run, const trial *now, int change)
 {
   const real left = MATH(fabs)((now->t_end - now->at.t) - now->at.t_low);
   const real size = size_of_level(run->grid_level + change);
   if (size * (1 + LAST_STEP) < left && left < size * (1 + SHORT_LAST))
-    while (change > -EVENED && 2 * size_of_level(run->grid_level + change - 1) >= left)
+    while (change > -LEVELS_PER_BINADE && 2 * size_of_level(run->grid_level + change - 1) >= left)
       change--;
   return change;
 }
+#else
+#define even_out(run, now, change) change
+#endif
 
 /* Lets Newton's method solve the next steps where the iteration, not the error, limits their size, if the error admits
  * steps so much larger that they take less time, and no longer than that. Asked after numbers of steps that are powers
@@ -843,8 +838,7 @@ static inline void choose_size(run_memory *run, const trial *now)
     change = (int)(run->failed - 1 - run->grid_level);
     is_limited = 1;
   }
-  change = levels_within(run, now, change);
-  change = EVENED ? even_out(run, now, change) : change;
+  change = even_out(run, now, levels_within(run, now, change));
   run->guess = now->guess;
   run->change_before = run->change;
   run->change = change;
