@@ -11,8 +11,23 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
+from scvi_codegen.codegen.options import (
+    ASSIGNMENTS,
+    COUNT,
+    EVENTS,
+    INPUTS,
+    METHOD,
+    NUMBER,
+    NUMBER_OR_NAMED,
+    NUMBERS,
+    NUMBERS_OR_NAME,
+    SIZES,
+    SWITCH,
+    Option,
+    check_agreement,
+)
 from scvi_codegen.common.atomic import NamedFile, naming_folders
-from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.common.errors import ModelFileError, SystemDefinitionError
 from scvi_codegen.common.toml_text import MAX_CHARACTERS
 from scvi_codegen.common.validation import ExactNumber
 from scvi_codegen.interfaces.cli.command_group import Command
@@ -20,23 +35,7 @@ from scvi_codegen.interfaces.models.model import Model
 from scvi_codegen.interfaces.models.model_files.entries import ROBOT_FILES
 from scvi_codegen.interfaces.models.model_files.model_file import catalogue_model, load_model, parse_model
 from scvi_codegen.interfaces.models.model_files.sections import event_entry
-from scvi_codegen.interfaces.models.options import (
-    ASSIGNMENTS,
-    COUNT,
-    EVENTS,
-    INPUTS,
-    METHOD,
-    METHOD_KEYS,
-    NUMBER,
-    NUMBER_OR_NAMED,
-    NUMBERS,
-    NUMBERS_OR_NAME,
-    OPTIONS,
-    SIZES,
-    SWITCH,
-    Option,
-    excluded,
-)
+from scvi_codegen.interfaces.models.options import METHOD_KEYS, OPTIONS, ROWS
 from scvi_codegen.interfaces.models.problems import PROBLEMS, problem
 from scvi_codegen.methods import ARGUMENTS, METHODS, size_of, specification_of
 
@@ -207,17 +206,14 @@ def model_arguments(*further: str, required: bool = True) -> Callable[[Command],
     return decorated
 
 
+def by_field(choices: Choices) -> dict[str, Any]:
+    """Return the options of the command line by field."""
+    return {option.field: choices.get(option.name) for option in OPTIONS}
+
+
 def check_exclusive(choices: Choices) -> None:
     """Reject options that exclude each other."""
-    names = [name for name, value in choices.items() if value is not None]
-    if pair := next(excluded(names, "initial", "run"), None):
-        raise click.UsageError(f"{pair[0].flag} and {pair[1].flag} exclude each other")
-
-
-def check_flag(option: Option, situation: str) -> None:
-    """Reject an option of the command line if it is not available in a situation."""
-    if situation in option.unavailable:
-        raise click.UsageError(f"{option.flag} is not available {situation}: {option.unavailable[situation]}")
+    check_agreement(by_field(choices), ModelFileError, rows=ROWS, partly=True)
 
 
 def _check_method(choices: Choices) -> None:

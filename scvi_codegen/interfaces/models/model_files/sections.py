@@ -7,20 +7,12 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import Any, Final, TypeVar
 
+from scvi_codegen.codegen.options import SWITCH, check_agreement
 from scvi_codegen.common.atomic import read_text
 from scvi_codegen.common.errors import ModelFileError, ScviCodegenError, closest
 from scvi_codegen.common.validation import FORMULA, checked_count, likely_names, synonym_hint
 from scvi_codegen.interfaces.models.model import DEFAULT_METHOD
-from scvi_codegen.interfaces.models.options import (
-    ALTERNATIVE_KEYS,
-    FIELDS,
-    KEYED,
-    STEP_KEYS,
-    SWITCH,
-    alternatives,
-    options_of,
-    real,
-)
+from scvi_codegen.interfaces.models.options import ALTERNATIVE_KEYS, KEYED, ROWS, options_of, real
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification, sized, specification_of
 from scvi_codegen.systems.event import Event
 from scvi_codegen.systems.first_order import FirstOrderSystem
@@ -239,14 +231,10 @@ class ModelSection:
 
 def read_run(section: Section) -> dict[str, Any]:
     """Return the fields of a model in ``[run]``; adaptive steps without a step size."""
-    section = {key: value for key, value in section.items() if value is not None}
-    for option, alternative in alternatives("run"):
-        check_one(section, "run", option.key, alternative.key)
-    if not STEP_KEYS & section.keys() and "steps" in section:
-        raise ModelFileError("[run] has steps but no step: give the step size")
-    fields = [option for option in options_of("run") if option in FIELDS and option.key in section]
-    numbers = {option.field: option.read(section[option.key], f"[run] {option.key}") for option in fields}
-    return {**numbers, **{name: section.get(name) for name in ("precision", "sums", "observe")}}
+    given = {option: section[option.key] for option in options_of("run") if section.get(option.key) is not None}
+    check_agreement({option.field: value for option, value in given.items()}, ModelFileError, rows=ROWS)
+    numbers = {option.field: option.checked(value, ModelFileError) for option, value in given.items()}
+    return {name: value for name, value in numbers.items() if name != "controller"}
 
 
 FORMULAS = ("lagrangian", "hamiltonian", "dissipation", "damping", "constraints")
