@@ -113,6 +113,15 @@ def without_modes(formula: Expr) -> Expr:
     return formula.xreplace(dict.fromkeys(formula.atoms(Mode), sympy.Integer(0)))
 
 
+def by_parity(x: Expr) -> Expr:
+    """Return rint(x) by one switching function, cos(pi x), with formulas that go on for half a unit beyond its zeros.
+
+    >>> by_parity(sympy.Symbol("x")).subs("x", sympy.Rational(12, 5))
+    2
+    """
+    return where(unit_step(sympy.cos(sympy.pi * x)), 2 * rint(x / 2), 2 * rint((x - 1) / 2) + 1)
+
+
 def wrap(x: Expr, length: Expr) -> Expr:
     """Return x - L rint(x / L), the number of smallest size that differs from x by a multiple of L."""
     return x - length * rint(x / length)
