@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import tomli_w
-from commands import error_of
+from commands import error_of, output_of
 
 import scvi_codegen as sc
 from scvi_codegen import Model, ModelFileError
@@ -214,6 +214,19 @@ def test_flags_of_commands_are_those_of_the_table():
     assert common | of_paths <= {each.name for each in path.params}
     assert common | of_families <= {each.name for each in family.params}
     assert not {option.name for option in OPTIONS if not option.common} & {each.name for each in derive.params}
+
+
+@pytest.mark.second
+def test_paths_and_families_ask_for_what_they_use_alone(tmp_path):
+    """A path has no initial velocity, a family no duration; the run of the same file lacks both."""
+    file = tmp_path / "pendulum.toml"
+    lines = {"system": {"name": "pendulum", "coordinates": ["q"], "lagrangian": "q_dot**2/2 + cos(q)"}}
+    file.write_text(tomli_w.dumps(lines | {"initial": {"q": [0.0]}, "method": {"method": "svi:2"}}))
+    assert "p or q_dot in [initial], no span or steps in [run]" in error_of("run", file)
+    assert "there is no span or steps in [run]" in error_of("path", file, "--to", 0.3, "--step", 0.1)
+    assert "there is no p or q_dot in [initial]" in error_of("family", file, "--period", 6.5)
+    output_of("path", file, "--from", 0.1, "--to", 0.3, "--span", 1, "--step", 0.25)
+    assert "2 periodic orbits" in output_of("family", file, "--amplitude", 0.1, "--count", 2)
 
 
 def test_page_of_model_files_has_the_table_of_options():

@@ -34,7 +34,7 @@ from scvi_codegen.interfaces.cli.command_group import Command
 from scvi_codegen.interfaces.models.model import Model
 from scvi_codegen.interfaces.models.model_files.entries import ROBOT_FILES
 from scvi_codegen.interfaces.models.model_files.model_file import catalogue_model, load_model, parse_model
-from scvi_codegen.interfaces.models.model_files.sections import event_entry
+from scvi_codegen.interfaces.models.model_files.sections import UNUSED, Unused, event_entry
 from scvi_codegen.interfaces.models.options import METHOD_KEYS, OPTIONS, ROWS
 from scvi_codegen.interfaces.models.problems import PROBLEMS, problem
 from scvi_codegen.methods import ARGUMENTS, METHODS, size_of, specification_of
@@ -234,11 +234,23 @@ def _check_method(choices: Choices) -> None:
             )
 
 
-def read_model(name: str, choices: Choices, steps: Mapping[str, float] | None = None) -> Model:
+def read_model(
+    name: str, choices: Choices, steps: Mapping[str, float] | None = None, unused: Unused | None = None
+) -> Model:
     """Return the model of a file, of standard input (``-``) or the catalogue, with the options of the command line.
 
-    ``steps``: entries of [run] that replace a step size, without which options of adaptive steps would be refused.
+    Args:
+        name: of the model.
+        choices: the options.
+        steps: entries of [run] that replace a step size, without which options of adaptive steps would be refused.
+        unused: required keys that a file may lack, of its sections.
     """
+    if unused is not None:
+        token = UNUSED.set(unused)
+        try:
+            return read_model(name, choices, steps)
+        finally:
+            UNUSED.reset(token)
     check_exclusive(choices)
     _check_method(choices)
     sections = sections_of(choices)

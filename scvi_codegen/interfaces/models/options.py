@@ -31,7 +31,7 @@ from scvi_codegen.codegen.options import (
     RunOptions,
     option,
 )
-from scvi_codegen.common.errors import ModelFileError
+from scvi_codegen.common.errors import ModelFileError, closest
 from scvi_codegen.common.validation import NUMERAL, ExactNumber
 from scvi_codegen.methods.controllers import CONTROLLERS, SYMPLECTIC
 
@@ -178,7 +178,7 @@ def checked_value(section: str, key: str, value: Any) -> Any:
     """Return a value of the section ``[path]`` or ``[family]``, or raise :class:`ModelFileError`."""
     options, where = {option.key: option for option in options_of(section)}, f"[{section}] {key}"
     if key not in options:
-        raise ModelFileError(f"there is no key {where}: use {', '.join(options)}")
+        raise ModelFileError(f"there is no key {where}{closest(key, options)} Known: {', '.join(options)}")
     if options[key].kind == NUMBERS:
         if not isinstance(value, list | tuple):
             raise ModelFileError(f"{where} must be a list of numbers, not {value!r}")

@@ -227,7 +227,9 @@ def _merged(document: Document, changes: Document, entry: Entry | None) -> tuple
         document = merged_sections(entry.motion, document)
     declared = {key.partition("[")[0]: key for key in document.get("parameters", {})}
     parameters = {declared.get(name, name): value for name, value in changes.get("parameters", {}).items()}
-    merged = merged_sections(document, {**changes, "parameters": parameters} if parameters else changes)
+    merged: dict[str, Section] = merged_sections(
+        document, {**changes, "parameters": parameters} if parameters else changes
+    )
     if entry is None:
         check_complete(merged)
         check_used(merged, changes.get("parameters", {}))

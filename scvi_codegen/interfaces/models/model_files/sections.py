@@ -2,7 +2,8 @@
 
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextvars import ContextVar
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any, Final, TypeVar
@@ -263,14 +264,27 @@ def is_number(value: Any) -> bool:
     return not isinstance(value, str | list | dict)
 
 
-def check_complete(document: Document) -> None:
-    """Raise an error that lists all missing keys; arrays whose sizes are names are at rest by default."""
-    missing = []
+Unused = Callable[[Document], Collection[str]]
+UNUSED: ContextVar[Unused] = ContextVar("unused", default=lambda document: ())
+"""Function of a document that returns the required keys that a command does not use."""
+
+
+def check_complete(document: dict[str, Section]) -> None:
+    """Raise an error that lists all missing keys; arrays whose sizes are names are at rest by default.
+
+    Keys that the command does not use get a value: a duration of 1, coordinates and velocities of 0.
+    """
+    missing, unused = [], UNUSED.get()(document)
     replaced = "system" if "field" in document else "field"
     for name, keys in REQUIRED.items():
         for key in () if name == replaced else keys:
             choice = next((choice for choice in ALTERNATIVES if key in choice), {key})
-            if choice.isdisjoint(document.get(name, {})) and not _is_optional(document, key):
+            if not choice.isdisjoint(section := document.get(name, {})) or _is_optional(document, key):
+                continue
+            if key in unused:
+                zeros = [0.0] * len(document.get("system", {}).get("coordinates", ()))
+                document[name] = {**section, key: 1.0 if key == "span" else zeros}
+            else:
                 missing.append(f"{' or '.join(sorted(choice))} in [{name}]")
     if missing == ["p or q_dot in [initial]"] and isinstance(read_system(document), FirstOrderSystem):
         return
