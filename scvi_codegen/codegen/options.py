@@ -209,7 +209,7 @@ class RunOptions:
         choices=("extremes", "energy"),
         common=False,
     )
-    span: float | None = option("run", NUMBER, "T", "Duration of the run.", determines=DURATION)
+    span: float | None = option("run", NUMBER, "T", "Duration of the run.", determines=DURATION, range=NOT_ZERO)
     steps: int | None = option(
         "run", COUNT, "N", "Number of steps, instead of --span.", determines=DURATION, requires=FIXED
     )
@@ -255,7 +255,7 @@ OPTION = {
     name: row.named(name)
     for name, row in (STATE_OPTIONS | {row.name: row.metadata["option"] for row in fields(RunOptions)}).items()
 }
-OPTION["t_end"] = replace(OPTION["span"], field="t_end")
+OPTION["t_end"] = replace(OPTION["span"], field="t_end", range=FINITE)
 """Options of runs by field of models and keyword of Python, whose runs end at a time instead of after a duration."""
 
 

@@ -136,9 +136,9 @@ def _in_flags(message: str, arguments: Sequence[str]) -> str:
     from scvi_codegen.codegen.options import METHOD
     from scvi_codegen.interfaces.models.options import OPTIONS
 
-    for option in OPTIONS:
-        if option.flag in flags and option.section:
-            key = "" if option.is_section or option.kind == METHOD else rf" {option.key}\b"
+    for option in reversed(OPTIONS):  # the name of a method last, whose section has other options
+        if option.section and not flags.isdisjoint(option.flag.split("/")):
+            key = "" if option.is_section else r"( method\b)?" if option.kind == METHOD else rf" {option.key}\b"
             message = re.sub(rf"\[{option.section}\]{key}", option.flag, message)
     return re.sub(r"(--[\w-]+) (?=[,.;:)])", r"\1", message)
 

@@ -35,9 +35,9 @@ from scvi_codegen.interfaces.models.model import Model
 from scvi_codegen.interfaces.models.model_files.entries import ROBOT_FILES
 from scvi_codegen.interfaces.models.model_files.model_file import catalogue_model, load_model, parse_model
 from scvi_codegen.interfaces.models.model_files.sections import UNUSED, Unused, event_entry
-from scvi_codegen.interfaces.models.options import METHOD_KEYS, OPTIONS, ROWS
+from scvi_codegen.interfaces.models.options import OPTIONS, ROWS
 from scvi_codegen.interfaces.models.problems import PROBLEMS, problem
-from scvi_codegen.methods import ARGUMENTS, METHODS, size_of, specification_of
+from scvi_codegen.methods import METHODS, size_of
 
 Choices = Mapping[str, Any]
 """Options of the command line that override MODEL, by name; ``None`` or an empty tuple for options that are absent."""
@@ -216,24 +216,6 @@ def check_exclusive(choices: Choices) -> None:
     check_agreement(by_field(choices), ModelFileError, rows=ROWS, partly=True)
 
 
-def _check_method(choices: Choices) -> None:
-    """Reject options that the chosen method does not take or that contradict the number in its name."""
-    method = choices.get("method")
-    if method is None:
-        return
-    message = specification_of(method)
-    taken, flags = ARGUMENTS[message["method"]], {option.name: option.flag for option in OPTIONS}
-    for option in METHOD_KEYS[1:]:
-        value = choices.get(option)
-        if value is not None and option not in taken:
-            takes = ", ".join(flags[key] for key in taken if key in METHOD_KEYS) or "no options"
-            raise click.UsageError(f"--method {method} takes no {flags[option]}; it takes {takes}")
-        if value is not None and message.get(option, value) != value:
-            raise click.UsageError(
-                f"--method {method} and {flags[option]} {value} contradict each other: leave one of them out"
-            )
-
-
 def read_model(
     name: str, choices: Choices, steps: Mapping[str, float] | None = None, unused: Unused | None = None
 ) -> Model:
@@ -252,7 +234,6 @@ def read_model(
         finally:
             UNUSED.reset(token)
     check_exclusive(choices)
-    _check_method(choices)
     sections = sections_of(choices)
     if steps:
         sections["run"] = {**sections.get("run", {}), **steps}

@@ -17,7 +17,15 @@ from scvi_codegen.common.display.cards import Html, card, listed, plain
 from scvi_codegen.common.errors import ArgumentError, ModelFileError, StateError, speaking
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import check_kind, keyword_hint
-from scvi_codegen.interfaces.models.options import FURTHER, RUN_FIELDS, STATE, checked_value, real, with_exact_numbers
+from scvi_codegen.interfaces.models.options import (
+    FURTHER,
+    ROWS,
+    RUN_FIELDS,
+    STATE,
+    checked_value,
+    real,
+    with_exact_numbers,
+)
 from scvi_codegen.interfaces.models.problems import Problem
 from scvi_codegen.interfaces.models.time_span import TimeSpan, check_length
 from scvi_codegen.methods import Method, as_method, default_method
@@ -152,7 +160,7 @@ class Model(TimeSpan):
         check_given(self, VELOCITY, ModelFileError)
         if self.threads is not None:
             raise ModelFileError(
-                "threads require arrays whose sizes are names, coordinates = ['q[N]']: omit threads (--threads)"
+                f"{ROWS['threads']} requires arrays whose sizes are names, coordinates = ['q[N]']: omit it"
             )
         for name in STATE.values():
             if (vector := getattr(self, name)) is not None:
@@ -499,8 +507,6 @@ class Model(TimeSpan):
 
     def _common(self, options: SolverOptions | None, threads: int | None) -> dict[str, Any]:
         options, threads = options or self.solver_options, threads or self.threads
-        if threads is not None and self.array_system is None:
-            raise ModelFileError("threads require arrays whose sizes are names, coordinates = ['q[N]']: omit threads")
         return {"options": options} if threads is None else {"options": options, "threads": threads}
 
     def _vector(self, name: str, values: Sequence[float]) -> tuple[float, ...]:

@@ -3,10 +3,9 @@
 The table of runs, and what follows from a row, is :mod:`scvi_codegen.codegen.options`.
 """
 
-import math
 from dataclasses import dataclass, fields
 from fractions import Fraction
-from numbers import Real
+from math import isfinite
 from typing import Any
 
 from scvi_codegen.codegen.options import (
@@ -21,6 +20,7 @@ from scvi_codegen.codegen.options import (
     NUMBER,
     NUMBERS,
     NUMBERS_OR_NAME,
+    OPTION,
     SIZES,
     STATE_OPTIONS,
     STEP_SIZE,
@@ -195,14 +195,9 @@ def checked_value(section: str, key: str, value: Any) -> Any:
 
 def real(value: Any, where: str) -> float:
     """Return a finite number, also an exact one, or raise an error that begins with ``where``."""
-    if isinstance(value, bool) or not isinstance(value, Real):
-        raise ModelFileError(f"{where} must be a number, not {value!r:.60}")
-    try:
-        number = value if isinstance(value, ExactNumber) else float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise ModelFileError(f"{where} is {number}: it must be a finite number")
+    if isinstance(value, ExactNumber) and isfinite(value):
+        return value
+    number: float = OPTION["t_end"].checked(value, ModelFileError, where)
     return number
 
 

@@ -7,7 +7,7 @@ from fractions import Fraction
 from typing import Any, Self
 
 from scvi_codegen.codegen.native.options import SolverOptions
-from scvi_codegen.codegen.options import DURATION, STEP_SIZE, check_agreement, check_given
+from scvi_codegen.codegen.options import DURATION, STEP_SIZE, check_agreement, check_given, in_words
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE
 from scvi_codegen.common.errors import MethodWarning, ModelFileError, warn
 from scvi_codegen.common.validation import LARGEST_COUNT
@@ -62,17 +62,10 @@ class TimeSpan(ModelOptions):
         for name, value in given.items():
             object.__setattr__(self, name, ROWS[name].checked(value, ModelFileError))
         check_given(self, DURATION, ModelFileError)
-        if self.h is None:
-            if self.span == 0.0:
-                raise ModelFileError("span is 0: it must be positive, or negative for a run backward in time")
-            return
-        if self.span is not None and not 0.0 < self.span / abs(self.h) <= LARGEST_COUNT:
-            backward = (
-                f"a run backward in time has a negative step, --step {-abs(self.h):g} --span {abs(self.span):g} "
-                f"(step = {-abs(self.h):g} and span = {abs(self.span):g} in files, h={-abs(self.h):g} in Python)"
-            )
-            remedy = backward if self.span < 0.0 else "give a positive span of less than 2^53 steps"
-            raise ModelFileError(f"span is {self.span:g} with a step size of {self.h:g}: {remedy}")
+        if None not in (self.h, self.span) and not 0.0 < self.span / abs(self.h) <= LARGEST_COUNT:  # type: ignore
+            backward = f"a run backward in time has {{h}} = {-abs(self.h):g} and {{t_end}} = {abs(self.span):g}"  # type: ignore
+            remedy = in_words(backward) if self.span < 0.0 else "give a positive one of less than 2^53 steps"  # type: ignore
+            raise ModelFileError(f"{ROWS['span']} = {self.span:g} with a step size of {self.h:g}: {remedy}")
 
     def _check_controller(self) -> None:
         """Raise an error if a controller of adaptive steps is given beside a step size."""

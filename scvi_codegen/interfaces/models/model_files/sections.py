@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import Any, Final, TypeVar
 
-from scvi_codegen.codegen.options import SWITCH, check_agreement
+from scvi_codegen.codegen.options import check_agreement
 from scvi_codegen.common.atomic import read_text
 from scvi_codegen.common.errors import ModelFileError, ScviCodegenError, closest
 from scvi_codegen.common.validation import FORMULA, checked_count, likely_names, synonym_hint
@@ -105,7 +105,7 @@ def _split_method_name(section: Section) -> Section:
     spelt = in_section("[method]", lambda: specification_of(name))
     for key, value in spelt.items():
         if key != "method" and section.get(key, value) != value:
-            raise ModelFileError(f"[method] method = {name!r} and {key} = {section[key]!r} contradict each other")
+            raise ModelFileError(f"[method] method = {name} and [method] {key} = {section[key]} contradict each other")
     return {**section, **spelt}
 
 
@@ -120,10 +120,6 @@ def _changed_method(base: Section, changes: Section) -> Section:
     if name != base_section.get("method"):
         accepted = ARGUMENTS.get(name, ())
         base_section = {key: value for key, value in base_section.items() if key in INHERITED and key in accepted}
-    for option in options_of("method"):  # a switch is named otherwise on the command line
-        if option.kind == SWITCH and option.key in changes and option.key not in ARGUMENTS.get(name, (option.key,)):
-            takers = " or ".join(other for other in ARGUMENTS if option.key in ARGUMENTS[other])
-            raise ModelFileError(f"{option.flag} is for the method {takers}, not for {name}: omit it")
     if {"abscissae", "space"} & changes.keys():
         base_section.pop("nodes", None)  # alternatives to nodes
     return sized({**base_section, **changes}) if "method" in changes else {**base_section, **changes}
@@ -145,10 +141,14 @@ def read_method(section: Section) -> Method:
     if "method" not in section:
         check_keys(section, dict.fromkeys(["method", *chain.from_iterable(ARGUMENTS.values())]), "key", "[method]")
     name = text_of(section, "method", "[method]")
-    if name in ARGUMENTS:
-        check_keys(section, ("method", *ARGUMENTS[name]), "key", f"[method] for {name}")
-    if not isinstance(section.get("variational", True), bool):
-        raise ModelFileError(f"[method] variational must be true or false, not {section['variational']!r}")
+    taken = ("method", *ARGUMENTS.get(name, section))
+    for option in options_of("method"):
+        if option.key in section:
+            option.checked(section[option.key], ModelFileError)
+            if option.key not in taken:
+                takes = ", ".join(row.word for row in options_of("method") if row.key in taken[1:]) or "no options"
+                raise ModelFileError(f"{option} is not for the method {name}, which takes {takes}: omit it")
+    check_keys(section, taken, "key", f"[method] for {name}")
     if not isinstance(section.get("abscissae", []), list | str):
         raise ModelFileError(f"[method] abscissae must be a list of numbers or a name, not {section['abscissae']!r}")
     return in_section("[method]", lambda: method_from_specification(section))
