@@ -278,16 +278,30 @@ static int NAME(call_parts)(NAME(call) *c, double t, double h, int by_newton, co
   return 0;
 }
 
+/* Length of a defect relative to the change of the state in its step. */
+static double NAME(call_defect_size)(const double *q, const double *p, const double *size, const double *defect)
+{
+  double change[2 * M];
+  for (int i = 0; i < M; i++)
+    change[i] = q[M + i] - q[i], change[M + i] = p[M + i] - p[i];
+  return NAME(relative_length)(2 * M, defect, size) / NAME(relative_length)(2 * M, change, size);
+}
+
 /* Defects of `count` + 1 states of another run at times t by one step phi of size h from each, which begins at the
  * curve of the last one. Where the iteration fails it is taken in `parts`; where that does not suffice, Newton's method
- * solves all further ones. 0: no number of parts resolves the step. */
+ * solves all further ones. 0: no number of parts resolves the step. Iterations leave limits[3] of the defect before. */
 int NAME(call_defects)(NAME(call) *c, long long count, const double *t, const double *h, const double *q,
     const double *p, const double *size, const double *limits, double *defects, int *parts)
 {
   int least = 1, by_newton = 0;
+  double expected = 0.0;
+  const NAME(options) exact = c->options ? *c->options : NAME(default_options)();
+  NAME(options) options = exact;
+  c->options = &options;
   NAME(start)(c->run, t[0], h[0], q, p);
   memset(defects, 0, sizeof(double) * (size_t)(count * 2 * M));
   for (long long k = 0; k < count; k++, q += M, p += M, defects += 2 * M) {
+    options.tolerance = fmax(exact.tolerance, limits[3] * expected);
     parts[k] = NAME(call_parts)(c, t[k], h[k], by_newton, q, p, size, limits, defects, &least);
     if (least > MOST_PARTS) {
       NAME(start)(c->run, t[k], h[k], q, p);
@@ -297,6 +311,7 @@ int NAME(call_defects)(NAME(call) *c, long long count, const double *t, const do
     }
     if (parts[k] < 0)
       return -parts[k];
+    expected = parts[k] == 0 ? 0.0 : NAME(call_defect_size)(q, p, size, defects);
     if (parts[k] == 0)
       NAME(start)(c->run, t[k], h[k], q + M, p + M);
   }

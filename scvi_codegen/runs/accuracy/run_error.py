@@ -74,6 +74,8 @@ CONVERGED = 1e-4
 Errors of orders r and R of one motion are d and about d^(R/r): a tenth of the defect where d is 10^(-r / (R - r)), and
 R - r is a quarter of r or more (``finer_method``).
 """
+PART_OF_DEFECT = 1e-4
+"""Of defects, which iterations of the finer method leave where no differences of its steps are taken."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -470,7 +472,8 @@ class _Replay:
         Steps are resolved where the error of the finer method's step is a tenth of the defect, or of rounding.
         """
         parts = [starts.part(k, k + MOST_STEPS) for k in range(0, len(starts.h), MOST_STEPS)]
-        limits, defects = np.array([CONVERGED, LOST, RESOLVED * self.u]), dict[int, Defects]()
+        left = 0.0 if self.linear is None else PART_OF_DEFECT
+        limits, defects = np.array([CONVERGED, LOST, RESOLVED * self.u, left]), dict[int, Defects]()
 
         def find(k: int, _: object = None) -> None:
             defects[k] = self.finer._defects(parts[k], parameters, self.size, limits)
