@@ -211,10 +211,14 @@ int NAME(call_pieces)(NAME(call) *c, long long count, const double *t, const dou
 #endif
 #define MOST_PARTS 16 /* of a step that the iteration does not solve, before Newton's method is loaded */
 
-/* Abscissae of the points at which a run keeps values of the last step; returns their number, 0: none. */
+#if defined(KEPT) && (defined(SUPPORT_SEPARABLE_ITERATION_H) || defined(SUPPORT_COUPLED_ITERATION_H))
+#define HAS_CURVES
+#endif
+
+/* Abscissae of the points at which a run keeps forces or velocities of the last step; returns their number, 0: none. */
 int NAME(call_abscissae)(double *abscissae)
 {
-#ifdef KEPT
+#ifdef HAS_CURVES
   for (int j = 0; j < KEPT; j++)
     abscissae[j] = VECTOR_ENTRY(ABSCISSA, j);
   return KEPT;
@@ -227,7 +231,7 @@ int NAME(call_abscissae)(double *abscissae)
 /* Copies these values, M of each point, of a step that the iteration solved; NaN: there are none. Returns the next. */
 static double *NAME(call_keep)(const NAME(run) *run, int parts, double *curve)
 {
-#ifdef KEPT
+#ifdef HAS_CURVES
   for (int i = 0; curve && i < M; i++)
     for (int j = 0; j < KEPT; j++)
       *curve++ = parts == 1 && run->guess > 0 ? run->memory[i * POINTS + j] : NAN;

@@ -250,7 +250,7 @@ def _iterating(stepper: Any, finer: Any) -> Any:
 
     Newton's method, which solves constraints and rotations, factorises the equations of each step for them.
     """
-    if stepper.constraints or stepper.interface.rotations or not len(finer._abscissae):
+    if stepper.constraints or stepper.interface.rotations:
         return None
     own = [] if stepper.interface.time_transformation is not None or stepper._lacks(Derivatives()) else [stepper]
     return next((of for of in (*own, finer) if of.tangent.constant("VECTORS_ITERATED")), None)

@@ -124,7 +124,7 @@ static int store_curve(const propagation *over, long long k, double *kept)
   const step_data step = step_of(over, k, nothing);
   double memory[M * POINTS];
   iteration_data data;
-  if (!all_finite(values, M * curves->count))
+  if (curves->count == 0 || !all_finite(values, M * curves->count))
     return 0;
   for (int i = 0; i < M; i++, values += curves->count)
     for (int n = 0; n < GROUPS; n++) {
@@ -144,9 +144,8 @@ static int store_steps(propagation *over, long long first, long long end)
   for (long long k = first; k < end; k++) {
     double *kept = stored_of(over, k - first);
     if (over->curves && store_curve(over, k, kept))
-      continue;
-    over->guess = over->curves ? 0 : over->guess;
-    if (!solve_and_store(over, k, kept))
+      over->guess = 0;
+    else if (!solve_and_store(over, k, kept))
       return 0;
   }
   return 1;
@@ -250,7 +249,7 @@ int NAME(transport_errors)(long long steps, const real *t, const real *h, const 
     int count, double left, double rounding, unsigned long long seed, const real *defects, real *vectors,
     long long stride, real *errors, real *deviations, solver_report *report, real *workspace)
 {
-  lanes table[points * GROUPS];
+  lanes table[(points + 1) * GROUPS];
   const stored_curves stored = {points, curves, table};
   error_vectors all = {count, STEP_INPUTS, rounding, seed, defects, stride, errors, deviations};
   propagation over = {PROPAGATION_OF_ARGUMENTS, .accepted = left * left, .count = count, .errors = &all,
