@@ -42,7 +42,7 @@ from scvi_codegen.methods import (
     sliding,
 )
 from scvi_codegen.methods.method import Method
-from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
+from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.systems.checks.unlocated_kinks import warn_of_formulas
 from scvi_codegen.systems.contact import ContactLike
@@ -238,6 +238,8 @@ def _compile_arrays(
     looser: Once[Stepper] | None,
 ) -> Stepper:
     """Return the stepper of arrays whose sizes each run determines; ``common``: further arguments."""
+    from scvi_codegen.runs.array_stepper import StepperOfRunTimeSizes
+
     if precision == AUTO:
         raise MethodError(f"precision='auto' is not available with arrays of run-time sizes: {SIZES_REQUIRED}")
     if symmetries:
