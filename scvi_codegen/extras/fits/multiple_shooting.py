@@ -154,7 +154,7 @@ class Chain:
     def _part(self, j: int, x: Array) -> tuple[Array, Array, Array, Array]:
         """Return the computed measurements and the end of segment j, each with derivatives by all unknowns."""
         part, values, size = self.parts[j], self.values(x), self.state
-        tangents = np.zeros((len(x), part.stepper._input_size))
+        tangents = np.zeros((len(x), part.stepper.products.tangents))
         tangents[np.arange(len(self.unknown_indices)), self.unknown_indices] = 1.0
         start = values[:size]
         if j > 0:
@@ -190,7 +190,7 @@ def _node_states_from_guess(parts: Sequence[Measurements], prior: Array) -> Arra
     size = 2 * parts[0].stepper.dimension
     state, states = prior[:size], []
     for part in parts[:-1]:
-        state = part.motion(state, np.zeros((0, part.stepper._input_size)), prior[size:])[2]
+        state = part.motion(state, np.zeros((0, part.stepper.products.tangents)), prior[size:])[2]
         states.append(state)
     return np.array(states).reshape(-1, size)
 
@@ -217,7 +217,7 @@ def _sizes(parts: Sequence[Measurements], prior: Array, nodes: Array) -> Array:
     size = nodes.shape[1]
     states = np.concatenate([prior[np.newaxis, :size], nodes])
     if len(states) == 1:
-        end = parts[0].motion(prior[:size], np.zeros((0, parts[0].stepper._input_size)), prior[size:])[2]
+        end = parts[0].motion(prior[:size], np.zeros((0, parts[0].stepper.products.tangents)), prior[size:])[2]
         states = np.stack([states[0], end])
     kinds = np.ptp(states, axis=0).reshape(2, -1)
     largest = kinds.max(axis=1, keepdims=True)

@@ -102,10 +102,7 @@ def equilibrium(stepper: Stepper, q: ArrayLike, *, t: float = 0.0, parameters: P
     stepper = stepper.bind(q, parameters)[0]._known_with_events
     stepper.products.require("periodic_orbit")
     stepper.products.check_given(parameters, step=True)
-    values, rest = stepper._parameters(parameters), np.zeros(stepper.dimension)
-    positions, _, velocity = stepper._states.start(q, None, rest)
-    momenta = stepper._initial_momenta(positions, None, velocity, t, values)
-    state = np.concatenate(stepper._states.pair(positions, momenta))
+    state, values = stepper.products.start(q, None, np.zeros(stepper.dimension), t, parameters)
     reduction = reduction_of(stepper, t, values)
     guess = state
     state = np.ravel(reduction.normalised(*np.split(state, 2)))
@@ -166,7 +163,7 @@ class _Motion:
 
     def step(self, state: Array) -> tuple[Array, Array]:
         """Return the change of a state by a step and the derivative of the step."""
-        tangents = np.zeros((len(state), self.stepper._input_size))
+        tangents = np.zeros((len(state), self.stepper.products.tangents))
         tangents[:, : len(state)] = np.eye(len(state))
         at = np.array([self.t]), np.array([self.h]), tangents, self.parameters
         states, vectors, _ = tangents_along(self.stepper, state, *at)

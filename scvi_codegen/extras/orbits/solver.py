@@ -398,7 +398,6 @@ def periodic_orbit(
         StepFailedError: if a step from the initial guess fails.
     """
     stepper = stepper.bind(q, parameters)[0]._known_with_events
-    q, p, velocity = stepper._states.start(q, p, velocity)
     stepper.products.require("periodic_orbit")
     stepper.products.check_given(parameters)
     if energy is not None:
@@ -410,9 +409,8 @@ def periodic_orbit(
         raise StateError(f"max_step={max_step:g} requires adaptive steps: omit it, or steps and h")
     if sequence is None:
         stepper.products.require("adaptive")
-    t, values = checked_number(t, "the time t"), stepper._parameters(parameters)
-    momenta = stepper._initial_momenta(q, p, velocity, t, values)
-    start = np.concatenate(stepper._states.pair(q, momenta))
+    t = checked_number(t, "the time t")
+    start, values = stepper.products.start(q, p, velocity, t, parameters)
     search = OrbitSearch.at(
         stepper,
         start[: stepper.dimension],
@@ -464,7 +462,7 @@ def gains_of(stepper: Stepper, gain: ArrayLike | Sequence[float | None] | None) 
         if len(stepper.interface.constraints) > stepper.interface.masked:
             raise StateError("a gain of None requires a system without constraints: give its number")
         entries = [0.0 if entry is None else entry for entry in entries]
-    return {"gain": stepper._states.vector(entries, "gain"), "drifts": drifts}
+    return {"gain": stepper.products.states.vector(entries, "gain"), "drifts": drifts}
 
 
 def _equal_steps(period: float, steps: int | None, h: float | None) -> StepSequence | None:
@@ -577,7 +575,7 @@ class OrbitSearch:
         """Return the distance of mirror images of states from steps back to them, relative to the motion."""
         assert self.reversor is not None
         search = self if self.sequence is not None else self.adapted(z, TOLERANCES[0] * ERROR)
-        at: Any = np.zeros((0, self.stepper._input_size)), self.parameters, self.options
+        at: Any = np.zeros((0, self.stepper.products.tangents)), self.parameters, self.options
         times = z[-1] * search.steps.ends
         states = tangents_along(self.stepper, z[:-1], self.t + times[:-1], np.diff(times), *at)[0]
         images, away = self.reversor(states), []
@@ -956,7 +954,7 @@ class OrbitSearch:
         size, ends, widths = self.reduction.size, steps.ends[first : last + 1], steps.widths[first:last]
         space = self.reduction.at(self.t + period * float(ends[0]), self.parameters)
         inward, shift = space.inward(*np.split(start, 2)), np.zeros(len(start))
-        tangents = np.zeros((size + 2 + (self.varied is not None), self.stepper._input_size))
+        tangents = np.zeros((size + 2 + (self.varied is not None), self.stepper.products.tangents))
         tangents[:size, : len(start)] = inward.T
         if self.varied is not None:
             tangents[-1, len(start) + self.varied] = 1.0
