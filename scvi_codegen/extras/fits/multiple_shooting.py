@@ -31,8 +31,8 @@ NEAR = 1e-5
 """Jumps and changes below which full steps are taken, as rounding hides the descent."""
 SMALL = 1e-6
 """Residuals, relative to the measurements, below which the fit counts as exact."""
-BOUNDED, RELEASED = 8, 1e-9
-"""Limits of the active-set iteration: base number of updates, and gradient (relative) that releases a bound."""
+BOUNDED = 8
+"""Base number of updates of the active-set iteration, whose bounds a gradient above ``SETTLED`` releases."""
 GAUGE = 1e3
 """Weight of the equations that fix the lengths of quaternions, relative to that of a measurement."""
 PARABOLA_NEIGHBOURS = 3
@@ -271,7 +271,7 @@ def _bounded_update(
         predicted = residuals[:rows] + jacobian[:rows] @ update
         uphill = jacobian[:rows].T @ predicted - jacobian[rows:].T @ multipliers
         inward = np.where(at_bound, np.where(update <= low, -uphill, uphill), 0.0)
-        if not (inward > RELEASED * np.abs(uphill).max(initial=0.0)).any():
+        if not (inward > SETTLED * np.abs(uphill).max(initial=0.0)).any():
             break
         at_bound[int(np.argmax(inward))] = False
     return update, multipliers, at_bound

@@ -21,7 +21,7 @@ from scvi_codegen.extras.paths import solver
 from scvi_codegen.extras.paths.discretisation import Discretisation, discretisation_of, kinetic_energy_is_positive
 from scvi_codegen.extras.paths.equations import Band, condensed_hessian, hessian_blocks, negative_pivots
 from scvi_codegen.extras.paths.intervals import Intervals, ManyCoordinates, ReducedIntervals
-from scvi_codegen.extras.paths.size import largest_range, size_for_updates
+from scvi_codegen.extras.paths.size import SAME, largest_range, size_for_updates
 from scvi_codegen.extras.paths.starts import curves_around, curves_at_random
 
 if TYPE_CHECKING:
@@ -31,10 +31,10 @@ MANY_COORDINATES = 48
 """Number of coordinates from which derivatives are computed as sparse matrices."""
 RANDOM_STARTS, FEW_ITERATIONS, SAME_PATH, MOST_REVOLUTIONS = 10, 25, 1e-6, 10**6
 """Number of starts at random and of their iterations, relative distance of equal paths, and most revolutions."""
+MOST_REPETITIONS = 1000
+"""Longest period of a closed path in multiples of T."""
 TOLERABLE_ERROR = 1e-3
 """Largest discretisation error without a warning."""
-SAME_MATRIX, MOST_REPETITIONS = 1e-9, 1000
-"""Distance of equal symmetries of closed paths, and the longest period in multiples of T."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -510,7 +510,7 @@ def _symmetry(interface: Any, closed: Any) -> Array:
             M[row, names.index(name)] = -1.0 if entry.startswith("-") else 1.0
         return M
     M = real_array(closed, "closed")
-    if M.shape != (m, m) or np.abs(M @ M.T - np.eye(m)).max(initial=0.0) > SAME_MATRIX:
+    if M.shape != (m, m) or np.abs(M @ M.T - np.eye(m)).max(initial=0.0) > SAME:
         raise StateError(
             f"closed must be True, the names of the {m} coordinates that follow after T, or an orthogonal matrix "
             f"({m}, {m})"
@@ -522,7 +522,7 @@ def _order(M: Array) -> int:
     """Return the least n with M^n = 1, 0 if there is none up to ``MOST_REPETITIONS``."""
     power = M
     for n in range(1, MOST_REPETITIONS + 1):
-        if np.abs(power - np.eye(len(M))).max() < SAME_MATRIX * n:
+        if np.abs(power - np.eye(len(M))).max() < SAME * n:
             return n
         power = power @ M
     return 0
