@@ -44,10 +44,9 @@ from scvi_codegen.methods import (
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.compiled_method import Variants
-from scvi_codegen.systems.checks.unlocated_kinks import warn_of_formulas
 from scvi_codegen.systems.contact import ContactLike
 from scvi_codegen.systems.contacts.rows import ContactRows
-from scvi_codegen.systems.event import Event, EventLike, as_events
+from scvi_codegen.systems.event import Event, EventLike, as_events, warn_of_formulas
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
 from scvi_codegen.systems.system import MechanicalSystem
 
