@@ -45,6 +45,13 @@ each."""
 _builds = itertools.count()
 
 
+def label_of(method: str | Method) -> str:
+    """Return a method as records and users write it: ``svi:8``."""
+    if isinstance(method, str):
+        return method
+    return f"svi:{method.degree}" if isinstance(method, SVI) and method == SVI(method.degree) else method.name
+
+
 def our_contenders(case: Case, *, methods: Iterable[Method] = (), quick: bool = False) -> list[Contender]:
     """Return contenders for every method at every recommended step size.
 
@@ -60,7 +67,7 @@ def our_contenders(case: Case, *, methods: Iterable[Method] = (), quick: bool = 
         options = f"{stepper.title}, solver auto, {' '.join(stepper.flags)}"
         for count, setting in _settings(case, method, np.hstack([case.q[:1], momenta[:1]]), quick).items():
             prepare = partial(_fixed, stepper, case, momenta, count)
-            result.append(Contender(f"{OURS} {method.name}", setting, options, seconds, prepare, momenta))
+            result.append(Contender(f"{OURS} {label_of(method)}", setting, options, seconds, prepare, momenta))
     return result
 
 
@@ -71,7 +78,7 @@ def fixed_contenders(case: Case, counts: Mapping[str | Method, Iterable[int]]) -
         stepper, seconds = compiled(case.system, method)
         momenta = momenta_of(stepper, case) if case.arrays is None and not case.system.constraints else None
         for steps in numbers:
-            prepare, name = partial(_fixed, stepper, case, momenta, steps), getattr(method, "name", method)
+            prepare, name = partial(_fixed, stepper, case, momenta, steps), label_of(method)
             setting, starts = f"h={case.span / steps:.4g}", len(case.q)
             result.append(Contender(f"{OURS} {name}", setting, "", seconds, prepare, momenta, starts=starts))
     return result

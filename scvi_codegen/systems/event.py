@@ -66,9 +66,10 @@ PASSED = (
     "sign more often than the search sees. Limit the steps by max_step= (or h=)"
 )
 SLIDING = (
-    "the motion slides on {function} = 0 at t = {t:.17g}: the forces on both sides of this jump point to it (dry "
-    "friction, a relay). Use sc.friction(..), for forces along a slip also a method by its name ('svi:4'), or a smooth "
-    "force such as tanh(u/width), or end the run there"
+    "the motion slides on {function} = 0 at t = {t:.17g}: the forces on both sides of this jump point to it (a relay). "
+    "It sticks there, by an svi: without quadrature=, if the jump is friction: -2*F*d(slip)/d(velocity) in the force "
+    "of each velocity, the reaction too, F >= 0 at all states. Write it so, as sc.friction(slip, limit=F), or as a "
+    "smooth force such as tanh(u/width), or end the run there"
 )
 CORNER = (
     "the motion rests in the corner {function} = 0 at t = {t:.17g}: the forces on both sides point to it and balance "

@@ -5,6 +5,10 @@ A function ``unit_step(u)`` of a system, of which positive_part, abs, sign, min,
 Runs that locate the zeros of u set it to +-2^1000, so that all points of a step are on one side (hybrid systems with
 located transitions, E. Hairer & G. Wanner, Solving Ordinary Differential Equations I, II.6; E. Eich-Soellner &
 C. Fuehrer, Numerical Methods in Multibody Dynamics, 6).
+
+A whole number changes between even and odd where cos(pi x) is 0, and either formula goes on for half a unit beyond:
+
+    rint(x) = 2 rint(x/2) where cos(pi x) >= 0, else 2 rint((x - 1)/2) + 1
 """
 
 from __future__ import annotations
@@ -15,11 +19,11 @@ from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.common.errors import MethodError
-from scvi_codegen.systems.checks.continuity import MOST_SURFACES, jump_message, jumps_of
+from scvi_codegen.systems.checks.continuity import MOST_SURFACES, changes_with, jump_message, jumps_of
 from scvi_codegen.systems.event import Kink, Refraction
 from scvi_codegen.systems.formulas.expressions import parts_of_type
 from scvi_codegen.systems.formulas.intermediates import LONGEST_WRITTEN, parts, written_size
-from scvi_codegen.systems.formulas.kinks import Mode, steps_on_sides, switching_function, unit_step
+from scvi_codegen.systems.formulas.kinks import Mode, by_parity, rint, steps_on_sides, switching_function, unit_step
 from scvi_codegen.systems.formulas.tables import without_tables
 
 if TYPE_CHECKING:
@@ -42,6 +46,8 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
 
     owned = [field.name for field in fields(system) if field.name in FORMULAS]
     formulas = [formula for name in owned for formula in _formulas(getattr(system, name))]
+    parities = _parities(formulas, system)
+    formulas = [formula.xreplace(parities) for formula in formulas]
     formulas += [part for reaction in system.reactions for part in reaction.direction]  # of friction
     steps = sorted(parts_of_type(unit_step, *formulas), key=str)
     powers = _vanishing_powers(formulas)
@@ -59,7 +65,7 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
     jumps = set(_jumps(system))
     jumps = arguments if jumps and len(arguments) > MOST_SURFACES else jumps
     with_modes = copy.copy(system)  # not made anew, as it would be checked again
-    changes: dict[str, Any] = {name: _replaced(getattr(system, name), rules) for name in owned}
+    changes: dict[str, Any] = {name: _replaced(_replaced(getattr(system, name), parities), rules) for name in owned}
     changes["reactions"] = tuple(
         replace(reaction, direction=_replaced(reaction.direction, rules)) for reaction in system.reactions
     )
@@ -75,6 +81,20 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
         )
         for u, mode in modes.items()
     )
+
+
+def _parities(formulas: Iterable[Expr], system: MechanicalSystem) -> dict[Expr, Expr]:
+    """Return each rint(x) by its parity where a formula is not the same function on both sides of a change.
+
+    Images of particles in a periodic box, whose forces end before, have no such change.
+    """
+    wholes = [part for part in parts_of_type(rint, *formulas) if _moves(part, system)]
+    wholes = [part for part in wholes if not parts_of_type(rint, part.args[0]) and _is_written(part)]
+    if system.lengths or len(wholes) > MOST_KINKS:
+        return {}
+    moving = {*system.coordinates, *system.velocities, *system.auxiliaries, system.time}
+    changing = [n for n in wholes if any(changes_with(n, f, moving, system.constants) for f in formulas)]
+    return {n: by_parity(n.args[0]) for n in changing}
 
 
 def _jumps(system: MechanicalSystem) -> dict[Expr, Expr]:

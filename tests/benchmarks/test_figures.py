@@ -6,6 +6,9 @@ import json
 import pytest
 import remake_figures as figures
 
+from benchmarks.contenders.ours import label_of
+from scvi_codegen import SVI
+
 RECORD = json.loads(figures.RECORD.read_text(encoding="utf-8"))
 
 
@@ -26,3 +29,7 @@ def test_another_measurement_changes_the_pages(page):
     written = figures.PAGES[page](text, record)
     assert written != text
     assert figures.PAGES[page](written, RECORD) == text
+
+
+def test_reports_name_the_method_as_the_record_does():
+    assert f"{figures.OURS} {label_of(SVI(8))}" == figures.METHOD

@@ -1,8 +1,9 @@
-"""Motions with kinks: random cases of nine families, and their motion by DOP853, restarted at each kink.
+"""Motions with kinks: random cases of ten families, and their motion by DOP853, restarted at each kink.
 
-A kink is the zero of a switching function, the argument of ``positive_part`` or ``unit_step``. Between two of them the
-equations are those of one mode, smooth beyond the zeros too. Zeros are bracketed on the polynomials of steps and found
-by Newton's iteration with steps that end there. Motions have units and an origin of their own; cases have others.
+A kink is the zero of a switching function, the argument of ``positive_part`` or ``unit_step``, or x - 1/2 - n of
+``rint(x)``. Between two of them the equations are those of one mode, smooth beyond the zeros too. Zeros are bracketed
+on the polynomials of steps and found by Newton's iteration with steps that end there. Motions have units and an origin
+of their own; cases have others.
 """
 
 import math
@@ -236,6 +237,19 @@ def drag(random):
     return Motion(values, [x], [v], u(3, 10), rate, *laws)
 
 
+def cogs(random):
+    """A driven mass that is drawn to the nearest of equidistant places, also from between two of them."""
+    u, edges = numbers(random), np.arange(-40, 40) + 0.5
+    k, f, w = 10.0 ** u(-1, 1.5), u(0.1, 2.0), u(0.5, 3.0)
+    x, v = random.choice([(0.0, u(0.5, 3)), (u(-3, 3), 0.0), (0.5, u(0.2, 2)), (-1.5, u(-2, -0.2))])
+    laws = (
+        lambda t, q, v, on: (f * math.cos(w * t) - 2 * k * (q[0] - (sum(on) - len(edges) / 2)),),
+        lambda t, q, v: [q[0] - edge for edge in edges],
+    )
+    values = {"k": k, "f": f, "w": w, "a": 1.0, "t0": 0.0}
+    return Motion(values, [x], [v], u(2, 8), w + math.sqrt(2 * k), *laws)
+
+
 TABLES = {
     "F": Table([-1.5, -0.8, -0.3, 0.4, 0.9, 1.6], [1.1, 0.2, -0.4, 0.5, 0.3, 1.4], degree=3, outside="linear"),
     "G": Table(
@@ -294,6 +308,7 @@ FAMILIES = {
     "ramp": Family("x", PUSHED, {"x": "r*(positive_part(t - t1) - positive_part(t - t2)) - d*x_dot"}, ramp),
     "relay": Family("x", PUSHED, {"x": "f*(1 - 2*unit_step(x - o)) + c"}, relay),
     "drag": Family("x", PUSHED, {"x": "f*cos(w*(t - t0)) - e*x_dot*abs(x_dot)"}, drag),
+    "cogs": Family("x", "m*x_dot**2/2 - k*wrap(x - o, a)**2", {"x": "f*cos(w*(t - t0))"}, cogs),
     "tables": Family(
         "x y", f"{PLANE} - j*((x - o)**2 + (y - o)**2)/2 - f*a*(F((x - o)/a) + G((x - o)/a, (y - o)/a))",
         {}, tables, TABLES,

@@ -1,4 +1,4 @@
-"""Runs across kinks against DOP853 restarted at each of them: nine families of random cases.
+"""Runs across kinks against DOP853 restarted at each of them: ten families of random cases.
 
 Default and given tolerances, output times and dense output, orders of fixed steps, and ``error=``
 (``tools/kinks.py``, which prints a table of all); bits of restored runs and of ensembles; derivatives.

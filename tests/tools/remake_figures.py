@@ -38,8 +38,8 @@ TITLES = {
 
 def recorded_case(case: dict[str, Any]) -> dict[str, float] | None:
     """Return what is recorded of a case of a report: the common error, milliseconds there and ratios of heyoka."""
-    row = next((row for row in case["rows"] if row["method"] == METHOD), None)
-    if row is None or row["default"] is None:
+    row = next(row for row in case["rows"] if row["method"] == METHOD)
+    if row["default"] is None:
         return None
     figures = {"error": row["at_error"], "ms": 1e3 * row["seconds"], "default": row["default"], "best": row["best"]}
     return {key: float(f"{value:.3g}") for key, value in figures.items()}

@@ -14,6 +14,7 @@ force is not Lipschitz continuous if its difference quotients on one side grow w
 
 import random
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from contextlib import suppress
 from itertools import islice
 
 import sympy
@@ -33,6 +34,8 @@ APART = (mp.mpf(10) ** -16, mp.mpf(10) ** -24)
 """Distances of the two sides, relative to the coordinate."""
 NEAR = (mp.mpf(10) ** -8, *APART)
 """Distances from a surface at which difference quotients are compared."""
+BESIDE = mp.mpf(10) ** -3
+"""Distance from an edge at which functions of both of its sides are compared: any but 0 would do."""
 VANISHING = mp.mpf(10) ** -28
 """Size of a difference relative to the values, below which it is a rounding error."""
 
@@ -118,6 +121,23 @@ def kink_in_velocities(formula: Expr, velocities: Iterable[Symbol]) -> tuple[Exp
     """Return a function u of velocities and a term of a formula that has a kink where u is 0; ``None`` without any."""
     surfaces = _surfaces(formula, set(velocities))
     return next(((surface, term) for surface, term, _ in surfaces), None)
+
+
+def changes_with(whole: Expr, formula: Expr, moving: Set[Symbol], constants: Mapping[Symbol, float]) -> bool:
+    """Return whether a formula is another function beyond a place where a whole number rint(x) in it changes.
+
+    Both functions are analytic near it, unless other kinks are there, too: they are the same if they agree at points.
+    """
+    n = sympy.Dummy("n", real=True)
+    near = formula.xreplace({whole: n})
+    beyond = near.xreplace({n: n + 1}) - near
+    edges = _tapes([near, beyond], whole.args[0] - n - sympy.S.Half, moving, {**constants, n: 1.0})
+    for tape, point, k in islice(edges, POINTS) if n in near.free_symbols else ():
+        with suppress(ArithmeticError):
+            size, change = tape(_moved(point, k, BESIDE))
+            if abs(change) > VANISHING * (1 + abs(size)):
+                return True
+    return False
 
 
 def _surfaces(formula: Expr, moving: Set[Symbol]) -> Iterator[tuple[Expr, Expr, Expr]]:

@@ -80,17 +80,27 @@ class Mode(sympy.Symbol):  # type: ignore[misc]
     """Mode in unit_step(u + mode): 0, or beyond all values of u (:mod:`scvi_codegen.systems.kinks`)."""
 
 
+ODD_INCREASING = (sympy.sinh, sympy.asinh, sympy.tanh, sympy.atan)
+
+
 @lru_cache(maxsize=4096)
 def switching_function(u: Expr) -> tuple[Expr, int]:
     """Return a switching function without constant factor, and the sign 1 or -1 of the factor that was left out.
 
+    Odd powers and odd increasing functions of u have the zeros and signs of u.
+
     >>> from sympy.abc import x
-    >>> switching_function(2 - 2 * x), switching_function(sympy.pi * x)
-    ((x - 1, -1), (x, 1))
+    >>> switching_function(2 - 2 * x), switching_function(sympy.pi * x**3), switching_function(sympy.tanh(x))
+    ((x - 1, -1), (x, 1), (x, 1))
     """
     sign, factors = 1, []
     for factor in Mul.make_args(u.primitive()[1]):
         if factor.is_positive and factor.is_number:
+            continue
+        if isinstance(factor, ODD_INCREASING) or (factor.is_Pow and factor.exp.is_odd and factor.exp.is_positive):
+            argument, orientation = switching_function(factor.args[0])
+            sign *= orientation
+            factors.append(argument)
             continue
         if factor.is_number and factor.is_negative:
             sign = -sign
@@ -111,6 +121,15 @@ def steps_on_sides(steps: Iterable[Expr], modes: Mapping[Expr, Expr]) -> dict[Ex
 def without_modes(formula: Expr) -> Expr:
     """Return a formula with unit_step(u) in place of unit_step(u + mode)."""
     return formula.xreplace(dict.fromkeys(formula.atoms(Mode), sympy.Integer(0)))
+
+
+def by_parity(x: Expr) -> Expr:
+    """Return rint(x) by one switching function, cos(pi x), with formulas that go on for half a unit beyond its zeros.
+
+    >>> by_parity(sympy.Symbol("x")).subs("x", sympy.Rational(12, 5))
+    2
+    """
+    return where(unit_step(sympy.cos(sympy.pi * x)), 2 * rint(x / 2), 2 * rint((x - 1) / 2) + 1)
 
 
 def wrap(x: Expr, length: Expr) -> Expr:
