@@ -80,7 +80,7 @@ def test_what_iterations_leave_does_not_grow_at_pericentres():
 
 @pytest.mark.parametrize("method", ["svi:4", "svi:8"])
 def test_saving_seldom_and_output_times_do_not_change_the_errors(method):
-    """Random orbits, tolerances and directions, up to the error of the finer method's steps; in ensembles, too."""
+    """Random orbits, tolerances and directions, up to errors and roundings of the finer steps; in ensembles, too."""
     random = np.random.default_rng(5)
     for _ in range(3):
         start, tolerance = start_of(random.uniform(0.3, 0.7)), 10.0 ** random.uniform(-9.0, -7.0)
@@ -89,7 +89,7 @@ def test_saving_seldom_and_output_times_do_not_change_the_errors(method):
         late = {**end, "t_eval": [0.2 * end["t_end"], end["t_end"]]}
         runs.append(kepler(method).integrate(**start, **late))
         ends = np.array([np.r_[run.error.q[-1], run.error.p[-1]] for run in runs])
-        assert np.abs(ends - ends[0]).max() <= 3e-4 * np.abs(ends).max(), tolerance
+        assert np.abs(ends - ends[0]).max() <= 3e-4 * np.abs(ends).max() + 200.0 * np.finfo(float).eps, tolerance
         assert runs[-1].error.q[0].any()  # the error since the initial state, which is not among the times
     two = {"q": [start["q"]] * 2, "velocity": [start["velocity"]] * 2, "parameters": start["parameters"]}
     member = kepler(method).integrate_ensemble(**two, **late)[1]
