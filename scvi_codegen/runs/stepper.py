@@ -542,11 +542,9 @@ class Stepper(OfSteppers, Integrator):
             StateError: if a shape, name or number is invalid.
             MethodError: if the method has no trajectories in SIMD lanes, for ``observe`` and single precision.
         """
-        times: Any = {"h": h, "steps": steps, "t_end": t_end, "save_every": save_every, "t": t, "t_eval": t_eval}
-        times |= {"max_step": max_step, "first_step": first_step, "options": options}
-        errors: Any = {"tolerance": tolerance, "absolute_tolerance": absolute_tolerance, "error": error}
-        others: Any = {"inputs": inputs, "parameters": parameters, "seed": seed, "metropolis": metropolis}
-        settings = times | errors | others | {"observe": observe, "precision": precision}
+        from scvi_codegen.runs.ensembles.ensemble import EnsembleSettings
+
+        settings = {name: value for name, value in locals().items() if name in EnsembleSettings.__dataclass_fields__}
         runs = self.products.ensemble_runs(q, p, settings, velocity=velocity, action=action)
         runs.run(progress=progress, threads=threads)
         return self.products.ensemble_result(runs)

@@ -55,7 +55,7 @@ def family(model_name: str, resume: str | None, output: str | None, plot: str | 
         raise ModelFileError(f"orbits of a family are saved as .npz, not as '{output}'")
     if plot is not None:
         check_picture(plot)
-    model = read_model(model_name, choices).with_known_sizes("family")
+    model = read_model(model_name, choices, unused=_unused).with_known_sizes("family")
     with progress_bar(model.family.get("count", COUNT), "orbits") as progress:
         members = _members(model, resume, progress)
     tell(_described(members), **_numbers(members))
@@ -66,6 +66,12 @@ def family(model_name: str, resume: str | None, output: str | None, plot: str | 
             tell(f"wrote {target}")
     if written := [target for target in (output, plot, page) if target]:
         tell(written=written)
+
+
+def _unused(document: Any) -> tuple[str, ...]:
+    """Return what families do not use: a duration, and near an equilibrium a velocity."""
+    settings = document.get("family", {})
+    return ("span", "q_dot") if "amplitude" in settings and "period" not in settings else ("span",)
 
 
 def _check_resumed(context: click.Context) -> None:
