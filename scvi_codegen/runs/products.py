@@ -32,7 +32,7 @@ from scvi_codegen.runs.ensembles.lanes import CommonRuns, LaneRuns
 from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
 from scvi_codegen.runs.ensembles.schedule import CommonSteps
 from scvi_codegen.runs.events.saltation import check_sides
-from scvi_codegen.runs.states.layout import InitialData, StateLayout
+from scvi_codegen.runs.states.layout import InitialData
 from scvi_codegen.runs.states.reduction import Reduction
 from scvi_codegen.runs.states.rotation_quantities import observable_derivatives, observable_names, observables
 from scvi_codegen.runs.states.rotations import Member, members_of
@@ -57,10 +57,19 @@ if TYPE_CHECKING:
 
 
 class Products:
-    """Checks, reduced states, inputs and blocks of ensembles of a stepper, ``stepper.products``."""
+    """Checks, reduced states, inputs and blocks of ensembles of a stepper, ``stepper.products``.
+
+    Attributes:
+        states: layout of states: ``start``, ``positions`` and ``vector`` read those by name, ``axes`` counts axes.
+        parameters: returns the (k,) parameters of values by name, the others by default; StateError for wrong ones.
+        propagate: propagates tangent vectors along steps, ``propagate(starts, vectors, parameters, options)``: of the
+            (n + 1, count, tangents) variations the image of row i under step i of n is added to row i + 1, with
+            ``transpose=True`` that of row i + 1 to row i. StepFailedError if a step fails.
+    """
 
     def __init__(self, stepper: Any) -> None:
         self.stepper = stepper
+        self.states, self.parameters, self.propagate = stepper._states, stepper._parameters, stepper._propagate
 
     RESOLVED = RESOLVED
     """Number of roundings of the largest value from which a difference counts as resolved."""
@@ -102,11 +111,7 @@ class Products:
     @cached_property
     def members(self) -> tuple[Member, ...]:
         """Rotations, directions and spins with the columns of their coordinates."""
-        return (
-            members_of(self.stepper.dimension, self.stepper.interface.rotations)
-            if self.stepper.interface.rotations
-            else ()
-        )
+        return members_of(self.stepper.dimension, self.stepper.interface.rotations)
 
     @property
     def finer(self) -> Any:
@@ -114,15 +119,6 @@ class Products:
         from scvi_codegen.runs.accuracy.run_error import finer_of
 
         return finer_of(self.stepper)
-
-    @property
-    def states(self) -> StateLayout:
-        """Layout of states: ``start``, ``positions`` and ``vector`` read those by name, ``axes`` counts their axes."""
-        return self.stepper._states  # type: ignore[no-any-return]
-
-    def parameters(self, values: Parameters) -> Array:
-        """Return the (k,) parameters of values by name, the others by default; StateError for wrong ones."""
-        return self.stepper._parameters(values)  # type: ignore[no-any-return]
 
     def start(
         self, q: States, p: States | None, velocity: States | None, t: float, parameters: Parameters
@@ -141,28 +137,6 @@ class Products:
     def tangents(self) -> int:
         """Number of variables of a step that tangent vectors have: (q, p), parameters, t and h."""
         return self.stepper._input_size  # type: ignore[no-any-return]
-
-    def propagate(
-        self,
-        starts: Starts,
-        vectors: Array,
-        parameters: Array,
-        options: SolverOptions | None = None,
-        *,
-        transpose: bool = False,
-    ) -> None:
-        """Propagate tangent vectors, or by ``transpose`` cotangents, along n steps, in place.
-
-        Args:
-            starts: initial data of the steps.
-            vectors: (n + 1, count, tangents) variations: the image of row i under step i is added to row i + 1, or
-                that of row i + 1 by the transpose to row i.
-            parameters, options: of the steps.
-
-        Raises:
-            StepFailedError: if a step fails.
-        """
-        self.stepper._propagate(starts, vectors, parameters, options, transpose=transpose)
 
     def run_by(
         self,

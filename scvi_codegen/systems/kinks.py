@@ -14,8 +14,9 @@ A whole number changes between even and odd where cos(pi x) is 0, and either for
 from __future__ import annotations
 
 import copy
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields, replace
+from itertools import count, filterfalse
 from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.common.errors import MethodError
@@ -42,11 +43,10 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
 
     Systems in transformed time, and with more than ``MOST_KINKS`` switching functions, stay as they are.
     """
-    owned = [field.name for field in fields(system) if field.name in FORMULAS]
-    formulas = [formula for name in owned for formula in _formulas(getattr(system, name))]
-    parities = _parities(formulas, system)
-    formulas = [formula.xreplace(parities) for formula in formulas]
-    formulas += [part for reaction in system.reactions for part in reaction.direction]  # of friction
+    stated = {field.name: getattr(system, field.name) for field in fields(system) if field.name in FORMULAS}
+    parities = _parities([*_flat(stated.values())], system)
+    owned = {name: _replaced(value, parities) for name, value in stated.items()}
+    formulas = [*_flat(owned.values()), *_flat(reaction.direction for reaction in system.reactions)]  # of friction
     steps = sorted(parts_of_type(unit_step, *formulas), key=str)
     powers = _vanishing_powers(formulas)
     one_sided = _one_sided(formulas, powers)
@@ -58,14 +58,14 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
 
     taken = {free.name for formula in formulas for free in formula.free_symbols}
     taken |= {variable.name for variable in (*system.coordinates, *system.velocities, *system.parameters)}
-    numbers = (k for k in range(1, 10**6) if f"mode_{k}" not in taken)
-    modes = {u: Mode(f"mode_{k}", real=True) for u, k in zip(sorted(arguments, key=str), numbers, strict=False)}
+    names = filterfalse(taken.__contains__, map("mode_{}".format, count(1)))
+    modes = {u: Mode(name, real=True) for u, name in zip(sorted(arguments, key=str), names, strict=False)}
     rules = steps_on_sides(located, modes)
     rules |= {power: rules[step] * power for power, step in powers.items() if step in rules}
     jumps = set(_jumps(system))
     jumps = arguments if jumps and len(arguments) > MOST_SURFACES else jumps
     with_modes = copy.copy(system)  # not made anew, as it would be checked again
-    changes: dict[str, Any] = {name: _replaced(_replaced(getattr(system, name), parities), rules) for name in owned}
+    changes: dict[str, Any] = {name: _replaced(value, rules) for name, value in owned.items()}
     changes["reactions"] = tuple(
         replace(reaction, direction=_replaced(reaction.direction, rules)) for reaction in system.reactions
     )
@@ -77,7 +77,10 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
     sides = {switching_function(step.args[0]) for step in powers.values() if step in rules}
     return with_modes, tuple(
         (Refraction if u in jumps else Kink)(
-            system.text_of(u.xreplace(rules)), mode=mode.name, power_sides=_signs(u, sides), held=_held(u, system)
+            system.text_of(u.xreplace(rules)),
+            mode=mode.name,
+            power_sides=tuple(side for side in (-1, 1) if (u, side) in sides),
+            held=_held(u, system),
         )
         for u, mode in modes.items()
     )
@@ -121,12 +124,10 @@ def _held(u: Expr, system: MechanicalSystem) -> str:
     return " + ".join(sorted(held)) or "0"
 
 
-def _signs(u: Expr, sides: Container[tuple[Expr, int]]) -> tuple[int, ...]:
-    return tuple(side for side in (-1, 1) if (u, side) in sides)
-
-
-def _formulas(value: Any) -> tuple[Expr, ...]:
-    return value if isinstance(value, tuple) else (value,)
+def _flat(values: Iterable[Any]) -> Iterator[Expr]:
+    """Yield formulas, which are values or parts of such."""
+    for value in values:
+        yield from value if isinstance(value, tuple) else (value,)
 
 
 def _replaced(value: Any, rules: dict[Expr, Expr]) -> Any:

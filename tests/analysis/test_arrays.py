@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -201,7 +202,7 @@ def test_small_systems_are_cut_out_where_the_motion_is_largest(place: int) -> No
         start = WholeStart(
             system=system,
             method=sc.as_method("svi:2"),
-            stepper=SimpleNamespace(interface=interface, products=Products(SimpleNamespace(interface=interface))),
+            stepper=SimpleNamespace(interface=interface, products=Products(Mock(interface=interface))),
             arrays=read_arrays(interface, {"q": q}, None, None),
             p={"q": p},
             h=0.1,

@@ -56,7 +56,7 @@ class Midpoint:
         time_transformation=None,
     )
     source = SimpleNamespace(files={"a.h": "1", "a.c": "2"})
-    _input_size, mode_columns = 4, ()
+    _input_size, mode_columns, _states, _parameters = 4, (), None, None
     products = property(Products)
 
     def __init__(self, errors: Any = (0.0, 0.0), sign: int = 0, forward: float = 0.0, back: float = 0.0) -> None:

@@ -107,7 +107,7 @@ class Integrator(LinearisedMethod):
         options: SolverOptions | None = None,
     ) -> tuple[Array, Array]:
         """Return F-: (q0, q1) -> (q0, p0 = -D1 L_d(q0, q1)); paper, 1.2. Raises as :meth:`discrete_lagrangian`."""
-        return self._vector(q0, "q0"), self._discrete_legendre(q0, q1, h, t, parameters, options)[0]
+        return self._states.vector(q0, "q0"), self._discrete_legendre(q0, q1, h, t, parameters, options)[0]
 
     def discrete_legendre_plus(
         self,
@@ -120,7 +120,7 @@ class Integrator(LinearisedMethod):
         options: SolverOptions | None = None,
     ) -> tuple[Array, Array]:
         """Return F+: (q0, q1) -> (q1, p1 = D2 L_d(q0, q1)); paper, 1.2. Raises as :meth:`discrete_lagrangian`."""
-        return self._vector(q1, "q1"), self._discrete_legendre(q0, q1, h, t, parameters, options)[1]
+        return self._states.vector(q1, "q1"), self._discrete_legendre(q0, q1, h, t, parameters, options)[1]
 
     def work_and_impulses(
         self,
@@ -179,7 +179,7 @@ class Integrator(LinearisedMethod):
         if not self.interface.has_action:
             require(self, "discrete_lagrangian")
         check_step_given(self.interface, parameters)
-        ends = self._vector(q0, "q0"), self._vector(q1, "q1"), self._parameters(parameters)
+        ends = self._states.vector(q0, "q0"), self._states.vector(q1, "q1"), self._parameters(parameters)
         p0, p1, action = *np.empty((2, self.dimension)), np.empty(1)
         binding = self.binding.with_function("discrete_legendre")
         t = checked_number(t, "the time t")

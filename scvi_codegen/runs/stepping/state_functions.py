@@ -249,9 +249,6 @@ class StateFunctions(CompiledMethod):
         """
         return by_name(unnamed(values), coordinate_shapes(self.interface))
 
-    def _vector(self, value: States, name: str) -> Array:
-        return self._states.vector(value, name)
-
     def _parameters(self, parameters: Parameters, base: Array | None = None) -> Array:
         """Return the (k,) parameters; those that are not passed by name are those of ``base``, or defaults."""
         return self._states.parameters(parameters, base)
