@@ -34,7 +34,7 @@ from scvi_codegen.runs.driver.bounded_motion import BoundedMotion
 from scvi_codegen.runs.driver.observation import Observe
 from scvi_codegen.runs.driver.run import Run
 from scvi_codegen.runs.driver.segments import InputSegments, checked_inputs, final_time
-from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings
+from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings, settings_in
 from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
 from scvi_codegen.runs.events.contacts import in_first_modes
 from scvi_codegen.runs.events.refinement import WithEventsInDouble, constantly
@@ -541,7 +541,7 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
             StateError: if a shape, name or number is invalid.
             MethodError: if the method has no trajectories in SIMD lanes, for ``observe`` and single precision.
         """
-        settings = {name: value for name, value in locals().items() if name in EnsembleSettings.__dataclass_fields__}
+        settings = EnsembleSettings(*settings_in(locals()))
         runs = self.products.ensemble_runs(q, p, settings, velocity=velocity, action=action)
         runs.run(progress=progress, threads=threads)
         return self.products.ensemble_result(runs)
