@@ -43,12 +43,11 @@ from scvi_codegen.methods import (
     sliding,
 )
 from scvi_codegen.methods.method import Method
-from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
+from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.compiled_method import Variants
-from scvi_codegen.systems.checks.unlocated_kinks import warn_of_formulas
 from scvi_codegen.systems.contact import ContactLike
 from scvi_codegen.systems.contacts.rows import ContactRows
-from scvi_codegen.systems.event import Event, EventLike, as_events
+from scvi_codegen.systems.event import Event, EventLike, as_events, warn_of_formulas
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
 from scvi_codegen.systems.system import MechanicalSystem
 
@@ -238,6 +237,8 @@ def _compile_arrays(
     looser: Once[Stepper] | None,
 ) -> Stepper:
     """Return the stepper of arrays whose sizes each run determines; ``common``: further arguments."""
+    from scvi_codegen.runs.array_stepper import StepperOfRunTimeSizes
+
     if precision == AUTO:
         raise MethodError(f"precision='auto' is not available with arrays of run-time sizes: {SIZES_REQUIRED}")
     if symmetries:

@@ -349,7 +349,10 @@ def test_family_is_saved_and_drawn(pendulum, moon, tmp_path):
     with np.load(tmp_path / "family.npz") as saved:
         assert saved["period"] == pytest.approx(family.periods, rel=1e-15)
         assert saved["multipliers"].shape == (3, 2)
-    family.plot(tmp_path / "family.png")
+    orbits, indices, _ = family.plot(tmp_path / "family.png").axes
+    assert np.array_equal(indices.lines[0].get_ydata(), family.stability_indices[:, 0].real)  # signed
+    corners = np.linalg.norm(np.diff(orbits.lines[2].get_xydata(), 2, axis=0), axis=1)
+    assert corners.max() < 1e-4 * np.ptp(orbits.lines[2].get_xdata())  # a curve, no polygon of steps
     with pytest.raises(sc.StateError, match=r"is a family of 'pendulum.*', not of 'restricted three-body problem"):
         sc.Family.load(moon, tmp_path / "family.npz")
     heavier = sc.LagrangianSystem.from_text("pendulum", ["q"], "q_dot**2 + g*cos(q)", parameters={"g": 1.0})

@@ -18,7 +18,7 @@ from scvi_codegen.methods.discretise import discretise
 pytestmark = pytest.mark.rotated
 
 ROOT = Path(scvi_codegen.__file__).parents[1]
-PAGE = ROOT / "docs" / "extending.md"
+TEXT = "".join((ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8") for name in ("extending", "extending_runs"))
 
 
 # What the page adds.
@@ -27,8 +27,7 @@ PAGE = ROOT / "docs" / "extending.md"
 def additions() -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
     """Return the code of the page by the file named above it: new files, and changes of files."""
     new, changes = (
-        re.findall(rf"^`([\w/.]+)`\n\n```{kind}\n(.*?)^```$", PAGE.read_text(), re.M | re.S)
-        for kind in ("python", "diff")
+        re.findall(rf"^`([\w/.]+)`\n\n```{kind}\n(.*?)^```$", TEXT, re.M | re.S) for kind in ("python", "diff")
     )
     return new, [(path, hunk) for path, change in changes for hunk in change.split("@@\n")]
 
@@ -80,7 +79,7 @@ def test_documented_additions_need_one_file_and_one_line() -> None:
 @pytest.mark.quick
 def test_the_pages_name_the_rooms_alike() -> None:
     """CONTRIBUTING, the page and the docstring of the package have one sentence for each room, in order."""
-    pages = (PAGE.read_text(), (ROOT / "CONTRIBUTING.md").read_text(), scvi_codegen.__doc__.replace("``", "`"))
+    pages = (TEXT, (ROOT / "CONTRIBUTING.md").read_text(), scvi_codegen.__doc__.replace("``", "`"))
     rows = r"^(?:\| |\* )`(\w+)`(?: \||:) (\w.*?)(?: \||\.)$"
     tables = [dict(re.findall(rows, page.split("to a run")[1].split("\n\n")[1], re.M)) for page in pages]
     assert tables[0] == tables[1] == tables[2]

@@ -106,7 +106,7 @@ def _start(
     if period is None or amplitude is not None:
         ways = "the period of an orbit (--period) or the amplitude next to an equilibrium (--amplitude)"
         raise ModelFileError(f"give {ways}")
-    value = period(dict(zip(stepper.parameters, stepper._parameters(model.parameters), strict=False)))
+    value = period(dict(zip(stepper.parameters, stepper.products.parameters(model.parameters), strict=False)))
     return periodic_orbit(stepper, model.q, model.p, velocity=model.velocity, period=value, **own, **at)
 
 

@@ -30,7 +30,7 @@ from scvi_codegen.api.text import Typeset, summary, write_text
 from scvi_codegen.common.errors import ArgumentError, ExpressionError, MethodError, StateError, closest
 from scvi_codegen.extras.derivation.writing import mathematics_font, plain_template
 from scvi_codegen.extras.orbits.family import Family
-from scvi_codegen.extras.orbits.picture import sizes_of
+from scvi_codegen.extras.orbits.picture import indices_of
 from scvi_codegen.extras.orbits.solver import ERROR, PeriodicOrbit
 from scvi_codegen.extras.pages.section import check_page, check_picture, drawn_system_of_model, starts_from_momenta
 from scvi_codegen.extras.pages.webassembly import LICENCES, check_compiler, webassembly
@@ -221,7 +221,7 @@ def _orbits(family: Family, *, from_momenta: bool) -> dict[str, Any]:
     places = [(k, "", orbit) for k, orbit in enumerate(family)]
     places += [(point.after, point.kind, point.orbit) for point in family.bifurcations]
     _, kinds, orbits = zip(*sorted(places, key=lambda place: place[0]), strict=True)  # stable
-    name, sizes = sizes_of(orbits)
+    name, indices = indices_of(orbits)
 
     def entry(kind: str, orbit: PeriodicOrbit, moduli: Any) -> dict[str, Any]:
         q, p, names, parameters = orbit.q, orbit.p, orbit.stepper.parameters, orbit.parameters
@@ -232,8 +232,8 @@ def _orbits(family: Family, *, from_momenta: bool) -> dict[str, Any]:
             "sizes": moduli.tolist(), "stability": "stable" if orbit.stable else "unstable", "bifurcation": kind,
         }  # fmt: skip
 
-    entries = [*map(entry, kinds, orbits, sizes)]
-    return {"value": family.parameter or "energy", "sizes": name, "orbits": entries}
+    entries = [*map(entry, kinds, orbits, np.abs(indices))]
+    return {"value": family.parameter or "energy", "sizes": f"|{name}|", "orbits": entries}
 
 
 def _check(model: Model, ranges: Mapping[str, tuple[float, float]]) -> None:
@@ -327,7 +327,7 @@ def _entry(model: Model, interface: Interface, initial: Sequence[str], adaptive:
     if model.system.bath:
         model.start()  # checks the seed and the rule of Metropolis
     events = interface.searched(model.events)
-    axes = {name: np.ravel(nodes).tolist() for name, nodes in model.mesh.points.items()} if model.mesh else {}
+    points = model.mesh.points if model.mesh else {}
     return (
         plain_template("page/entry.c.jinja").render(
             array=model.array_system is not None, m=size, capacity=256 if size < 64 else 16,
@@ -341,7 +341,7 @@ def _entry(model: Model, interface: Interface, initial: Sequence[str], adaptive:
             velocities=not starts_from_momenta(model),
             level=interface.energy_index if interface.in_tau else None,
             noise=model if model.system.bath else None,
-            axes={f"at_{name}": nodes for name, nodes in axes.items()},
+            axes={f"at_{name}": np.ravel(nodes).tolist() for name, nodes in points.items()},
             names={f"at_{name}": k for k, name in enumerate(interface.parameters)},
         )
     )  # fmt: skip

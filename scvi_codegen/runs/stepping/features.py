@@ -8,7 +8,7 @@ from typing import Any
 from scvi_codegen.codegen.options import OPTION, in_words
 from scvi_codegen.codegen.variants import Derivatives
 from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError, closest
-from scvi_codegen.systems.checks.unlocated_kinks import warn_of_formulas
+from scvi_codegen.systems.event import warn_of_formulas
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
 
 OPERATIONS = {

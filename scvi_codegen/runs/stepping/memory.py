@@ -181,10 +181,10 @@ class Memory:
         t: float = 0.0,
         parameters: Parameters = None,
         options: SolverOptions | None = None,
-        noise: Noise = DEFAULT_NOISE,
+        noise: Noise | None = None,
     ) -> None:
         """Start at (q, p) and t; nothing of an earlier run remains."""
-        self._noise = noise
+        self._noise = DEFAULT_NOISE if noise is None else noise
         initial = InitialData(q, p, None, self.stepper._states.time(t), parameters, options)
         self._set_up(plan, initial)
         self._begin(q, p, initial.t)

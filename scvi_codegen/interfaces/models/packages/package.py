@@ -32,8 +32,9 @@ from scvi_codegen.codegen.variants import WithEvents
 from scvi_codegen.common.atomic import read_text, write_text
 from scvi_codegen.common.errors import PackageError
 from scvi_codegen.common.validation import ArgumentType, checks_arguments
+from scvi_codegen.runs.array_stepper import StepperOfRunTimeSizes
 from scvi_codegen.runs.states.layout import layout_of
-from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
+from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.systems.event import Event
 
