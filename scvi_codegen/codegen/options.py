@@ -7,7 +7,7 @@ arguments of runs (docs/extending.md). Neither SymPy nor click is imported.
 
 import dataclasses
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import combinations
 from math import isfinite
@@ -125,6 +125,10 @@ class Option:
             raise error(f"unknown {shown} {value!r}: use {' or '.join(map(repr, self.choices))}")
         if self.kind == NUMBER_OR_NAMED and isinstance(value, Mapping):
             return {str(part): self._number(number, f"{shown} of {part}", error) for part, number in value.items()}
+        if self.kind == NUMBERS:
+            if not isinstance(value, Iterable) or isinstance(value, str):
+                raise error(f"{shown} must be a list of numbers, not {value!r}")
+            return tuple(self._number(number, f"{shown}[{k}]", error) for k, number in enumerate(value))
         return self._number(value, shown, error) if self.kind in (NUMBER, NUMBER_OR_NAMED) else value
 
     def _number(self, value: Any, shown: str, error: type[ScviCodegenError]) -> float:
@@ -214,6 +218,11 @@ class RunOptions:
         "run", COUNT, "N", "Number of steps, instead of --span.", determines=DURATION, requires=FIXED
     )
     save_every: int = option("run", COUNT, "N", "Save every N-th state.", least=1, default=1)
+    t_eval: Sequence[float] | None = option(
+        *("run", NUMBERS, "T1,T2,..", "Times at which states are saved, instead of every N-th."),
+        unavailable={"for a run recorded in a folder": "write it to a file (-o NAME.npz)"},
+        common=False,
+    )
     solver_tolerance: float | None = option(
         *("run", NUMBER, "X", "Convergence criterion: relative update of the stages [round-off]."),
         range=SOLVED,

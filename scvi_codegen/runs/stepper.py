@@ -542,9 +542,9 @@ class Stepper(OfSteppers, Integrator):
             StateError: if a shape, name or number is invalid.
             MethodError: if the method has no trajectories in SIMD lanes, for ``observe`` and single precision.
         """
-        from scvi_codegen.runs.ensembles.ensemble import EnsembleSettings
+        from scvi_codegen.runs.ensembles.ensemble import EnsembleSettings, settings_in
 
-        settings = {name: value for name, value in locals().items() if name in EnsembleSettings.__dataclass_fields__}
+        settings = EnsembleSettings(*settings_in(locals()))
         runs = self.products.ensemble_runs(q, p, settings, velocity=velocity, action=action)
         runs.run(progress=progress, threads=threads)
         return self.products.ensemble_result(runs)

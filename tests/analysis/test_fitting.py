@@ -159,7 +159,7 @@ def test_unidentifiable_parameters_are_named(options, message):
         ({"unknown": ["alpha", "alpha"]}, "unknown names 'alpha' twice"),
         ({"observed": ["x", "x"]}, "observed names 'x' twice"),
         ({"deviations": np.inf}, "deviations must be a positive number"),
-        ({"h": 0.0}, "the step size h is 0"),
+        ({"h": 0.0}, "h = 0 must be positive"),
         ({"measured": np.where(TIMES[3] == TIMES, np.inf, recorded()[0])}, "a value in measured is infinite"),
         ({"t": TIMES[::-1]}, "ascending"),
         ({"segments": 0}, "segments"),

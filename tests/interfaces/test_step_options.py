@@ -34,6 +34,7 @@ OPTIONS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "absolute_tolerance": ({"absolute_tolerance": 0.5}, {"absolute_tolerance": 0.5}),
     "absolute_tolerance, named": ({"absolute_tolerance": {"x": 0.5}}, {"absolute_tolerance": {"x": 0.5}}),
     "save_every": ({"save_every": 3}, {"save_every": 3}),
+    "t_eval": ({"t_eval": [0.5, 1.25]}, {"t_eval": [0.5, 1.25]}),
     "event": ({"event": EVENT}, {}),
     "event, terminal": ({"event": TERMINAL}, {}),
     "precision": ({"precision": "double-double"}, {}),
@@ -47,6 +48,7 @@ first_step                 -     -    =         =         =
 absolute_tolerance         -     -    =         =         =
 absolute_tolerance, named  -     -    =         =         =
 save_every                 =     =    =         =         =
+t_eval                     =     =    =         =         =
 event                      =     =    =         =         =
 event, terminal            =     =    =         =         =
 precision                  =     =    =         =         =
@@ -82,6 +84,8 @@ def flags(values: dict[str, Any]) -> list[str]:
             )
         elif isinstance(value, dict):
             text = ",".join(f"{key}={each}" for key, each in value.items())
+        elif isinstance(value, list):
+            text = ",".join(map(str, value))
         words += [f"--{name.replace('_', '-')}", text]
     return words
 

@@ -47,7 +47,7 @@ def ring(here: Path) -> str:
     [
         (("run", "--size", "N=4000", "--advise", "1e-9"), "--advise compiles an array model with its sizes"),
         (("run", "-o", "ring.txt"), "a trajectory is written as .npz, .csv"),
-        (("run", "--size", "N=1.5"), "must be an integer, not 1.5"),
+        (("run", "--size", "N=1.5"), "--size N must be a whole number, not 1.5"),
         (("run", "--parameter", "x=1"), "has no parameter 'x'"),
         (("generate", "-o", "folder", "--method", "scvi:4"), "not supported for array systems"),
         (("run", "--solver", "explicit"), "unknown solver 'explicit' of an array system"),

@@ -70,8 +70,6 @@ def _unused(document: Any) -> tuple[str, ...]:
 def _paths(model: Model) -> list[Path]:
     """Return the paths of a model, that of least action first."""
     settings = dict(model.path)
-    if model.h is None:
-        raise ModelFileError("a path has steps of one size: give a step size (--step, [run] step)")
     closed = settings.get("closed")
     if (closed is None) == ("to" not in settings):
         raise ModelFileError("give the end of the path (--to, [path] to) or closed (--closed, [path] closed), not both")
@@ -79,12 +77,12 @@ def _paths(model: Model) -> list[Path]:
         if len(settings.get(key, model.q)) != model.dimension:
             names = ", ".join(str(coordinate) for coordinate in model.system.coordinates)
             raise ModelFileError(f"[path] {key} has {len(settings[key])} numbers: give those of {names}")
-    steps, stepper = max(2, math.ceil(model.covered / abs(model.h) * (1.0 - 1e-9))), model.stepper()
+    steps, stepper = max(2, math.ceil(model.covered / abs(model.step) * (1.0 - 1e-9))), model.stepper()
     arguments: dict[str, Any] = {"steps": steps, "t": model.t, "parameters": model.parameters}
     arguments |= {"options": model.solver_options, "energy": settings.get("energy")}
     if model.system.inputs:
         arguments["inputs"] = model.all_inputs()
-    span = math.copysign(model.covered, model.h)
+    span = math.copysign(model.covered, model.step)
     if closed is None:
         q0, q1 = settings.get("from", model.q), settings["to"]
         arguments |= {"starts": settings.get("starts", 0), "revolutions": settings.get("revolutions")}

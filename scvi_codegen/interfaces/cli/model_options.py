@@ -113,11 +113,11 @@ def _number_or_named(
     return dict(_assignments(context, parameter, values))
 
 
-def _sizes(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> tuple[tuple[str, int], ...]:
-    for name, value in (assignments := _assignments(context, parameter, values)):
-        if not value.is_integer():
-            raise click.BadParameter(f"the size {name} must be an integer, not {value:g}")
-    return tuple((name, int(value)) for name, value in assignments)
+def _sizes(
+    context: click.Context, parameter: click.Parameter, values: tuple[str, ...]
+) -> tuple[tuple[str, float], ...]:
+    sizes = _assignments(context, parameter, values)
+    return tuple((name, int(value) if value.is_integer() else value) for name, value in sizes)
 
 
 def _input_files(

@@ -89,13 +89,16 @@ def integrate_model(model: Model) -> RunOutcome:
             stopped = bool(caught)
             return stopped
 
-        recorded = partial(run._recorded, output=Output(model.save_every, progress=look), stop=stop)
-        segments = model.segments(run)
+        recorded, segments = partial(run._recorded, stop=stop), model.segments(run)
         try:
             if model.system.inputs:
+                recorded = partial(
+                    recorded, output=Output(model.save_every, model.output_times(run, None), progress=look)
+                )
                 trajectory = record_segments(run, segments, recorded, lambda: stopped)
             else:
-                trajectory = recorded(next(segments))
+                steps = next(segments)
+                trajectory = recorded(steps, Output(model.save_every, model.output_times(run, steps), progress=look))
         except StepFailedError as error:
             failure, trajectory = error, Trajectory.before(error)
     missed = None

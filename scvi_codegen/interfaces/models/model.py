@@ -73,7 +73,7 @@ class Model(TimeSpan):
             or axis and angle.
         p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
         velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
-        h, tolerance, error, span, steps, save_every, t, time_transformation, controller, precision, sums,
+        h, tolerance, error, span, steps, save_every, t_eval, t, time_transformation, controller, precision, sums,
             observe, solver_tolerance, max_iterations, threads, action: as of
                 :class:`~scvi_codegen.interfaces.models.time_span.TimeSpan`.
         inputs: by name a table of values, ``(t, values)`` or ``(t, values, kind)`` as :meth:`Stepper.integrate` accepts
@@ -397,6 +397,17 @@ class Model(TimeSpan):
 
         inputs, values = self._inputs_and_parameters(run)
         yield from prepared_segments(run, inputs, self.end, values)
+
+    def output_times(self, run: Run, steps: int | None) -> Array | None:
+        """Return the times at which a run of ``steps``, ``None`` to its target time, saves states; ``None``: steps."""
+        if self.t_eval is None:
+            return None
+        from scvi_codegen.runs.stepping.features import check_together  # not needed for reading a model
+
+        stride = None if self.save_every == 1 else self.save_every
+        check_together(t_eval=self.t_eval, save_every=stride, inputs=self.system.inputs or None)
+        stepper: Any = run.stepper
+        return stepper._output_times(self.t_eval, self.t, run.plan, steps)  # type: ignore[no-any-return]
 
     @property
     def end(self) -> float:

@@ -164,8 +164,6 @@ def options_of(section: str) -> tuple[Option, ...]:
 
 RUN_FIELDS = tuple(ROWS[name] for name in ModelOptions.__dataclass_fields__ if ROWS[name].section in ("initial", "run"))
 """Options of runs that are fields of a model."""
-METHOD_KEYS = tuple(option.name for option in options_of("method") if option.common)
-"""Options that specify the method."""
 OF_ADAPTIVE_STEPS = tuple(option.field for option in RUN_FIELDS if option.requires == ADAPTIVE)
 """Options of adaptive steps besides the tolerance."""
 FURTHER = ("path", "family", "page", "picture")
@@ -179,12 +177,9 @@ def checked_value(section: str, key: str, value: Any) -> Any:
     options, where = {option.key: option for option in options_of(section)}, f"[{section}] {key}"
     if key not in options:
         raise ModelFileError(f"there is no key {where}{closest(key, options)} Known: {', '.join(options)}")
-    if options[key].kind == NUMBERS:
-        if not isinstance(value, list | tuple):
-            raise ModelFileError(f"{where} must be a list of numbers, not {value!r}")
-        return [real(entry, where) for entry in value]
     if options[key].kind != TEXT:
-        return options[key].checked(value, ModelFileError, where)
+        value = options[key].checked(value, ModelFileError, where)
+        return list(value) if isinstance(value, tuple) else value
     if section == "family" and not isinstance(value, str):
         raise ModelFileError(f"{where} must be a text, not {value!r}")
     names = isinstance(value, list | tuple) and all(isinstance(entry, str) for entry in value)

@@ -39,6 +39,7 @@ class TimeSpan(ModelOptions):
         span: time span, positive, or ``None`` if ``steps`` is given. With adaptive steps negative for a run backward.
         steps: number of fixed steps, or ``None`` if ``span`` is given.
         save_every: stride of saved states, in steps.
+        t_eval: times at which states are saved instead, as of :meth:`Stepper.integrate`.
         t: initial time.
         time_transformation: time-rescaling function of the reversible controller, as text, see
             :func:`~scvi_codegen.compile_stepper`; requires a span. A system in transformed time has its own.

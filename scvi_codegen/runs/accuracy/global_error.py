@@ -154,18 +154,17 @@ def warn_of_unconfirmed(confirmations: Sequence[GlobalError | None]) -> None:
         )
 
 
-def checked_error(error: Any, others: Mapping[str, Any], stepper: Any = None) -> float:
+def checked_error(error: Any, others: Mapping[str, Any], stepper: Any) -> float:
     """Return the requested global error; raise StateError if it is unattainable or another option sets step sizes."""
     check_agreement({"error": error, **others})
     bound: float = OPTION["error"].checked(error)
-    if stepper is not None:
-        words = max(stepper.interface.words, 1 + (stepper._precise is not None))
-        if bound < (least := smallest_estimate(words)):
-            remedy = ", or precision='double-double'" if words == 1 else ""
-            raise StateError(
-                f"error={bound:g} is below {least:.1e}, the least error that {NAMES_OF_PRECISIONS[words]} arithmetic "
-                f"confirms: give a larger error{remedy}"
-            )
+    words = max(stepper.interface.words, 1 + (stepper._precise is not None))
+    if bound < (least := smallest_estimate(words)):
+        remedy = ", or precision='double-double'" if words == 1 else ""
+        raise StateError(
+            f"{OPTION['error']} = {bound:g} is below {least:.1e}, the least error that {NAMES_OF_PRECISIONS[words]} "
+            f"arithmetic confirms: give a larger one{remedy}"
+        )
     return bound
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
+from operator import itemgetter
 from typing import Any, Self, cast
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.codegen.native.arguments import real_array
 from scvi_codegen.codegen.native.options import SolverOptions, checked_options
+from scvi_codegen.codegen.options import in_words
 from scvi_codegen.codegen.variants import Lanes
 from scvi_codegen.common.errors import MethodError, StateError, of_trajectory
 from scvi_codegen.common.validation import checked_count
@@ -129,8 +131,8 @@ class EnsembleSettings:
     observe: str | None = None
     seed: int = 0
     metropolis: bool = False
-    trajectory: int = 0
     precision: str = "double"
+    trajectory: int = 0
 
     @property
     def control(self) -> ErrorControl:
@@ -190,12 +192,13 @@ class EnsembleSettings:
     def steps_or_ends(self, t: float, words: int) -> tuple[int | None, Array | None]:
         """Return the number of common steps or the final times; StateError for missing or contradictory arguments."""
         h, t_end = self.h, self.t_end
-        check_together(inputs=self.inputs, t_eval=self.t_eval)
         if words > 1:
             check_doubles(t_end=t_end, t_eval=self.t_eval)
-        check_has_end(self.t_eval, t, h, t_end)
-        if h is not None and self.t_eval is not None:
-            raise StateError("t_eval requires adaptive steps: give t_end without h and steps")
+        if self.t_eval is not None:
+            check_together(inputs=self.inputs, t_eval=self.t_eval)
+            check_has_end(self.t_eval, t, h, t_end)
+            if h is not None:
+                raise StateError(in_words("{t_eval} requires adaptive steps: give {t_end} without {h} and {steps}"))
         if h is not None and t_end is not None and np.ndim(t_end):
             raise StateError("with h all trajectories have one t_end: give one number, or omit h (adaptive step size)")
         ends = None if t_end is None else real_array(t_end, "t_end")
@@ -210,6 +213,10 @@ class EnsembleSettings:
         if h is None or (self.inputs is None and first is None):
             return self.steps, ends
         return None, np.array(final_time(t, h, self.steps, first))
+
+
+settings_in = itemgetter(*EnsembleSettings.__slots__[:-1])
+"""The values of :class:`EnsembleSettings` among the arguments of ``integrate_ensemble``, in order."""
 
 
 @dataclass(slots=True, eq=False)

@@ -24,7 +24,6 @@ from scvi_codegen.runs.ensembles.observation import EnsembleObservation
 from scvi_codegen.runs.ensembles.result import INTERRUPTED, OK, EnsembleTrajectory, failure_after
 from scvi_codegen.runs.ensembles.schedule import CommonSteps
 from scvi_codegen.runs.states.validation import Array
-from scvi_codegen.runs.states.words import from_block
 from scvi_codegen.runs.stepping.chunks import drive
 from scvi_codegen.runs.stepping.memory import Memory
 from scvi_codegen.runs.stepping.step_plan import Fixed
@@ -59,8 +58,7 @@ class CommonRuns:
         (count, m), words = ensemble.q.shape, stepper.interface.words
         shape = len(self.steps.numbers), count
         self.blocks = [empty_array((*shape, words * m)) for _ in "qp"]
-        states: list[Array] = self.blocks if words == 1 else [*map(from_block, self.blocks)]
-        self.q, self.p = states
+        self.q, self.p = map(stepper._states.numbers, self.blocks)
         self.q[1:] = self.p[1:] = np.nan
         self.q[0], self.p[0] = ensemble.q, ensemble.p
         if stepper.sums_action:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
 
-from scvi_codegen.codegen.options import in_words
+from scvi_codegen.codegen.options import OPTION, in_words
 from scvi_codegen.codegen.variants import Derivatives
 from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError, closest
 from scvi_codegen.systems.event import warn_of_formulas
@@ -16,7 +16,7 @@ OPERATIONS = {
     "error": "{error=}",
     "run_error": "run.error",
     "check_growth": "check_growth=True",
-    "t_eval": "t_eval",
+    "t_eval": "{t_eval}",
     "observe": "observe",
     "events": "events=",
     "inputs": "inputs=",
@@ -237,8 +237,8 @@ FEATURES = {
             "threads share the steps of arrays whose sizes are known at run time only; omit {threads}, compile without "
             "sizes, or compile roll_sums(system).system, whose runs take its tables and parameters",
         ),
-        ("with save_every", "t_eval", "give either t_eval or {save_every}, not both"),
-        ("with inputs", "t_eval", "omit t_eval"),
+        ("with save_every", "t_eval", "give either {t_eval} or {save_every}, not both"),
+        ("with inputs", "t_eval", "omit {t_eval}"),
         ("with inputs", "observe", "omit observe"),
         ("with inputs", "sensitivity chaos", "use tangent or pullback, or run.pieces"),
         (
@@ -281,7 +281,9 @@ def refusal(operation: str, property_: str, title: str = "") -> ScviCodegenError
     """Return the error of an operation that a property excludes, ``StateError`` for other arguments of the run."""
     of_stepper = property_ in PROPERTIES or property_ in PROPERTIES_OF_SIZES
     called, remedy = in_words(OPERATIONS[operation]), in_words(FEATURES[operation, property_])
-    reason = f"{called} is not available {property_}{title and f' ({title})'}"
+    other = OPTION.get(property_.removeprefix("with "))
+    where = f"with {other.word}" if other else property_
+    reason = f"{called} is not available {where}{title and f' ({title})'}"
     return (MethodError if of_stepper else StateError)(f"{reason}: {remedy}")
 
 

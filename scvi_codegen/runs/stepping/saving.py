@@ -10,7 +10,7 @@ import numpy as np
 from scvi_codegen.common.errors import ScviCodegenError, StateError
 from scvi_codegen.common.representation import clipped
 from scvi_codegen.common.validation import checked_count
-from scvi_codegen.runs.states.words import block_of, from_block
+from scvi_codegen.runs.states.words import block_of
 from scvi_codegen.runs.stepping.array_interface import RunSizes, check_accesses, read_tables
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.step_plan import Adaptive, ErrorControl, FixedSteps
@@ -103,7 +103,7 @@ def _read(
         stepper = binding._bound_to(problem).with_events(stepper.events)
     words = stepper.interface.words
     values = np.frombuffer(arrays, count=words * len(stepper.defaults), offset=offset)
-    parameters = stepper.parameters_by_name(values if words == 1 else from_block(values))
+    parameters = stepper.parameters_by_name(stepper._states.numbers(values))
     for name in header["unset inputs"]:
         del parameters[f"{name}_0"]
     control = ErrorControl(**header.get("control", {}))

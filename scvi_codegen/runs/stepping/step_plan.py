@@ -317,7 +317,8 @@ def checked_plan(kind: KindOfSteps, h: float | None, t_end: float | None, contro
         if kind.has_unseen_growth:
             warn(UNSEEN_GROWTH, AccuracyWarning)
         return control.to(t_end)
-    check_agreement({"h": h, **control.named})
+    if named := control.named:
+        check_agreement({"h": h, **named})
     if t_end is not None:
         raise StateError("give either h (fixed step size) or t_end (adaptive step size); got both")
     return Fixed(checked_step(h))

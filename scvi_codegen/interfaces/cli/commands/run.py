@@ -148,28 +148,21 @@ def run(
     recorded = output is not None and is_run_folder(output)
     _check_error_bars(error_bars, recorded, ensemble)
     _check_outputs(output, plot, ensemble, checkpoint)
+    check_exclusive(choices)
     requested = {name: choices.pop(name) for name in ERRORS}
-    _check_combination(choices, plot=plot, ensemble=ensemble, requested=requested, folder=output if recorded else None)
     errors = {name: requested[name] for name in ("tolerance", "error") if requested[name] is not None}
     is_adaptive = any(choices.get(name) is not None for name in (*OF_ADAPTIVE_STEPS, "span"))
     model = read_model(model_name, choices, errors if is_adaptive else None)
     _check_output_of_words(model, output)
     if model.precision in (DOUBLE_DOUBLE, AUTO):
         model = model.with_known_sizes()
-    if ensemble is not None:
-        _check_ensemble(model)
-    else:
-        model._check_alone()
+    _check_kind(model, requested, in_ensemble=ensemble is not None, recorded=recorded)
     for option, needed in (
         ("--ensemble", ensemble is not None),
         ("--advise", requested["advise"] is not None),
         (f"-o {output}", recorded),
     ):
         model = model.with_known_sizes(option) if needed else model
-    if model.system.inputs:
-        check_available({"advise": requested["advise"]}, WITH_INPUTS, rows=ROWS)
-    if model.system.inputs and recorded:
-        raise click.UsageError("a run with inputs cannot be recorded in a folder: write it to a file (-o NAME.npz)")
     states = None if ensemble is None else load_ensemble(ensemble, model)
     model, confirmation, member = _with_steps(model, requested, states)
     _check_output_of_words(model, output)  # with precision = "auto"
@@ -189,13 +182,25 @@ def _check_error_bars(error_bars: bool, recorded: bool, ensemble: str | None) ->
         raise click.UsageError(f"--error-bars is not available {where}: use runs in memory (Python: run.error)")
 
 
-def _check_ensemble(model: Model) -> None:
-    """Reject models and options that ensembles do not have."""
-    if model.has_time_transformation:
+def _check_kind(model: Model, requested: dict[str, float | None], *, in_ensemble: bool, recorded: bool) -> None:
+    """Reject models and options that ensembles, or single runs, in memory or in a folder, do not have."""
+    values = {row.field: getattr(model, row.field) for row in RUN_FIELDS} | {
+        name: value for name, value in requested.items() if value is not None
+    }
+    if model.system.inputs:
+        check_available(values, WITH_INPUTS, rows=ROWS)
+    if not in_ensemble:
+        model._check_alone()
+    elif model.has_time_transformation:
         raise click.UsageError(
             "--ensemble is not available with a time transformation: each trajectory has its own times"
         )
-    check_available({row.field: getattr(model, row.field) for row in RUN_FIELDS}, IN_ENSEMBLE, rows=ROWS)
+    else:
+        check_available(values, IN_ENSEMBLE, rows=ROWS)
+    if recorded:
+        check_available(values, "for a run recorded in a folder", rows=ROWS)
+        if model.system.inputs:
+            raise click.UsageError("a run with inputs cannot be recorded in a folder: write it to a file (-o NAME.npz)")
 
 
 def _check_output_of_words(model: Model, output: str | None) -> None:
@@ -241,26 +246,14 @@ def _check_outputs(output: str | None, plot: str | None, ensemble: str | None, c
     """Check before a long run that its files can be written."""
     if checkpoint is not None and not (output is not None and is_run_folder(output)):
         raise click.UsageError(f"--checkpoint requires a run recorded in a folder (-o NAME{SUFFIX})")
-    if output is not None and not (ensemble is None and is_run_folder(output)):
+    in_folder = output is not None and ensemble is None and is_run_folder(output)
+    if output is not None and not in_folder:
         check_output(output, ensemble=ensemble is not None)
     if plot is not None:
+        if in_folder:
+            raise click.UsageError("--plot is not available for a run recorded in a folder: omit one of them")
         check_writable(Path(plot), "'--plot'")
         part("services", "check_picture")(plot, films=True)
-
-
-def _check_combination(
-    choices: dict[str, Any],
-    *,
-    plot: str | None,
-    ensemble: str | None,
-    requested: dict[str, float | None],
-    folder: str | None,
-) -> None:
-    if folder is not None and plot is not None:
-        raise click.UsageError("--plot is not available for a run recorded in a folder: it needs the states in memory")
-    check_exclusive(choices | requested)
-    if ensemble is not None:
-        check_available(requested, IN_ENSEMBLE, rows=ROWS)
 
 
 def _run_one(
