@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from notation import lagrange
-from scipy.integrate import solve_ivp
+from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 
 import scvi_codegen as sc
@@ -68,3 +68,21 @@ def test_forces_with_a_jump_against_a_slip_are_friction():
         for steps in ({"tolerance": 1e-10}, {"h": 0.02}):
             run = stepper.integrate([x], velocity=[v], t_end=SPAN, parameters=values, **steps)
             assert run.q[-1, 0] == pytest.approx(exact, abs=1e-8), (number, steps)
+
+
+@pytest.mark.second
+def test_limits_that_depend_on_the_slip_are_finite_far_from_rest():
+    """x = integral of v dv / F(v) to the stop, of Stribeck friction with a narrow peak."""
+    forces = {"x": "-(a + b*exp(-(x_dot/w)**2))*sign(x_dot)"}
+    stepper = sc.compile_stepper(lagrange("stribeck", "x", "x_dot**2/2", forces=forces, a=0.1, b=0.4, w=0.01))
+    for number in range(10):
+        random = np.random.default_rng([3, number])
+        a, w, v = random.uniform(0.05, 1), 10 ** random.uniform(-3.2, 0), random.uniform(0.3, 2)
+        b = a * 10 ** random.uniform(-1, 1)
+        peak = [min(k * w, v) for k in (1, 2, 3, 4, 6)]
+        exact = quad(lambda v, a=a, b=b, w=w: v / (a + b * math.exp(-((v / w) ** 2))), 0, v, points=peak, epsabs=1e-14)[
+            0
+        ]
+        values = {"a": a, "b": b, "w": w}
+        run = stepper.integrate([0.0], velocity=[v], t_end=2 * v / a + 1, parameters=values, tolerance=1e-6)
+        assert run.q[-1, 0] == pytest.approx(exact, rel=1e-4), number

@@ -121,13 +121,13 @@ def _limit(
     system: LagrangianSystem, slip: Sequence[Expr], directions: Sequence[Sequence[Expr]], pushes: Sequence[Expr]
 ) -> Expr | None:
     """Return F of forces -F T^T w/abs(w) if they are so, with one F >= 0 for the default parameters; else ``None``."""
-    from sympy import Add, S, cancel
+    from sympy import Add, S
 
     from scvi_codegen.systems.formulas.kinks import switching_function, unit_step
 
     along = slip if len(slip) > 1 else (S.One,)
     rows = [Add(*(row * w for row, w in zip(column, along, strict=True))) for column in zip(*directions, strict=True)]
-    limit = cancel(next(-push / row for push, row in zip(pushes, rows, strict=True) if row))
+    limit = next(_quotient(-push, row) for push, row in zip(pushes, rows, strict=True) if row)
     if not all(_vanishes(push + limit * row) for push, row in zip(pushes, rows, strict=True)):
         return None
     at_rest: list[tuple[Expr, Expr]] = []
@@ -139,6 +139,15 @@ def _limit(
     resting = dict.fromkeys(slip, S.Zero)
     above, below = (limit.xreplace(dict.fromkeys(own, side) | resting).subs(at_rest) for side in (S.One, S.Zero))
     return limit if above != 0 and _is_nowhere_negative(limit, system.constants) and _vanishes(above - below) else None
+
+
+def _quotient(numerator: Expr, denominator: Expr) -> Expr:
+    """Return a quotient without common factors; functions stay as written: exp(-u**2) is not 1/exp(u**2)."""
+    from sympy import Dummy, Function, cancel
+
+    quotient = numerator / denominator
+    written = {part: Dummy() for part in quotient.atoms(Function)}
+    return cancel(quotient.xreplace(written)).xreplace({mark: part for part, mark in written.items()})
 
 
 def _is_nowhere_negative(limit: Expr, constants: Mapping[Symbol, float]) -> bool:
