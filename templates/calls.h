@@ -211,6 +211,36 @@ int NAME(call_pieces)(NAME(call) *c, long long count, const double *t, const dou
 #endif
 #define MOST_PARTS 16 /* of a step that the iteration does not solve, before Newton's method is loaded */
 
+#if defined(KEPT) && (defined(SUPPORT_SEPARABLE_ITERATION_H) || defined(SUPPORT_COUPLED_ITERATION_H))
+#define HAS_CURVES
+#endif
+
+/* Abscissae of the points at which a run keeps forces or velocities of the last step; returns their number, 0: none. */
+int NAME(call_abscissae)(double *abscissae)
+{
+#ifdef HAS_CURVES
+  for (int j = 0; j < KEPT; j++)
+    abscissae[j] = VECTOR_ENTRY(ABSCISSA, j);
+  return KEPT;
+#else
+  (void)abscissae;
+  return 0;
+#endif
+}
+
+/* Copies these values, M of each point, of a step that the iteration solved; NaN: there are none. Returns the next. */
+static double *NAME(call_keep)(const NAME(run) *run, int parts, double *curve)
+{
+#ifdef HAS_CURVES
+  for (int i = 0; curve && i < M; i++)
+    for (int j = 0; j < KEPT; j++)
+      *curve++ = parts == 1 && run->guess > 0 ? run->memory[i * POINTS + j] : NAN;
+#else
+  (void)run, (void)parts;
+#endif
+  return curve;
+}
+
 /* Length of a vector in units of sizes; infinite where a component other than 0 has the size 0. */
 static double NAME(relative_length)(int count, const double *x, const double *size)
 {
@@ -278,16 +308,33 @@ static int NAME(call_parts)(NAME(call) *c, double t, double h, int by_newton, co
   return 0;
 }
 
+/* Length of a defect relative to the change of the state in its step, a power of 2, so that sizes, which later states
+ * change, do not change bits. */
+static double NAME(call_defect_size)(const double *q, const double *p, const double *size, const double *defect)
+{
+  double change[2 * M];
+  for (int i = 0; i < M; i++)
+    change[i] = q[M + i] - q[i], change[M + i] = p[M + i] - p[i];
+  const double part = NAME(relative_length)(2 * M, defect, size) / NAME(relative_length)(2 * M, change, size);
+  return part > 0.0 && part < INFINITY ? exp2(floor(log2(part))) : 0.0;
+}
+
 /* Defects of `count` + 1 states of another run at times t by one step phi of size h from each, which begins at the
  * curve of the last one. Where the iteration fails it is taken in `parts`; where that does not suffice, Newton's method
- * solves all further ones. 0: no number of parts resolves the step. */
+ * solves all further ones. 0: no number of parts resolves the step. Iterations leave limits[3] of the defect before.
+ * Values of the steps at their points go into curves, unless that is NULL. */
 int NAME(call_defects)(NAME(call) *c, long long count, const double *t, const double *h, const double *q,
-    const double *p, const double *size, const double *limits, double *defects, int *parts)
+    const double *p, const double *size, const double *limits, double *curves, double *defects, int *parts)
 {
   int least = 1, by_newton = 0;
+  double expected = 0.0;
+  const NAME(options) exact = c->options ? *c->options : NAME(default_options)();
+  NAME(options) options = exact;
+  c->options = &options;
   NAME(start)(c->run, t[0], h[0], q, p);
   memset(defects, 0, sizeof(double) * (size_t)(count * 2 * M));
   for (long long k = 0; k < count; k++, q += M, p += M, defects += 2 * M) {
+    options.tolerance = fmax(exact.tolerance, limits[3] * expected);
     parts[k] = NAME(call_parts)(c, t[k], h[k], by_newton, q, p, size, limits, defects, &least);
     if (least > MOST_PARTS) {
       NAME(start)(c->run, t[k], h[k], q, p);
@@ -297,6 +344,8 @@ int NAME(call_defects)(NAME(call) *c, long long count, const double *t, const do
     }
     if (parts[k] < 0)
       return -parts[k];
+    curves = NAME(call_keep)(c->run, parts[k], curves);
+    expected = parts[k] == 0 ? 0.0 : NAME(call_defect_size)(q, p, size, defects);
     if (parts[k] == 0)
       NAME(start)(c->run, t[k], h[k], q + M, p + M);
   }

@@ -8,8 +8,9 @@
     Error of usage unless a file can be written, of ``states`` also in its format, before a long computation.
 ``progress_bar(steps, label)``
     Context of a bar on a terminal: a function of the number of completed steps and a text beside it.
-``model_arguments(*further)``, ``read_model(name, choices)``
-    Decorator of the argument MODEL and its options; the ``Model`` of these.
+``model_arguments(*further)``, ``read_model(name, choices, unused=)``
+    Decorator of the argument MODEL and its options; the ``Model`` of these, whose file may lack the keys that a
+    function of its sections returns.
 ``ModelSection(keys, system, initial, check)``
     A section of model files, in ``section.py`` of an extra, with the checks of keys and numbers, ModelFileError.
 ``part(kind, name)``

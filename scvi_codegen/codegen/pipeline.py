@@ -25,7 +25,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property, partial
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from sympy import Expr
 
@@ -41,7 +41,6 @@ from scvi_codegen.codegen.lowering.program import lower, lower_arrays, summing_s
 from scvi_codegen.codegen.lowering.solvers.points import summing_action
 from scvi_codegen.codegen.lowering.stage_groups import system_kernel
 from scvi_codegen.codegen.native.announcements import announced
-from scvi_codegen.codegen.rendering.events import EventFormulas, with_events
 from scvi_codegen.codegen.rendering.kernels.simd import Fallback
 from scvi_codegen.codegen.rendering.program_source import (
     EMBEDDED,
@@ -80,7 +79,6 @@ from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import tables_in_two_words
 from scvi_codegen.systems.arrays.symmetry import momentum_maps
 from scvi_codegen.systems.constraints import dissipates
-from scvi_codegen.systems.contacts.modes import bound_contacts
 from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.derived_systems import with_tangent_vectors
@@ -89,11 +87,13 @@ from scvi_codegen.systems.formulas.expressions import gradient_tuple
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
 from scvi_codegen.systems.formulas.tables import tables_in
 from scvi_codegen.systems.kinks import located_kinks
-from scvi_codegen.systems.legendre.of_arrays import SiteHamiltonian, site_hamiltonian
 from scvi_codegen.systems.legendre.transform import energy_of_states, equivalent_lagrangian
 from scvi_codegen.systems.symmetry.symmetry import SYMMETRIES, Symmetry, all_symmetries
 from scvi_codegen.systems.system import BATH_ENERGY, MechanicalSystem
 from scvi_codegen.systems.term_groups import roll_terms
+
+if TYPE_CHECKING:
+    from scvi_codegen.systems.legendre.of_arrays import SiteHamiltonian
 
 LONGEST_PREFIX = 64
 C_HEADERS = frozenset(
@@ -462,6 +462,8 @@ class Sources:
         states = *system.coordinates, *system.momentum_symbols
         match observed:
             case Crossings(functions):
+                from scvi_codegen.codegen.rendering.events import EventFormulas
+
                 formulas = EventFormulas(self.interface, as_events(functions))
                 momenta = dict(zip(formulas.p, system.momentum_symbols, strict=True))
                 values: Sequence[Expr] = [value.xreplace(momenta) for value in formulas.functions]
@@ -543,7 +545,11 @@ class ArraySources(Sources):
     def sites(self) -> SiteHamiltonian | None:
         """Hamiltonian by which the system is integrated, of a Lagrangian with other velocities than m v**2/2."""
         by_momenta = self.g is None and self.solver == "fixed-point" and self.system.coupled_terms
-        return site_hamiltonian(self.system) if by_momenta and not self.system.bath else None
+        if self.system.bath or not by_momenta:
+            return None
+        from scvi_codegen.systems.legendre.of_arrays import site_hamiltonian
+
+        return site_hamiltonian(self.system)
 
     @without_collection
     def integrator(self, *, controlled: bool = True) -> tuple[Source, Interface]:
@@ -653,6 +659,8 @@ def generate_source(
     if system.has_contacts and time_transformation is not None:
         raise MethodError(f"time_transformation={str(time_transformation)!r} is not available with contacts: omit it")
     if system.has_contacts:
+        from scvi_codegen.systems.contacts.modes import bound_contacts
+
         system, rows = bound_contacts(system, system.contacts)
     form = discretised_form(system, method)
     system, located = located_kinks(form) if locates and original.bath is None else (form, ())
@@ -674,5 +682,8 @@ def generate_source(
     if located:
         interface = replace(interface, kinks=form.kinks, modes=_modes_of(located))
     searched = interface.searched(as_events(events))
-    complete = with_events(source, interface, searched) if searched else source
-    return (complete.single_file() if embedded else complete), interface
+    if searched:
+        from scvi_codegen.codegen.rendering.events import with_events
+
+        source = with_events(source, interface, searched)
+    return (source.single_file() if embedded else source), interface

@@ -6,9 +6,25 @@ import sys
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from contextvars import ContextVar
+from typing import Any, Literal, TypeAlias
 
 PACKAGE = __name__.partition(".")[0]
+
+
+Face: TypeAlias = Literal["python", "model", "file", "command"]
+"""Where a user writes the options that messages name: a call, a :class:`Model`, its file, or a command with MODEL."""
+FACE: ContextVar[Face] = ContextVar("face", default="python")
+
+
+@contextmanager
+def speaking(face: Face) -> Iterator[None]:
+    """Let messages name options in the words of a face, the outermost one that is no call of Python."""
+    token = FACE.set(face if FACE.get() == "python" else FACE.get())
+    try:
+        yield
+    finally:
+        FACE.reset(token)
 
 
 def closest(name: str, candidates: Iterable[str]) -> str:

@@ -1,6 +1,7 @@
 """Values that are made when they are first needed."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Generic, TypeVar
 
 Value = TypeVar("Value")
@@ -25,3 +26,12 @@ class Once(Generic[Value]):
 
     def __reduce__(self) -> tuple[object, ...]:
         return Once, (self.make,)
+
+
+def constantly(value: Value) -> Callable[[], Value]:
+    """Return a function that returns a value, and can be pickled."""
+    return partial(_itself, value)
+
+
+def _itself(value: Value) -> Value:
+    return value

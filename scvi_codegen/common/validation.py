@@ -93,18 +93,6 @@ LARGEST_COUNT = 2**53 - 1
 """Largest integer below which binary64 represents every integer."""
 
 
-TOLERANCE_RANGE = (
-    "the tolerance must be positive and below 1 (relative error of each step), not {value:g}: leave it out for errors "
-    "at round-off level"
-)
-
-
-def check_tolerance(value: float) -> None:
-    """Raise an error unless the tolerance of adaptive steps is positive and below 1."""
-    if not 0.0 < value < 1.0:
-        raise StateError(TOLERANCE_RANGE.format(value=value))
-
-
 def checked_count(
     value: Any, name: str, *, least: int, most: int = LARGEST_COUNT, error: type[ScviCodegenError] = StateError
 ) -> int:

@@ -23,8 +23,8 @@ from scvi_codegen.methods.constraints import with_constraints
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table, Velocities
 from scvi_codegen.methods.tables.basis import identity_matrix, next_step
-from scvi_codegen.systems.checks.unlocated_kinks import warn_of_formulas
 from scvi_codegen.systems.derived_expressions import auxiliary_multipliers, forms_of
+from scvi_codegen.systems.event import warn_of_formulas
 from scvi_codegen.systems.first_order import FirstOrderSystem
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
 from scvi_codegen.systems.formulas.intermediates import intermediate, symbols_of

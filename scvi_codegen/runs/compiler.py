@@ -25,8 +25,9 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.codegen.native.building import TUNED_FLAGS
 from scvi_codegen.codegen.native.compilers import REORDERING_FLAGS
-from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE, PRECISIONS, Interface, Source
-from scvi_codegen.codegen.variants import SUMS, Derivatives, Sums, Variant
+from scvi_codegen.codegen.options import OPTION
+from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE, Interface, Source
+from scvi_codegen.codegen.variants import Derivatives, Sums, Variant
 from scvi_codegen.common.cache import cached_source, key_of
 from scvi_codegen.common.errors import MethodError, MethodWarning, SizesRequiredError
 from scvi_codegen.common.once import Once
@@ -42,12 +43,11 @@ from scvi_codegen.methods import (
     sliding,
 )
 from scvi_codegen.methods.method import Method
-from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
+from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.compiled_method import Variants
-from scvi_codegen.systems.checks.unlocated_kinks import warn_of_formulas
 from scvi_codegen.systems.contact import ContactLike
 from scvi_codegen.systems.contacts.rows import ContactRows
-from scvi_codegen.systems.event import Event, EventLike, as_events
+from scvi_codegen.systems.event import Event, EventLike, as_events, warn_of_formulas
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
 from scvi_codegen.systems.system import MechanicalSystem
 
@@ -125,8 +125,7 @@ def compile_stepper(
         MethodError: if the method, the solver or another argument is not available for the system.
     """
     check_precision(precision, flags)
-    if sums not in SUMS:
-        raise MethodError(f"unknown sums {sums!r}: use {' or '.join(map(repr, SUMS))}")
+    summed: Sums = OPTION["sums"].checked(sums, MethodError)
     of_finer = {"sizes": sizes, "tables": tables, "flags": flags, "precision": precision}
     finer = Once(partial(_finer_stepper, system, method, tuple(contacts), of_finer))
     others = {"precision": precision, "sizes": sizes, "tables": tables, "controller": controller}
@@ -146,7 +145,7 @@ def compile_stepper(
     if method is None and not rows:
         looser = _looser(stated, {**further, "precision": precision})
     if isinstance(system, OfRunTimeSizes) and sizes is None and tables is None:
-        of_arrays = _compile_arrays(system, method, symmetries, as_events(events), precision, common, sums, looser)
+        of_arrays = _compile_arrays(system, method, symmetries, as_events(events), precision, common, summed, looser)
         of_arrays._finer = finer
         return of_arrays
     if sums == "plain":
@@ -238,6 +237,8 @@ def _compile_arrays(
     looser: Once[Stepper] | None,
 ) -> Stepper:
     """Return the stepper of arrays whose sizes each run determines; ``common``: further arguments."""
+    from scvi_codegen.runs.array_stepper import StepperOfRunTimeSizes
+
     if precision == AUTO:
         raise MethodError(f"precision='auto' is not available with arrays of run-time sizes: {SIZES_REQUIRED}")
     if symmetries:
@@ -281,8 +282,7 @@ def check_precision(precision: str, flags: Sequence[str]) -> None:
             "precision='single' is that of ensembles, integrate_ensemble(.., precision='single'), and of C for "
             "microcontrollers, generate_source(.., embedded='single'): omit it here"
         )
-    if precision not in PRECISIONS:
-        raise MethodError(f"unknown precision {precision!r}: use {', '.join(map(repr, PRECISIONS[:-1]))} or {AUTO!r}")
+    OPTION["precision"].checked(precision, MethodError)
     if precision == DOUBLE_DOUBLE and (worst := [flag for flag in flags if flag in REORDERING_FLAGS]):
         raise MethodError(
             f"the compiler flag {worst[0]!r} reorders sums, which destroys precision='double-double': omit it "

@@ -32,7 +32,7 @@ from scvi_codegen.runs.ensembles.lanes import CommonRuns, LaneRuns
 from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
 from scvi_codegen.runs.ensembles.schedule import CommonSteps
 from scvi_codegen.runs.events.saltation import check_sides
-from scvi_codegen.runs.states.layout import InitialData
+from scvi_codegen.runs.states.layout import InitialData, StateLayout
 from scvi_codegen.runs.states.reduction import Reduction
 from scvi_codegen.runs.states.rotation_quantities import observable_derivatives, observable_names, observables
 from scvi_codegen.runs.states.rotations import Member, members_of
@@ -114,6 +114,55 @@ class Products:
         from scvi_codegen.runs.accuracy.run_error import finer_of
 
         return finer_of(self.stepper)
+
+    @property
+    def states(self) -> StateLayout:
+        """Layout of states: ``start``, ``positions`` and ``vector`` read those by name, ``axes`` counts their axes."""
+        return self.stepper._states  # type: ignore[no-any-return]
+
+    def parameters(self, values: Parameters) -> Array:
+        """Return the (k,) parameters of values by name, the others by default; StateError for wrong ones."""
+        return self.stepper._parameters(values)  # type: ignore[no-any-return]
+
+    def start(
+        self, q: States, p: States | None, velocity: States | None, t: float, parameters: Parameters
+    ) -> tuple[Array, Array]:
+        """Return (2m,) positions and momenta, and the (k,) parameters, of a state by p or by velocity.
+
+        Raises:
+            StateError: for wrong shapes, names and numbers, and unless exactly one of p and velocity is passed.
+        """
+        values = self.parameters(parameters)
+        q, p, velocity = self.states.start(q, p, velocity)
+        momenta = self.stepper._initial_momenta(q, p, velocity, t, values)
+        return np.concatenate(self.states.pair(q, momenta)), values
+
+    @property
+    def tangents(self) -> int:
+        """Number of variables of a step that tangent vectors have: (q, p), parameters, t and h."""
+        return self.stepper._input_size  # type: ignore[no-any-return]
+
+    def propagate(
+        self,
+        starts: Starts,
+        vectors: Array,
+        parameters: Array,
+        options: SolverOptions | None = None,
+        *,
+        transpose: bool = False,
+    ) -> None:
+        """Propagate tangent vectors, or by ``transpose`` cotangents, along n steps, in place.
+
+        Args:
+            starts: initial data of the steps.
+            vectors: (n + 1, count, tangents) variations: the image of row i under step i is added to row i + 1, or
+                that of row i + 1 by the transpose to row i.
+            parameters, options: of the steps.
+
+        Raises:
+            StepFailedError: if a step fails.
+        """
+        self.stepper._propagate(starts, vectors, parameters, options, transpose=transpose)
 
     def run_by(
         self,

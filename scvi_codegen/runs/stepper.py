@@ -8,56 +8,35 @@ Neither SymPy nor Jinja is imported.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property, lru_cache, partial, wraps
+from functools import cached_property, lru_cache, partial
 from math import isfinite
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.native.arguments import checked_number
-from scvi_codegen.codegen.native.binding import BY_VELOCITY, ON_CONSTRAINTS, Binding, with_calls
+from scvi_codegen.codegen.native.binding import ON_CONSTRAINTS
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import Source
-from scvi_codegen.codegen.variants import Variant
 from scvi_codegen.common.errors import MethodError, StateError
-from scvi_codegen.common.once import Once
+from scvi_codegen.common.once import constantly
 from scvi_codegen.common.validation import ArgumentType, checked_count, checks_arguments, of
-from scvi_codegen.runs.accuracy.global_error import Runs, checked_error, warn_of_unconfirmed_run
-from scvi_codegen.runs.accuracy.growth import measures_growth, warn_of_error_growth
-from scvi_codegen.runs.accuracy.local_error import warn_of_inaccuracy
-from scvi_codegen.runs.accuracy.warning_switch import warn_of_failed_check
-from scvi_codegen.runs.driver.bounded_motion import BoundedMotion
-from scvi_codegen.runs.driver.observation import Observe
-from scvi_codegen.runs.driver.run import Run
-from scvi_codegen.runs.driver.segments import InputSegments, checked_inputs, final_time
-from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings
-from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
-from scvi_codegen.runs.events.contacts import in_first_modes
-from scvi_codegen.runs.events.refinement import WithEventsInDouble, constantly
-from scvi_codegen.runs.forwarding import Forwarded, OfSteppers
-from scvi_codegen.runs.results.dense_output import check_has_end, times_of_run
-from scvi_codegen.runs.results.output import ALL_STATES, Output
+from scvi_codegen.runs.forwarding import OfSteppers
 from scvi_codegen.runs.states.layout import InitialData
 from scvi_codegen.runs.states.times import times_after
-from scvi_codegen.runs.states.validation import Array, Parameters, States, check_step_given, flat_state
+from scvi_codegen.runs.states.validation import Array, Parameters, States, check_step_given
 from scvi_codegen.runs.states.words import check_doubles, hashed
-from scvi_codegen.runs.stepping.array_interface import RunSizes, interface_of_sizes, shapes_of_call, sizes_of_run
 from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.runs.stepping.features import check_together, require
 from scvi_codegen.runs.stepping.integrator import Integrator
-from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise, with_sequences
 from scvi_codegen.runs.stepping.projection import consistent, constraint_values, multipliers, projected
-from scvi_codegen.runs.stepping.saving import read_checkpoint
-from scvi_codegen.runs.stepping.state_functions import neither_or_both
 from scvi_codegen.runs.stepping.step_plan import (
     Adaptive,
     ErrorControl,
     Fixed,
-    FixedSteps,
     KindOfSteps,
     StepPlan,
     Until,
@@ -66,24 +45,31 @@ from scvi_codegen.runs.stepping.step_plan import (
     duration_of,
     planned_steps,
 )
-from scvi_codegen.runs.trajectory import Trajectory
 from scvi_codegen.systems.event import Event, EventLike
-from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
 
 if TYPE_CHECKING:
+    from scvi_codegen.runs.driver.bounded_motion import BoundedMotion
+    from scvi_codegen.runs.driver.observation import Observe
+    from scvi_codegen.runs.driver.run import Run
+    from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings
+    from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
+    from scvi_codegen.runs.events.functions import EventFunctions
     from scvi_codegen.runs.products import Products
+    from scvi_codegen.runs.stepping.noise import Noise
+    from scvi_codegen.runs.trajectory import Trajectory
 
 Called = TypeVar("Called", bound=Callable[..., Any])
 
 
-class Stepper(WithEventsInDouble, OfSteppers, Integrator):
+class Stepper(OfSteppers, Integrator):
     """Compiled integrator of one system: :class:`Integrator` with integrations, runs, ensembles and projections."""
 
     KIND: ClassVar[ArgumentType]
     """Kind of an argument that is a stepper, for ``checks_arguments``."""
-    _trajectory_type = Trajectory
     _precise: Callable[[], Stepper | None] | None = None
     """Function that returns the stepper in double-double if there is one, for ``error=`` with precision="auto"."""
+    _doubles: Callable[[], Stepper] | None = None
+    """Function that returns the integrator in double, without events, of one in double-double."""
     _finer: Callable[[], Any] | None = None
     """Function that returns the stepper of a finer method, for ``run.error``; ``None`` without the system."""
 
@@ -92,9 +78,32 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
         copy._precise, copy._doubles, copy._finer = self._precise, self._doubles, self._finer
         return copy
 
+    @property
+    def _in_double(self) -> Stepper:
+        """The integrator in double with the same events, which locates those of one in double-double."""
+        if self._doubles is None:
+            raise MethodError(
+                "events= with precision='double-double' require the integrator in double, which a stepper that was "
+                "loaded or pickled without events lacks: compile the system"
+            )
+        return self._doubles().with_events(self.events)
+
+    def _compile(self) -> None:
+        super()._compile()
+        if self.interface.words > 1 and self.events and self._doubles is not None:
+            self._in_double._compile()
+            _ = self._event_functions
+
+    @cached_property
+    def _event_functions(self) -> EventFunctions:
+        """The functions of the events in 40 digits."""
+        from scvi_codegen.runs.events.functions import EventFunctions
+
+        return EventFunctions(self, self.events)
+
     def __reduce__(self) -> tuple[Any, ...]:
         if self.origin is not None:
-            return (_rebuild_bound, (self.origin, self.problem, self.events))
+            return cast(Any, self.origin)._rebuilt, (self.problem, self.events)
         variants = self._variants if self._reason is None else Variants()
         made = partial(
             type(self),
@@ -213,18 +222,26 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
             save_every = checked_count(save_every, "save_every", least=1)
         stepper: Stepper = self if events is None and not action else self._for_run(events, action=action)
         interface = self.interface
-        noise = Noise.checked(stepper, seed, metropolis, inputs=inputs) if seed != 0 or metropolis else DEFAULT_NOISE
+        noise = stepper._noise(seed, metropolis, inputs) if seed != 0 or metropolis else None
         if not (inputs is None and t_eval is None and observe is None and tables is None and threads is None):
+            from scvi_codegen.runs.results.dense_output import check_has_end
+
             self._check_not_of_run(tables, threads)
             stride = None if save_every == 1 else save_every
             check_together(inputs=inputs, t_eval=t_eval, observe=observe, save_every=stride, error=error)
             check_has_end(t_eval, t, h, t_end)
             if inputs is not None:
+                from scvi_codegen.runs.driver.segments import InputSegments, checked_inputs, final_time
+                from scvi_codegen.runs.stepping.noise import with_sequences
+
                 end = partial(final_time, t, h, steps, t_end)
                 inputs = checked_inputs(interface, with_sequences(interface.inputs, inputs, seed, t=t, h=h, end=end))
         if interface.rotations or interface.variables:
             q, p, velocity = self._states.start(q, p, velocity)
         if error is not None:
+            from scvi_codegen.runs.accuracy.global_error import checked_error
+            from scvi_codegen.runs.driver.bounded_motion import BoundedMotion
+
             require(stepper, "error")
             motion = BoundedMotion(
                 stepper=stepper,
@@ -246,58 +263,24 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
             stepper, plan, count = stepper._planned.__wrapped__(*schedule)
         if max_step is not None:
             check_max_step(plan, t, interface.words)
-        segments, output = None, ALL_STATES
+        segments, output = None, None
         if inputs is not None:
             segments = InputSegments(stepper, inputs, parameters, t, final_time(t, h, steps, t_end))
             plan, parameters = segments.plan(plan), segments.first
         if not (save_every == 1 and t_eval is None and observe is None and progress is None):
+            from scvi_codegen.runs.results.output import Output
+
             times = None if t_eval is None else stepper._output_times(t_eval, t, plan, count)
             output = Output(save_every, times, observe, progress)
         initial = tuple.__new__(InitialData, (q, p, velocity, t, parameters, options))  # without a call of Python
         return stepper._integrated(initial, plan, count, output, segments, check_growth, noise)
 
-    def _integrated(
-        self,
-        initial: InitialData,
-        plan: StepPlan,
-        steps: int | None,
-        output: Output,
-        segments: InputSegments | None,
-        check_growth: bool | None,
-        noise: Noise,
-    ) -> Trajectory:
-        """Return a run of validated steps, ``None`` to the target time, with its warnings; ``segments``: of inputs."""
-        by_velocity, begins_by = initial.velocity is not None, self._begins_by
-        if (initial.p is not None) == by_velocity:
-            raise neither_or_both(initial.p)
-        if begins_by is not None and segments is None:
-            begins_by |= BY_VELOCITY * by_velocity
-        else:
-            q, p = self._consistent_state(initial, plan)
-            initial, begins_by = initial._replace(q=q, p=p, velocity=None), 0
-        fixed = isinstance(plan, FixedSteps)
-        growth = not (fixed and not check_growth) and measures_growth(self, plan, check_growth)
-        try:
-            run: Run = self._released_runs.pop()
-        except IndexError:  # all are in use
-            run = Run._reusable(self)
-        run._set_up(plan, initial)
-        run._noise = noise
-        if segments is None:
-            trajectory = run._integrated(initial, begins_by, growth, steps, output)
-        else:
-            run._start_from(initial, begins_by, growth)
-            trajectory = segments.record(run, output.save_every, output.progress)
-        try:
-            if segments is None:
-                warn_of_inaccuracy(trajectory, run)
-            if growth:
-                warn_of_error_growth(run, float(trajectory.t[-1]), requested=check_growth is True)
-        except Exception as failure:  # noqa: BLE001  (the run is complete)
-            warn_of_failed_check(failure)
-        if run._rows is not None:  # large memory is freed instead
-            self._released_runs.append(run)
-        return trajectory
+    @cached_property
+    def _integrated(self) -> Callable[..., Trajectory]:
+        """Function :func:`~scvi_codegen.runs.driver.run.integrated` of this stepper: a run with its warnings."""
+        from scvi_codegen.runs.driver.run import integrated
+
+        return partial(integrated, self)
 
     def _for_run(self, events: EventLike | Sequence[EventLike] | None, *, action: bool) -> Self:
         """Return the stepper of runs with these events, ``None`` for its own, that sum the action if requested."""
@@ -322,6 +305,8 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
 
     def _bounded(self, motion: BoundedMotion) -> Trajectory:
         """Return the run whose relative global error is confirmed to be bounded, in double-double if double fails."""
+        from scvi_codegen.runs.accuracy.global_error import Runs, warn_of_unconfirmed_run
+
         trajectory: Trajectory = Runs(motion).confirmed_run()
         assert trajectory.confirmation is not None  # by confirmed_run
         if not (trajectory.confirmation.confirmed or self._has_tau) and (precise := self._in_double_double) is not None:
@@ -368,10 +353,17 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
         self._check_not_of_run(tables, threads)
         initial = InitialData(*self._states.start(q, p, velocity), t, parameters, options)
         control = ErrorControl(tolerance, absolute_tolerance, max_step, first_step)
-        return self._started(initial, self._plan(h, t_end, control), Noise.checked(self, seed, metropolis))
+        return self._started(initial, self._plan(h, t_end, control), self._noise(seed, metropolis))
 
-    def _started(self, initial: InitialData, plan: StepPlan, noise: Noise = DEFAULT_NOISE) -> Run:
+    def _noise(self, seed: int, metropolis: bool, inputs: Any = None) -> Noise:
+        from scvi_codegen.runs.stepping.noise import Noise
+
+        return Noise.checked(self, seed, metropolis, inputs=inputs)
+
+    def _started(self, initial: InitialData, plan: StepPlan, noise: Noise | None = None) -> Run:
         """Return a run at its start, on the constraints."""
+        from scvi_codegen.runs.driver.run import Run
+
         stepper = self._at_tolerance(plan.tolerance) if isinstance(plan, Adaptive) else self
         (q, p), (*_, t, parameters, options) = stepper._consistent_state(initial, plan), initial
         return Run.started(stepper, q, p, plan=plan, t=t, parameters=parameters, options=options, noise=noise)
@@ -381,6 +373,8 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
         q, p, velocity, t, parameters, _ = initial
         p = self._initial_momenta(q, p, velocity, t, parameters)
         if self.interface.contacts:
+            from scvi_codegen.runs.events.contacts import in_first_modes
+
             return in_first_modes(self, q, p, t, parameters, duration_of(plan, t))
         if not self.interface.constraints:
             return q, p
@@ -403,6 +397,8 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
         return ON_CONSTRAINTS if interface.constraints else 0
 
     def _run(self, q: Array, p: Array, **arguments: Any) -> Run:
+        from scvi_codegen.runs.driver.run import Run
+
         return Run.started(self, q, p, **arguments)
 
     def _plan(self, h: float | None, t_end: float | None, control: ErrorControl) -> StepPlan:
@@ -424,6 +420,8 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
         return (self._at_tolerance(plan.tolerance) if isinstance(plan, Adaptive) else self), plan, count
 
     def _output_times(self, t_eval: ArrayLike, t: float, plan: StepPlan, steps: int | None) -> Array:
+        from scvi_codegen.runs.results.dense_output import times_of_run
+
         require(self, "t_eval")
         if self.interface.words > 1:
             check_doubles(t_eval=t_eval)
@@ -456,6 +454,9 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
         Raises:
             StateError: if the bytes are damaged (their checksum differs) or belong to another integrator.
         """
+        from scvi_codegen.runs.driver.run import Run
+        from scvi_codegen.runs.stepping.saving import read_checkpoint
+
         transformed = self.interface.time_transformation is not None
         if h is not None and not transformed:
             raise StateError("omit h: the saved run contains its step size")
@@ -541,11 +542,9 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
             StateError: if a shape, name or number is invalid.
             MethodError: if the method has no trajectories in SIMD lanes, for ``observe`` and single precision.
         """
-        times: Any = {"h": h, "steps": steps, "t_end": t_end, "save_every": save_every, "t": t, "t_eval": t_eval}
-        times |= {"max_step": max_step, "first_step": first_step, "options": options}
-        errors: Any = {"tolerance": tolerance, "absolute_tolerance": absolute_tolerance, "error": error}
-        others: Any = {"inputs": inputs, "parameters": parameters, "seed": seed, "metropolis": metropolis}
-        settings = EnsembleSettings(**times, **errors, **others, observe=observe, precision=precision)
+        from scvi_codegen.runs.ensembles.ensemble import EnsembleSettings
+
+        settings = {name: value for name, value in locals().items() if name in EnsembleSettings.__dataclass_fields__}
         runs = self.products.ensemble_runs(q, p, settings, velocity=velocity, action=action)
         runs.run(progress=progress, threads=threads)
         return self.products.ensemble_result(runs)
@@ -560,8 +559,12 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
         action: bool = False,
     ) -> Ensemble:
         """Return the ensemble of :meth:`integrate_ensemble`, with the same arguments."""
+        from scvi_codegen.runs.ensembles.ensemble import Ensemble
+
         q, p, velocity = self._states.start(q, p, velocity)
         if settings.error is not None:
+            from scvi_codegen.runs.accuracy.global_error import checked_error
+
             require(self, "error")
             steps = {"h": settings.h, "steps": settings.steps, "tolerance": settings.tolerance}
             settings = replace(settings, error=checked_error(settings.error, steps, self))
@@ -612,177 +615,6 @@ class Stepper(WithEventsInDouble, OfSteppers, Integrator):
         """
         g, rate = constraint_values(self, q, p, t, parameters)
         return (g[0], rate[0]) if self._states.is_one(q) else (g, rate)
-
-
-class UnavailableError(MethodError, AttributeError):
-    """Error of an attribute that requires known sizes; ``hasattr`` is false."""
-
-
-def _bound(method: Called, *, at_rest: bool = False) -> Called:
-    """Return a method of steppers of run-time sizes that binds a stepper to its arrays and calls the method of this.
-
-    It has the further argument ``tables``. The first argument is a position; ``at_rest``: without p and velocity the
-    initial velocity is 0.
-    """
-
-    @wraps(method)
-    def call(self: StepperOfRunTimeSizes, q: Any, *arguments: Any, **named: Any) -> Any:
-        return self._call_bound(method, at_rest, q, arguments, **named)
-
-    return cast(Called, call)
-
-
-def _bound_path(method: Called) -> Called:
-    """Return the method ``path``; the positions that determine the sizes are q0, or of closed paths the first."""
-
-    @wraps(method)
-    def call(self: StepperOfRunTimeSizes, q0: Any = None, *arguments: Any, **named: Any) -> Any:
-        start = named.get("start")
-        if q0 is not None or start is None:
-            return self._call_bound(method, False, q0, arguments, **named)
-        if callable(start):
-            first = start(named.get("t", 0.0))
-        else:
-            first = {name: x[0] for name, x in start.items()} if isinstance(start, Mapping) else start[0]
-        return self.bind(first, named.get("parameters"))[0].path(None, *arguments, **named)
-
-    return cast(Called, call)
-
-
-class StepperOfRunTimeSizes(Stepper):
-    """Stepper of arrays whose sizes each call determines: its methods bind a stepper to the arrays of the call."""
-
-    run_time_sizes = True
-    _last: tuple[Hashable, Stepper | None] = None, None
-    _latest: tuple[Hashable, Stepper] | None = None
-
-    integrate = _bound(Stepper.integrate, at_rest=True)
-    start = _bound(Stepper.start, at_rest=True)
-    project = _bound(Stepper.project, at_rest=True)
-    integrate_ensemble = _bound(Stepper.integrate_ensemble, at_rest=True)
-    _ensemble = _bound(Stepper._ensemble, at_rest=True)
-    chaos_indicators_ensemble: Any = Forwarded("steppers", "chaos_indicators_ensemble", partial(_bound, at_rest=True))
-    path: Any = Forwarded("steppers", "path", _bound_path)
-    multipliers, constraint_values = _bound(Stepper.multipliers), _bound(Stepper.constraint_values)
-    step, step_positions = _bound(Stepper.step), _bound(Stepper.step_positions)
-    discrete_lagrangian = _bound(Stepper.discrete_lagrangian)
-    discrete_legendre_minus = _bound(Stepper.discrete_legendre_minus)
-    discrete_legendre_plus = _bound(Stepper.discrete_legendre_plus)
-    work_and_impulses, rates = _bound(Stepper.work_and_impulses), _bound(Stepper.rates)
-    energy, momentum_maps = _bound(Stepper.energy), _bound(Stepper.momentum_maps)
-    momentum, velocity = _bound(Stepper.momentum), _bound(Stepper.velocity)
-    initial_momentum = _bound(Stepper.initial_momentum)
-    jacobian, sensitivity = _bound(Stepper.jacobian), _bound(Stepper.sensitivity)
-    jvp, vjp = _bound(Stepper.jvp), _bound(Stepper.vjp)
-
-    def _call_bound(
-        self,
-        method: Callable[..., Any],
-        at_rest: bool,
-        q: Any,
-        arguments: tuple[Any, ...],
-        *,
-        parameters: Any = None,
-        tables: Mapping[str, ArrayLike] | None = None,
-        **named: Any,
-    ) -> Any:
-        """Call a method of the stepper that is bound to the arrays of the call."""
-        if method in (Stepper.integrate_ensemble, Stepper._ensemble):
-            operations = {"observe": "observe_ensemble", "precision": "single"}
-            for argument, operation in operations.items():
-                if named.get(argument) not in (None, "double"):
-                    require(self, operation)
-        threads = named.pop("threads", None) if method in PER_STEP else None
-        stepper = self if named.get("events") is None else self.with_events(named.pop("events"))
-        bound, state = stepper.bind(q, parameters, tables, threads)
-        if len(arguments) == 1 and arguments[0] is None:  # p=None by position
-            arguments = ()
-        if at_rest and not arguments and named.get("p") is None and named.get("velocity") is None:
-            layout = self.interface.layout
-            general = layout.momentum_formulas or (self._reason is not None and not layout.momenta)
-            spins = any(rotation.startswith("spin") for rotation in bound.interface.rotations)
-            if not (spins or bound.interface.variables):  # their state has momenta of its own
-                positions, *_ = bound._states.start(state, None, None)
-                named["velocity" if general else "p"] = np.zeros(np.shape(positions))
-        return method(bound, state, *arguments, parameters=parameters, **named)
-
-    def bind(
-        self, q: Any, parameters: Any = None, tables: Mapping[str, ArrayLike] | None = None, threads: int | None = None
-    ) -> tuple[Any, Any]:
-        """See :meth:`CompiledMethod.bind`."""
-        shapes, (last, bound) = None if tables is not None else shapes_of_call(q, parameters, threads), self._last
-        if shapes is None or shapes != last or bound is None:
-            problem = sizes_of_run(self.interface, q, parameters, tables, threads)
-            if self._reason is None:
-                bound = self._bound_to(problem)
-            elif problem.threads > 1:
-                raise MethodError(f"omit threads: this system is compiled with the sizes of each call. {self._reason}")
-            else:
-                bound = self.with_sizes(problem.sizes, tables=problem.places)
-            self._last = shapes, bound
-        if self.events:
-            bound = bound.with_events(self.events)
-        if (type(q) is np.ndarray and q.ndim == 1) or bound.interface.rotations or bound.interface.variables:
-            return bound, q
-        return bound, flat_state(bound.interface, q, "q")
-
-    def _bound_to(self, problem: RunSizes) -> Stepper:
-        """Return the stepper bound to these sizes and tables; the latest one is kept for later calls."""
-        if self._latest is None or self._latest[0] != problem.key:
-
-            def make(variant: Variant) -> Source | None:
-                stepper = bound.known if variant.of_known_sizes else self
-                return stepper._variants[variant]
-
-            interface = interface_of_sizes(self.interface, problem.sizes)
-            looser = None if self._looser is None else Once(lambda: cast(Any, self._looser)()._bound_to(problem))
-            further: dict[str, Any] = {"variants": Variants(make=make), "flags": self.flags, "looser": looser}
-            bound = Stepper(self._plain, interface, origin=self, problem=problem, **further)
-            self._latest = problem.key, bound
-        return self._latest[1]
-
-    def _load(self) -> None:
-        """Load nothing: bound steppers load the library."""
-
-    def __getattr__(self, name: str) -> Any:
-        if name in ("binding", "dimension"):  # of which the properties raised this error
-            raise self._unavailable(name)
-        raise AttributeError(f"'{type(self).__name__}' has no attribute '{name}'")
-
-    def _unavailable(self, name: str) -> UnavailableError:
-        return UnavailableError(f"{name} is not available for {self!r}: {SIZES_REQUIRED}")
-
-    @property
-    def binding(self) -> Binding:
-        """Unavailable: bound steppers have one."""
-        raise self._unavailable("binding")
-
-    @property
-    def dimension(self) -> int:
-        """Unavailable: it depends on the sizes."""
-        raise self._unavailable("dimension")
-
-    @property
-    def known(self) -> Self:
-        """Unavailable: a stepper of these sizes is required."""
-        raise MethodError(f"{self!r} requires sizes here: pass stepper.with_sizes(..). {SIZES_REQUIRED}")
-
-    def _compile(self) -> None:
-        if self._reason is None:
-            building.load(with_calls(self.source), flags=self.flags)
-
-    @property
-    def _has_error_estimate(self) -> bool:
-        """True if the method has adaptive steps; also if that follows from the sizes."""
-        return self._reason is not None or "advance_to" in self.source.contents.functions
-
-
-PER_STEP = (Stepper.integrate, Stepper.start)
-"""Methods whose ``threads`` are those of each step."""
-
-
-def _rebuild_bound(origin: StepperOfRunTimeSizes, problem: RunSizes, events: tuple[Event, ...]) -> Stepper:
-    return origin._bound_to(problem)._copy(events)
 
 
 Stepper.KIND = of("a compiled stepper", Stepper)

@@ -1,4 +1,4 @@
-"""Events: zero crossings of functions of the state, as specified and as detected."""
+"""Events: zero crossings of functions of the state, as specified and as detected; imports no SymPy."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Self, TypeAlias, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.common.errors import EventError
-from scvi_codegen.common.representation import summary
+from scvi_codegen.common.errors import EventError, MethodWarning, warn
+from scvi_codegen.common.representation import clipped, summary
 from scvi_codegen.common.validation import checked_count
 
 if TYPE_CHECKING:
@@ -386,3 +386,18 @@ def as_events(events: EventLike | Sequence[EventLike] | None) -> tuple[Event, ..
         return ()
     several = events if isinstance(events, list | tuple) else (events,)
     return tuple(event if isinstance(event, Event) else Event(event) for event in several)
+
+
+def warn_of_formulas(of: Any, subject: str) -> None:
+    """Warn that steps do not end at kinks of a system or an interface, other than rint and cutoffs of lists."""
+    kinks = [u for u in of.kinks if not (u.startswith("cos(pi*") or of.lengths)]
+    if kinks:
+        u, loop, indices = kinks[0].partition(" for ")
+        remedy = "Use short steps (h=, max_step=), or sizes= with at most 256 switching functions"
+        if getattr(of, "temperature", None) is not None:
+            remedy = "Use short steps (h=) or, with named coordinates, metropolis=True: its averages have no error of h"
+        warn(
+            f"{subject} does not locate the kinks of this system, such as {clipped(u, 60)} = 0{loop}{indices}: steps "
+            f"across them use the formulas as they are and lose order. {remedy}",
+            MethodWarning,
+        )

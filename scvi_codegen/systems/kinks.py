@@ -42,8 +42,6 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
 
     Systems in transformed time, and with more than ``MOST_KINKS`` switching functions, stay as they are.
     """
-    from scvi_codegen.systems.contacts.modes import mapped
-
     owned = [field.name for field in fields(system) if field.name in FORMULAS]
     formulas = [formula for name in owned for formula in _formulas(getattr(system, name))]
     parities = _parities(formulas, system)
@@ -56,6 +54,8 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
     arguments = {switching_function(step.args[0])[0] for step in located}
     if not arguments or len(arguments) > MOST_KINKS or system.clock:
         return system, ()
+    from scvi_codegen.systems.contacts.modes import mapped
+
     taken = {free.name for formula in formulas for free in formula.free_symbols}
     taken |= {variable.name for variable in (*system.coordinates, *system.velocities, *system.parameters)}
     numbers = (k for k in range(1, 10**6) if f"mode_{k}" not in taken)

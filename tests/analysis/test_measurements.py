@@ -25,6 +25,7 @@ from scvi_codegen.extras.verification.stepping import _agree, _solves, predictor
 from scvi_codegen.extras.verification.structure import _reversal, _symplecticity, structure_checks
 from scvi_codegen.extras.verification.system_under_test import State, SystemUnderTest
 from scvi_codegen.extras.verification.variable_steps import variable_step_checks
+from scvi_codegen.runs.products import Products
 
 
 def lagrangian(formula: str, coordinates: str = "q", **others: Any) -> sc.LagrangianSystem:
@@ -56,6 +57,7 @@ class Midpoint:
     )
     source = SimpleNamespace(files={"a.h": "1", "a.c": "2"})
     _input_size, mode_columns = 4, ()
+    products = property(Products)
 
     def __init__(self, errors: Any = (0.0, 0.0), sign: int = 0, forward: float = 0.0, back: float = 0.0) -> None:
         self.errors, self.sign, self.tangent_errors = 1.0 + np.array(errors), sign, (forward, back)

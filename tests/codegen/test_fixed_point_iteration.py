@@ -16,7 +16,7 @@ from scvi_codegen import SVI, LagrangianSystem, SolverOptions, Stepper, compile_
 from scvi_codegen.systems.system import MechanicalSystem
 
 H, T, STATES = 0.1, 0.7, 20
-ONE_ITERATION = SolverOptions(tolerance=1e300)
+ONE_ITERATION = SolverOptions(tolerance=1e300, absolute=True)
 ROUNDING = 64 * 2.0**-52
 
 

@@ -115,7 +115,7 @@ def test_unreadable_file_is_reported(file):
         ('{ file = "u.csv", values = [1.0] }', "must have either file, or t and values"),
         ('{ kind = "linear" }', "must have either file, or t and values"),
         ("{ t = [0.0, 1.0] }", "u values must be a list of numbers"),
-        ('{ t = [0.0, 1.0], values = [0.0, "a"] }', r"values\[1\] must be a number"),
+        ('{ t = [0.0, 1.0], values = [0.0, "a"] }', r"values\[1\] must be real numbers"),
         ("{ t = [0.0, 1.0, 0.5], values = [0.0, 1.0, 1.0] }", "must be ascending: 0.5 follows 1"),
         ("{ t = [0.0, 1.0], values = [0.0, 1.0], kind = 3 }", "kind must be text"),
         ('{ t = [0.0, 1.0], values = [0.0, 1.0], kind = "quintic" }', "constant or linear or cubic"),

@@ -97,5 +97,5 @@ def test_unsupported_model_fields_are_reported(shaken: Path, tmp_path: Path) -> 
         sc.Model(
             system=stretched, method=sc.SVI(4), q=(1, 0), p=(0, 1), h=0.1, span=3.0, time_transformation="frequency"
         )
-    with pytest.raises(ModelFileError, match="controller must be symplectic or predictive or reversible"):
+    with pytest.raises(ModelFileError, match=r"unknown .* 'pid': use 'symplectic' or 'predictive' or 'rev"):
         parse_model(SHAKEN.replace('"reversible"', '"pid"'))

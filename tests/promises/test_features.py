@@ -11,6 +11,7 @@ from features import FEATURES, KINDS, SUPPORTS, Kind, refusals
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
+from scvi_codegen.codegen.options import in_words
 from scvi_codegen.common.errors import MissingLibraryError, ScviCodegenError
 from scvi_codegen.runs.stepping import features
 
@@ -212,7 +213,7 @@ def test_refusals_of_the_table_are_those_of_the_operations(situation, situations
         assert not support
         with pytest.raises(ScviCodegenError) as error:
             OPERATIONS[operation](stepper)
-        remedy = features.FEATURES[operation, excluding]
+        remedy = in_words(features.FEATURES[operation, excluding])
         assert support.reason.endswith(remedy), (operation, situation)
         assert remedy in str(error.value), (operation, situation)
 

@@ -7,7 +7,7 @@ import pytest
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.runs.stepper import StepperOfRunTimeSizes
+from scvi_codegen.runs.array_stepper import StepperOfRunTimeSizes
 
 SYSTEMS = {
     "ring": {

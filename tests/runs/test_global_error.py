@@ -265,9 +265,9 @@ class TestCommandLine:
     @pytest.mark.parametrize(
         ("run", "words", "message"),
         [
-            ("error = 1e-9\ntolerance = 1e-9", [], "has both tolerance and error"),
-            ("error = 1e-9\nstep = 0.1", [], "has both step and error"),
-            ("error = 2.0", [], "between 0 and 1"),
+            ("error = 1e-9\ntolerance = 1e-9", [], "[run] tolerance and [run] error exclude each other"),
+            ("error = 1e-9\nstep = 0.1", [], "[run] step and [run] error exclude each other"),
+            ("error = 2.0", [], "[run] error = 2 must be positive and below 1"),
         ],
     )
     def test_invalid_files_are_rejected(self, tmp_path, run, words, message):

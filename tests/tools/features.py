@@ -13,6 +13,7 @@ import numpy as np
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
+from scvi_codegen.codegen.options import in_words
 from scvi_codegen.runs.stepping import features
 
 ENDS = {"named coordinates": ("x", "y", "z"), "known sizes": ("x", "q[2]"), "run-time sizes": ("x", "q[N]")}
@@ -281,10 +282,13 @@ SUPPORTS = {
 
 def refusals() -> str:
     """Return the names, and the table of what excludes them, of docs/features.md."""
-    names = (f"`{name}`" + f" ({title})" * (title.strip("=") != name) for name, title in features.OPERATIONS.items())
+    names = (
+        f"`{name}`" + f" ({title})" * (title.strip("=") != name)
+        for name, title in zip(features.OPERATIONS, map(in_words, features.OPERATIONS.values()), strict=True)
+    )
     rows: dict[tuple[str, str], list[str]] = {}
     for (operation, excluding), remedy in features.FEATURES.items():
-        rows.setdefault((excluding, remedy), []).append(f"`{operation}`")
+        rows.setdefault((excluding, in_words(remedy)), []).append(f"`{operation}`")
     lines = [f"| {excluding} | {', '.join(each)} | {remedy} |" for (excluding, remedy), each in rows.items()]
     head = ["| property | not available | reason, remedy |", "| --- | --- | --- |"]
     return "\n".join([textwrap.fill(f"{MARK}: {', '.join(names)}.", 120), "", *head, *lines, ""])

@@ -1,9 +1,12 @@
 """Loops around kernels: the terms of systems of arrays, and the term groups of named coordinates."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain, combinations, islice, product
+from typing import TYPE_CHECKING
 
 from sympy import Add, Expr, S, Symbol, preorder_traversal
 
@@ -19,9 +22,11 @@ from scvi_codegen.systems.formulas.expressions import gradient
 from scvi_codegen.systems.formulas.indices import Access, Array, Place
 from scvi_codegen.systems.formulas.neighbours import MAX_COMPONENTS, Neighbours
 from scvi_codegen.systems.formulas.symbols import DOT
-from scvi_codegen.systems.legendre.of_arrays import SiteHamiltonian
 from scvi_codegen.systems.system import MechanicalSystem
 from scvi_codegen.systems.term_groups import SplitSystem, TermGroup
+
+if TYPE_CHECKING:
+    from scvi_codegen.systems.legendre.of_arrays import SiteHamiltonian
 
 LONG_FORMULA = 1000
 """Nodes of the expressions from which on a comment does not contain a formula."""

@@ -49,7 +49,6 @@ from scvi_codegen.codegen.lowering.stage_groups import (
     lowered_stage_group,
     system_kernel,
 )
-from scvi_codegen.codegen.statements.steps import bath_texts, rattle_texts, splitting_texts
 from scvi_codegen.codegen.variants import Sums
 from scvi_codegen.common.errors import MethodError, SizesRequiredError
 from scvi_codegen.common.precision import Matrix, Vector, mp
@@ -140,6 +139,8 @@ def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
 
 def step_texts(system: MechanicalSystem, method: Method) -> Mapping[str, str]:
     """Return the statements from which the C of a step is generated, by their titles; none of other steps."""
+    from scvi_codegen.codegen.statements.steps import bath_texts, rattle_texts, splitting_texts
+
     bath = bath_texts(bool(system.bath.noise)) if system.bath else {}
     if not system.constraints:
         splitting = splitting_of(system, method)

@@ -85,11 +85,3 @@ def checked_number(value: Any, name: str) -> float:
     if not math.isfinite(number):
         raise StateError(f"{name} is {number}: it must be finite")
     return float(number)
-
-
-def checked_step(h: float) -> float:
-    """Return a finite step size other than 0."""
-    number = checked_number(h, "the step size h")
-    if number == 0.0:
-        raise StateError("the step size h is 0: it must be positive, or negative to integrate backward")
-    return number

@@ -1,14 +1,13 @@
 """Solver options, status codes of steps, and advice for each failure."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.codegen.native.capacity import TOO_MANY_STATES
+from scvi_codegen.codegen.options import OPTION, POSITIVE
 from scvi_codegen.codegen.rendering.text import MAX_ITERATIONS, TOLERANCE
 from scvi_codegen.common.errors import StateError, StepFailedError
-from scvi_codegen.common.validation import checked_count
 
 OUTCOMES = ("not converged", "singular", "not finite", "step size underflow", "spurious solution", "no memory")
 STATUS = dict(enumerate(OUTCOMES, 1))
@@ -61,9 +60,6 @@ FAILURES = {
 """Cause and remedy of a failure, by status."""
 
 
-MOST_ITERATIONS = 10**6
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SolverOptions:
     """Convergence criterion of the iteration on the stage equations.
@@ -79,11 +75,13 @@ class SolverOptions:
     absolute: bool = False
 
     def __post_init__(self) -> None:
-        if not checked_number(self.tolerance, "the tolerance") > 0.0:
-            raise StateError(f"the tolerance must be positive, not {self.tolerance!r}")
+        criterion = OPTION["solver_tolerance"]
+        if self.absolute:  # in the units of the states
+            criterion = replace(criterion, range=POSITIVE)
+        criterion.checked(self.tolerance, name="SolverOptions.tolerance")
         if not isinstance(self.absolute, bool):
             raise StateError(f"absolute must be True or False, not {self.absolute!r}")
-        checked_count(self.max_iterations, "max_iterations", least=1, most=MOST_ITERATIONS)
+        OPTION["max_iterations"].checked(self.max_iterations)
 
 
 def checked_options(options: SolverOptions | None) -> SolverOptions | None:

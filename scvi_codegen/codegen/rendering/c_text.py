@@ -22,6 +22,9 @@ TOKEN = re.compile(
 """Tokens of C: exported names are words, the ends of pasted words and the standard's names of FMI are none."""
 
 
+DIRECTIVES = {"ifdef", "ifndef", "if", "elif", "else", "endif", "define", "undef", "include", "error"}
+
+
 class Macro(NamedTuple):
     """Macro with the names of its parameters, ``None`` without brackets, and the tokens of its text."""
 
@@ -84,6 +87,42 @@ def pieces(code: str) -> Iterator[tuple[str, str]]:
             last = text
     if kind:
         yield kind, code[start:]
+
+
+class Branch(NamedTuple):
+    """Line of ``#if``, ``#elif`` or ``#else``, and what is below it."""
+
+    line: str
+    block: Block
+
+
+Block = list["tuple[str, str] | list[Branch]"]
+"""Pieces, and conditionals as their branches."""
+
+
+def nested(pieces: Iterator[tuple[str, str]]) -> tuple[Block, str]:
+    """Return kinds and texts with conditionals as branches, and the directive that ends the block, else nothing."""
+    block: Block = []
+    for kind, text in pieces:
+        word = directive(text)[0] if kind == "directive" else ""
+        if word in ("elif", "else", "endif"):
+            return block, text
+        if not word.startswith("if"):
+            block.append((kind, text))
+            continue
+        branches, line = list[Branch](), text
+        while directive(line)[0] not in ("endif", ""):
+            inside, end = nested(pieces)
+            branches.append(Branch(line, inside))
+            line = end
+        block.append(branches)
+    return block, ""
+
+
+def directive(text: str) -> tuple[str, str]:
+    """Return the word of a directive and the rest of its line without a comment; empty words for other texts."""
+    word, _, rest = text[1:].partition(" ") if text.startswith("#") else ("", "", "")
+    return (word, rest.partition("/*")[0].strip()) if word in DIRECTIVES else ("", "")
 
 
 def macros_of(code: str) -> dict[str, Macro]:

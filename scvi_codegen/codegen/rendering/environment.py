@@ -8,9 +8,9 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, pass_context
 from jinja2.runtime import Context
 
 from scvi_codegen.codegen.ir.kernel import Kernel, Number
-from scvi_codegen.codegen.rendering.kernels.double_double import pair_kernel_text
 from scvi_codegen.codegen.rendering.kernels.functions import kernel_text, lane_kernel_text, lane_mass_text, power_of_h
 from scvi_codegen.codegen.rendering.kernels.printer import print_number
+from scvi_codegen.codegen.rendering.kernels.simd import Lanes
 from scvi_codegen.codegen.rendering.text import table, wrapped, wrapped_comment, wrapped_comment_lines
 from scvi_codegen.common.cache import template_folder
 
@@ -67,6 +67,12 @@ def _lane_mass_text(context: Context, kernel: Kernel) -> str:
     return lane_mass_text(kernel, context["program"].fixed_point, meaning, context["target"])
 
 
+def _pair_kernel_text(kernel: Kernel, *lanes: Lanes) -> str:
+    from scvi_codegen.codegen.rendering.kernels.double_double import pair_kernel_text
+
+    return pair_kernel_text(kernel, *lanes)
+
+
 FUNCTIONS: dict[str, Callable[..., str]] = {
     "power_of_h": power_of_h,
     "vector": _vector,
@@ -79,7 +85,7 @@ FILTERS: dict[str, Callable[..., object]] = {
     "kernel_text": _kernel_text,
     "lane_kernel_text": _lane_kernel_text,
     "lane_mass_text": _lane_mass_text,
-    "pair_kernel_text": pair_kernel_text,
+    "pair_kernel_text": _pair_kernel_text,
     "rests": _rests,
     "transposed": lambda rows: tuple(zip(*rows, strict=True)),
     "wrapped": wrapped,

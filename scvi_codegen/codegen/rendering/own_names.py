@@ -20,9 +20,10 @@ BREAK = re.compile(r'(?:[^" ]|"(?:\\.|[^"\\])*")+ ')
 def with_distinct_names(texts: Mapping[str, str], header: str, prefix: str) -> dict[str, str]:
     """Return texts whose own names are none of those they export, as ``finish_step`` of an integrator ``finish``."""
     starts = f"{prefix}_", f"{prefix.upper()}_"
-    if not any(start in text for start in starts for text in texts.values()):
+    macros = {name for name, _ in definitions(header)}.union(starts)  # with the prefix in the code, too
+    having = (text for text in texts.values() if any(start in text for start in starts))
+    if not any(name.startswith(starts) for text in having for name in words(text) - macros):
         return dict(texts)
-    macros = {name for name, _ in definitions(header)}  # with the prefix in the code, too
     exported = {name for name in words(header) - macros if name.startswith(starts[0])}
     exported |= {_exported(name, prefix) for text in texts.values() for name in words(text) if name.endswith(")")}
     distinct = {name: f"{'LOCAL' if name.isupper() else 'local'}_{name}" for name in exported}

@@ -12,20 +12,13 @@ import posixpath
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
-from scvi_codegen.codegen.rendering.c_text import squeezed, words
+from scvi_codegen.codegen.rendering.c_text import Block, Branch, directive, nested, squeezed, words
 
 Read = Callable[[str], str]
 """Function that returns the text of a support header by its name, ``support/...``."""
 
-DIRECTIVES = {"ifdef", "ifndef", "if", "elif", "else", "endif", "define", "undef", "include", "error"}
 SUPPORT = "support/"
 """Folder of the support headers, from which the sources include them."""
-
-
-def _directive(line: str) -> tuple[str, str]:
-    """Return the word of a directive and the rest of its line without a comment; empty words for other lines."""
-    word, _, rest = line[1:].partition(" ") if line.startswith("#") else ("", "", "")
-    return (word, rest.partition("/*")[0].strip()) if word in DIRECTIVES else ("", "")
 
 
 def _support_name(line: str, folder: str) -> str | None:
@@ -76,7 +69,7 @@ class _Macros:
 
     def holds(self, line: str) -> bool | None:
         """Return whether the condition of a line holds; ``None`` if unknown, as for comparisons of numbers."""
-        word, condition = _directive(line)
+        word, condition = directive(line)
         if word == "else":
             return True
         if word in ("ifdef", "ifndef"):
@@ -103,37 +96,6 @@ def _joined(ends: Sequence[_Macros]) -> _Macros:
     return _Macros(defined, mentioned - defined, compiled[0].failed)
 
 
-@dataclass
-class _Alternative:
-    """Line of ``#if``, ``#elif`` or ``#else``, and the block below it."""
-
-    line: str
-    block: _Block
-
-
-_Block = list["str | list[_Alternative]"]
-"""Lines, and conditions with their alternatives."""
-
-
-def _parsed(lines: Iterator[str]) -> tuple[_Block, str]:
-    """Return a block, and the line of ``#elif``, ``#else`` or ``#endif`` that ends it; nothing at the end of a file."""
-    block: _Block = []
-    for line in lines:
-        word = _directive(line)[0]
-        if word in ("elif", "else", "endif"):
-            return block, line
-        if word not in ("if", "ifdef", "ifndef"):
-            block.append(line)
-            continue
-        alternatives, end = list[_Alternative](), line
-        while _directive(end)[0] not in ("endif", ""):
-            body, following = _parsed(lines)
-            alternatives.append(_Alternative(end, body))
-            end = following
-        block.append(alternatives)
-    return block, ""
-
-
 class _Preprocessor:
     """Lines that remain of a source and of the headers that it includes."""
 
@@ -143,26 +105,28 @@ class _Preprocessor:
 
     def _visit(self, folder: str, text: str) -> Iterator[str]:
         """Yield the lines of a text with headers inserted."""
-        yield from self._block(_parsed(iter(text.split("\n")))[0], folder)
+        lines = (("directive" if line.startswith("#") else "code", line) for line in text.split("\n"))
+        yield from self._block(nested(lines)[0], folder)
 
-    def _block(self, block: _Block, folder: str) -> Iterator[str]:
+    def _block(self, block: Block, folder: str) -> Iterator[str]:
         for part in block:
-            if not isinstance(part, str):
+            if isinstance(part, list):
                 yield from self._conditional(part, folder)
                 continue
-            word, rest = _directive(part)
+            _, line = part
+            word, rest = directive(line)
             if word in ("define", "undef"):
                 macro = rest.split("(")[0].split()[0]
                 self._macros.uncertain.discard(macro)
                 (self._macros.defined.add if word == "define" else self._macros.defined.discard)(macro)
             self._macros.failed |= word == "error"
-            header = _support_name(part, folder)
+            header = _support_name(line, folder)
             if header is None:
-                yield part
+                yield line
             else:
                 yield from self._visit(posixpath.dirname(header), self._read(header).removesuffix("\n"))
 
-    def _conditional(self, alternatives: Sequence[_Alternative], folder: str) -> Iterator[str]:
+    def _conditional(self, alternatives: Sequence[Branch], folder: str) -> Iterator[str]:
         before, ends, holds = self._macros, list[_Macros](), None
         for alternative in alternatives:
             holds = before.holds(alternative.line)
@@ -173,7 +137,7 @@ class _Preprocessor:
                 return
             line = "#else" if holds else alternative.line
             if not ends and alternative is not alternatives[0]:
-                line = f"#if {_directive(line)[1]}"
+                line = f"#if {directive(line)[1]}"
             yield line
             self._macros = before.copy() if ends else before.resumed(self._ends.get(line))
             yield from self._block(alternative.block, folder)
@@ -190,7 +154,7 @@ class _Preprocessor:
 def preprocessed(code: str, read: Read) -> str:
     """Return a source with support headers inserted, without known conditions and macros that nothing uses."""
     lines = _Preprocessor(code, read).lines
-    directives = {line: _directive(line) for line in lines if line.startswith("#define ")}
+    directives = {line: directive(line) for line in lines if line.startswith("#define ")}
     switches = {line: name for line, (_, name) in directives.items() if name.isidentifier()}
     used = words("\n".join(line for line in lines if line not in switches))
     kept = (line for line in lines if line not in switches or switches[line] in used)

@@ -17,14 +17,20 @@ from itertools import accumulate, chain
 from typing import Any, ClassVar, Literal, TypeAlias, cast, get_args
 
 from scvi_codegen.codegen.ir.derivatives import Derivatives, PointDerivatives
-from scvi_codegen.codegen.ir.equations import Control, FixedPointIteration, IterationTable, StoredValues
+from scvi_codegen.codegen.ir.equations import Control, FixedPointIteration, IterationTable, Splitting, StoredValues
 from scvi_codegen.codegen.ir.kernel import Kernel, Number, is_divided
 from scvi_codegen.codegen.ir.program import ArrayProgram, Program
 from scvi_codegen.codegen.rendering.environment import support_text, template_environment
-from scvi_codegen.codegen.rendering.kernels.double_double import arithmetic_headers, uses_functions
 from scvi_codegen.codegen.rendering.kernels.functions import unrolled_equations
 from scvi_codegen.codegen.rendering.kernels.loops import loop_context
-from scvi_codegen.codegen.rendering.kernels.printer import DOUBLE, SINGLE, Target, constants, inverse_roots
+from scvi_codegen.codegen.rendering.kernels.printer import (
+    DOUBLE,
+    SINGLE,
+    Target,
+    constants,
+    inverse_roots,
+    uses_functions,
+)
 from scvi_codegen.codegen.rendering.kernels.simd import (
     POINTS,
     TRAJECTORIES,
@@ -45,8 +51,6 @@ from scvi_codegen.codegen.rendering.text import (
     HeaderRecord,
     wrapped_functions,
 )
-from scvi_codegen.codegen.statements.printing import Layout
-from scvi_codegen.codegen.statements.steps import half_step, pair_rattle_functions, rattle_functions, splitting_header
 
 Embedded: TypeAlias = Literal["double", "single"]
 """Precision of C source for a microcontroller."""
@@ -353,7 +357,7 @@ def _render_explicit(program: Program) -> Source:
     context = _context(program, DOUBLE, None)
     words = {"derivatives": 0, "of_numbers": kernels, "of_vectors": (), "functions": uses_functions(kernels)}
     sizes = {"memory": memory_in_pairs(program), "workspace": workspace_in_pairs(program)}
-    headers = {LEAP: splitting_header(split, Layout(2), action=False)}
+    headers = _leap(split, words=2, action=False)
     return _render(program.prefix, context | sizes | {"two_words": words, "own_headers": headers})
 
 
@@ -398,7 +402,7 @@ def render_ensemble_in_pairs(program: Program, derivatives: PointDerivatives | N
         },
     }
     if split is not None:
-        context["own_headers"] = {LEAP: splitting_header(split, Layout(2, lanes=True), action=False)}
+        context["own_headers"] = _leap(split, words=2, lanes=True, action=False)
     return _render(f"{program.prefix}_ensemble", context, "ensemble")
 
 
@@ -471,11 +475,17 @@ def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") 
     code = environment.get_template(f"{entry}.c.jinja").render(context)
     headers = dict(cast("Mapping[str, str]", context.get("own_headers", {})))
     if context["two_words"]:
+        from scvi_codegen.codegen.rendering.kernels.double_double import arithmetic_headers
+
         headers |= arithmetic_headers()
     program = context.get("program")
     if isinstance(program, Program) and program.bath:
+        from scvi_codegen.codegen.statements.steps import half_step
+
         headers["support/run/exchange_heat.h"] = half_step(program.bath)
     if isinstance(program, Program) and program.rattle:
+        from scvi_codegen.codegen.statements.steps import pair_rattle_functions, rattle_functions
+
         features = [name.lower() for name in program.rattle.macros]
         headers["support/constraints/iterate.h"] = wrapped_functions(rattle_functions(program.rattle.part, features))
         headers["support/double_double/correct_points.h"] = wrapped_functions(pair_rattle_functions())
@@ -529,11 +539,19 @@ CONTENTS: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
 """Contents of the C of an entry template, from its context."""
 
 
+def _leap(split: Splitting, *, words: int = 1, lanes: bool = False, action: bool) -> dict[str, str]:
+    """Return the header with the increments of an explicit step, by its name."""
+    from scvi_codegen.codegen.statements.printing import Layout
+    from scvi_codegen.codegen.statements.steps import splitting_header
+
+    return {LEAP: splitting_header(split, Layout(words, lanes), action=action)}
+
+
 def _control_context(program: Program, control: Control | None) -> dict[str, object]:
     """Return the template's context for adaptive steps; the predictor tables are a separate header."""
     if program.splitting:
         action = program.splitting.at_rest is not None
-        return {"control": control, "own_headers": {LEAP: splitting_header(program.splitting, Layout(), action=action)}}
+        return {"control": control, "own_headers": _leap(program.splitting, action=action)}
     name = f"support/{program.prefix}_predictor.h"
     if not (control and control.predictor and program.fixed_point):
         return {"control": control, "own_headers": {}}
@@ -566,7 +584,7 @@ def render_ensemble(
         return None
     if split is not None:
         kernels, points, source = split.kernels, 1, splitting_source(split, observed, target)
-        headers = {LEAP: splitting_header(split, Layout(lanes=True), action=program.acts_along)}
+        headers = _leap(split, lanes=True, action=program.acts_along)
     elif program.rattle and program.constraints and not program.damping:
         kernels, points = program.rattle.kernels, program.rattle.points + 1
         source = constrained_source(program.rattle, program.constraints)

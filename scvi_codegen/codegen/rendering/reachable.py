@@ -8,16 +8,19 @@ a part of them, and no C compiler prints a source without what it does not use.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import chain, groupby, pairwise
+from itertools import groupby, pairwise
 
 from scvi_codegen.codegen.rendering.c_text import (
+    Block,
     Macro,
     definitions,
+    directive,
     macros_of,
     names_of,
+    nested,
     pieces,
     renamed,
     squeezed,
@@ -97,7 +100,7 @@ def readable(code: str) -> dict[str, str]:
     if "#define NAME(" not in code:
         return {"": code}
     code = _without_aliases(code.replace(CHOICES, ""))
-    files = _by_file(_without_alternatives(_reached([*_parts(code, macros_of(code))])))
+    files = _by_file(_without_alternatives(_reached(_parts_of(code))))
     texts = {
         name: "\n".join([f"/* {FILES[name][0]} */\n" if name else "", *_lines(file)]).strip("\n")
         for name, file in files.items()
@@ -151,11 +154,17 @@ def _without_calls(code: str, macro: str) -> str:
     return "".join(texts)
 
 
-def _parts(code: str, macros: Mapping[str, Macro], conditions: tuple[str, ...] = ()) -> Iterator[Part]:
-    """Yield the parts of a text at file scope in order."""
-    rest, joined, opened = pieces(code), False, False
+def _parts_of(code: str) -> list[Part]:
+    """Return the parts of a text at file scope in order."""
+    return [*_parts(nested(pieces(code))[0], macros_of(code))]
+
+
+def _parts(block: Block, macros: Mapping[str, Macro], conditions: tuple[str, ...] = ()) -> Iterator[Part]:
+    """Yield the parts of a block at file scope in order."""
+    joined, opened = False, False
     section, comment = tuple[str, ...](), tuple[str, ...]()
-    for kind, text in rest:
+    for piece in block:
+        kind, text = ("directive", piece[0].line) if isinstance(piece, list) else piece
         if kind == "blank":
             if comment:
                 section, opened = ((*section, "\n".join(comment)) if opened else ("\n".join(comment),)), True
@@ -164,34 +173,23 @@ def _parts(code: str, macros: Mapping[str, Macro], conditions: tuple[str, ...] =
         if kind == "comment":
             comment += (text,)
             continue
-        branches, names = tuple[tuple[str, tuple[Part, ...]], ...](), frozenset[str]()
-        if text.startswith("#if"):
-            lines = _branches(text, rest)
-            text = "\n".join((*chain.from_iterable(lines), "#endif"))
-            inside = (*conditions, text.split("\n")[0])
-            branches = tuple((first, tuple(_parts("\n".join(block), macros, inside))) for first, *block in lines)
-            names = frozenset(name for _, parts in branches for part in parts for name in part.names)
-        elif text.startswith("#undef "):
-            names = frozenset(text.split()[1:2])
-        else:
-            names = frozenset(names_of(text, macros)) - PREFIXED
         comment = tuple(_for_readers("\n".join(comment)).split("\n")) if comment else ()
-        yield Part(comment, (*text.split("\n"),), names, conditions, section, joined and not comment, branches)
+        whole = Part(comment, (*text.split("\n"),), frozenset(), conditions, section, joined and not comment)
+        if isinstance(piece, list):
+            inside = *conditions, text
+            yield _conditional(whole, ((line, tuple(_parts(block, macros, inside))) for line, block in piece))
+        else:
+            word, name = directive(text)
+            yield replace(whole, names=frozenset([name] if word == "undef" else names_of(text, macros)) - PREFIXED)
         comment, joined, opened = (), True, False
 
 
-def _branches(first: str, rest: Iterator[tuple[str, str]]) -> list[list[str]]:
-    """Return the texts in the branches of a conditional, each behind its line; takes those up to its end."""
-    branches, depth = [[first]], 1
-    for _, text in rest:
-        depth += text.startswith("#if") - text.startswith("#endif")
-        if depth == 0:
-            break
-        if depth == 1 and text.startswith(("#else", "#elif")):
-            branches.append([text])
-        else:
-            branches[-1].append(text)
-    return branches
+def _conditional(part: Part, branches: Iterable[tuple[str, tuple[Part, ...]]]) -> Part:
+    """Return a part that consists of branches."""
+    branches = tuple(branches)
+    names = frozenset(name for _, parts in branches for inner in parts for name in inner.names)
+    lines = [text for line, parts in branches for text in (line, *_lines(parts))]
+    return replace(part, lines=(*lines, "#endif"), names=names, branches=branches)
 
 
 def _for_readers(comment: str) -> str:
@@ -236,7 +234,7 @@ def functions_of(code: str) -> dict[str, Function]:
     """Return every function with a body, by its exported or own name, in order; of alternatives the first."""
     code, exported = _without_aliases(code), exported_names([code])
     bodies: dict[str, Part] = {}
-    for part in _parts(code, macros_of(code)):
+    for part in _parts_of(code):
         for leaf in part.leaves:
             if "{" in leaf.lines:
                 (name,) = leaf.names
@@ -291,8 +289,7 @@ def _kept(part: Part, reached: set[Part]) -> Part | None:
     for line, parts in part.branches:
         nameless = {leaf for inner in parts for leaf in inner.leaves if not leaf.names}
         branches.append((line, tuple(left for inner in parts if (left := _kept(inner, reached | nameless)))))
-    lines = [text for line, parts in branches for text in (line, *_lines(parts))]
-    return replace(part, lines=(*lines, "#endif"), branches=tuple(branches))
+    return _conditional(part, branches)
 
 
 def _by_file(parts: Sequence[Part]) -> dict[str, list[Part]]:

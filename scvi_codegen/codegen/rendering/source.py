@@ -14,17 +14,19 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from scvi_codegen.codegen.rendering.own_names import with_distinct_names, with_exported_names, with_own_names
 from scvi_codegen.codegen.rendering.preprocessor import preprocessed
-from scvi_codegen.codegen.rendering.reachable import Function, functions_of, readable
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.systems.contact import Impacts
 from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.event import Event, Kink, Refraction, Transition
 from scvi_codegen.systems.formulas.indices import Access, ArrayDeclarations, ArrayMap, Loop
 from scvi_codegen.version import __version__
+
+if TYPE_CHECKING:
+    from scvi_codegen.codegen.rendering.reachable import Function
 
 TEXTS = ("header", "code", "declarations")
 PREFIX = re.compile(r"[A-Za-z_]\w*", re.ASCII)
@@ -172,11 +174,15 @@ class Source:
     @property
     def _readable_files(self) -> dict[str, str]:
         """Files without what no exported function uses, by name; that of the step first."""
+        from scvi_codegen.codegen.rendering.reachable import readable
+
         return with_exported_names(readable(self.amalgamated().code))
 
     @property
     def functions(self) -> dict[str, Function]:
         """Functions of the code and its support headers with a body, by name, in order."""
+        from scvi_codegen.codegen.rendering.reachable import functions_of
+
         return functions_of(self.amalgamated().code)
 
     def with_distinct_names(self, prefix: str) -> Source:

@@ -421,8 +421,8 @@ def _advised(
 def _starts(stepper: Stepper, q: States, state: dict[str, Any]) -> tuple[list[tuple[Any, Any, Any]], Any]:
     """Return (m,) positions and momenta with parameters of each trajectory; and (k, m) those of an ensemble."""
     t, parameters = state["t"], state["parameters"]
-    q, p, velocity = stepper._states.start(q, state["p"], state["velocity"])
-    if stepper._states.axes(q) != 2:
+    q, p, velocity = stepper.products.states.start(q, state["p"], state["velocity"])
+    if stepper.products.states.axes(q) != 2:
         start = stepper.start(q, p, velocity=velocity, t=t, parameters=parameters, h=1.0)  # checks the arguments
         return [(start.q, start.p, parameters)], ()
     together = stepper.products.ensemble_start(q, p, velocity, t=t, parameters=parameters)

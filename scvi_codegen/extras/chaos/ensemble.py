@@ -144,7 +144,7 @@ class ChaosIndicatorsEnsemble:
 
         def propagate_chunk(part: Starts, numbers: NDArray[np.intp], vectors: Array) -> None:
             check_stop(int(numbers[-1]))
-            stepper._propagate(part, vectors, self.parameters[j], self.options)
+            stepper.products.propagate(part, vectors, self.parameters[j], self.options)
 
         def step_segments() -> Iterator[StepSegment]:
             now = self.q[j], self.p[j]
@@ -175,5 +175,5 @@ def indicators_of_ensemble(
     **settings: Any,
 ) -> ChaosIndicators:
     """Return the indicators of :meth:`scvi_codegen.Stepper.chaos_indicators_ensemble`."""
-    q, p, velocity = stepper._states.start(q, p, velocity)
+    q, p, velocity = stepper.products.states.start(q, p, velocity)
     return ChaosIndicatorsEnsemble(stepper, q, p, velocity, **settings).run(progress=progress, threads=threads)

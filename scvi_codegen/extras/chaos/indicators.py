@@ -317,7 +317,7 @@ class TangentPropagation:
                 end = min(done + self._size, steps)
                 part, saved = starts.part(done, end), numbers[done : end + 1]
                 stepper = self._space.stepper
-                vectors = np.zeros((end - done + 1, self._frame.shape[1], stepper._input_size))
+                vectors = np.zeros((end - done + 1, self._frame.shape[1], stepper.products.tangents))
                 columns = slice(2 * stepper.dimension)
                 vectors[0, :, columns] = self._space.entering(self._frame, part.q[0], part.p[0]).T
                 propagate_chunk(part, saved, vectors)

@@ -63,18 +63,15 @@ class DerivedStep:
 
     def __init__(self, system: MechanicalSystem, stages: StageSystem) -> None:
         self.system, self.stages, self.motion = system, stages, exact_motion(system)
-        symbols = [
-            (*group.arguments, system.time, *system.parameters, Discretisation.MIDDLE) for group in stages.stage_groups
-        ]
-        self.kernels = [
-            Tape(group.results, arguments) for group, arguments in zip(stages.stage_groups, symbols, strict=True)
-        ]
-        self.scalars = [
-            None if group.scalar is None else Tape([group.scalar], arguments)
-            for group, arguments in zip(stages.stage_groups, symbols, strict=True)
-        ]
+        groups, further = stages.stage_groups, (system.time, *system.parameters, Discretisation.MIDDLE)
+
+        def tape(group: Any, formulas: Sequence[Any]) -> Tape:
+            return Tape(formulas, (*group.arguments, *further))
+
+        self.kernels = [tape(group, group.results) for group in groups]
+        self.scalars = [None if group.scalar is None else tape(group, [group.scalar]) for group in groups]
         self.damping = Tape([stages.damping], system.parameters)
-        self.rate = Tape([system.clock.rate], symbols[0]) if system.clock else None
+        self.rate = tape(groups[0], [system.clock.rate]) if system.clock else None
         self.blocks = _slices(stages.block_sizes(system.dimension))
         self.rows = _slices(stages.row_sizes(system.dimension))
         self.arguments = [_slices([len(gather.arguments) for gather in group.gathers]) for group in stages.stage_groups]

@@ -71,15 +71,17 @@ def average(run: Any, quantity: Callable[[Any], ArrayLike] | ArrayLike, *, burn_
         raise StateError("average requires at least two states at equal distances in time: give h, or t_eval=")
     further, half = x.shape[len(shape) :], len(t) // 2
     x = x.reshape(len(t), shape[-1] if len(shape) > 1 else 1, -1)
-    omitted = 0 if burn_in is None else int(np.ceil(round(checked_number(burn_in, "burn_in") / interval, 9)))
     if burn_in is None:
         omitted = min(half, len(t) - 2, int(np.ceil(RELAXATION * _correlation_time(x[half:])[0].max())))
-    elif not 0 <= omitted <= len(t) - 2:
-        raise StateError(f"burn_in = {burn_in:g} must be at least 0 and leave two states of {t[-1] - t[0]:g}")
+        least = LEAST_TIMES if omitted < half else np.inf  # the run may not have settled
+    else:
+        omitted, least = int(np.ceil(round(checked_number(burn_in, "burn_in") / interval, 9))), LEAST_TIMES
+        if not 0 <= omitted <= len(t) - 2:
+            raise StateError(f"burn_in = {burn_in:g} must be at least 0 and leave two states of {t[-1] - t[0]:g}")
     x = x[omitted:]
     tau, sigma = _correlation_time(x)
     times = x.shape[0] * x.shape[1] / tau
-    if (burn_in is None and omitted == half) or times.min() < LEAST_TIMES:
+    if times.min() < least:
         warnings.warn(
             f"the error of the average is unreliable: of the run, {t[-1] - t[0]:g} long, {omitted * interval:g} are "
             f"omitted, {times.min():.3g} autocorrelation times remain, of {LEAST_TIMES:g} required; integrate longer",

@@ -161,7 +161,6 @@ def fit(
         StepFailedError: if a step of the initial guess fails.
     """
     stepper = stepper.bind(q, parameters)[0]._known_with_events
-    q, p, velocity = stepper._states.start(q, p, velocity)
     measurements = Measurements.checked(
         stepper, t, measured, observed, deviations, start, h, stepper.products.inputs_of(inputs)
     )
@@ -248,14 +247,13 @@ class _Model:
                 f"parameters must be values, as {{'{next(iter(parameters))}': 1.0}}, not names: name those to estimate "
                 f"in unknown={list(parameters)}"
             )
-        values = stepper._parameters(parameters)
-        momenta = stepper._initial_momenta(q, p, velocity, measurements.start, values)
+        state, values = stepper.products.start(q, p, velocity, measurements.start, parameters)
         unknown_indices = [2 * m + stepper.interface.parameters.index(name) for name in estimated]
         names = estimated
         if fit_initial_state:
             names = (*estimated, *state_names(stepper))
             unknown_indices += range(2 * m)
-        prior = np.concatenate([*stepper._states.pair(q, momenta), values])
+        prior = np.concatenate([state, values])
         return cls(measurements, names, np.array(unknown_indices, dtype=np.intp), prior)
 
     @property

@@ -39,7 +39,7 @@ def tangents_along(
         vectors[0] = tangents
         if size_variations is not None:  # the variation of h of each step is added to that of the step before
             vectors[0, :, -1], vectors[1:-1, :, -1] = size_variations[0], np.diff(size_variations, axis=0)
-        stepper._propagate(starts, vectors, parameters, options)
+        stepper.products.propagate(starts, vectors, parameters, options)
         return np.concatenate([starts.q, starts.p], axis=1), vectors[..., :size], vectors[-1]
     states, vectors = np.empty((count + 1, size)), np.empty((count + 1, len(tangents), size))
     states[0], vectors[0] = state, tangents[:, :size]

@@ -31,8 +31,8 @@ NEAR = 1e-5
 """Jumps and changes below which full steps are taken, as rounding hides the descent."""
 SMALL = 1e-6
 """Residuals, relative to the measurements, below which the fit counts as exact."""
-BOUNDED, RELEASED = 8, 1e-9
-"""Limits of the active-set iteration: base number of updates, and gradient (relative) that releases a bound."""
+BOUNDED = 8
+"""Base number of updates of the active-set iteration, whose bounds a gradient above ``SETTLED`` releases."""
 GAUGE = 1e3
 """Weight of the equations that fix the lengths of quaternions, relative to that of a measurement."""
 PARABOLA_NEIGHBOURS = 3
@@ -154,7 +154,7 @@ class Chain:
     def _part(self, j: int, x: Array) -> tuple[Array, Array, Array, Array]:
         """Return the computed measurements and the end of segment j, each with derivatives by all unknowns."""
         part, values, size = self.parts[j], self.values(x), self.state
-        tangents = np.zeros((len(x), part.stepper._input_size))
+        tangents = np.zeros((len(x), part.stepper.products.tangents))
         tangents[np.arange(len(self.unknown_indices)), self.unknown_indices] = 1.0
         start = values[:size]
         if j > 0:
@@ -190,7 +190,7 @@ def _node_states_from_guess(parts: Sequence[Measurements], prior: Array) -> Arra
     size = 2 * parts[0].stepper.dimension
     state, states = prior[:size], []
     for part in parts[:-1]:
-        state = part.motion(state, np.zeros((0, part.stepper._input_size)), prior[size:])[2]
+        state = part.motion(state, np.zeros((0, part.stepper.products.tangents)), prior[size:])[2]
         states.append(state)
     return np.array(states).reshape(-1, size)
 
@@ -217,7 +217,7 @@ def _sizes(parts: Sequence[Measurements], prior: Array, nodes: Array) -> Array:
     size = nodes.shape[1]
     states = np.concatenate([prior[np.newaxis, :size], nodes])
     if len(states) == 1:
-        end = parts[0].motion(prior[:size], np.zeros((0, parts[0].stepper._input_size)), prior[size:])[2]
+        end = parts[0].motion(prior[:size], np.zeros((0, parts[0].stepper.products.tangents)), prior[size:])[2]
         states = np.stack([states[0], end])
     kinds = np.ptp(states, axis=0).reshape(2, -1)
     largest = kinds.max(axis=1, keepdims=True)
@@ -271,7 +271,7 @@ def _bounded_update(
         predicted = residuals[:rows] + jacobian[:rows] @ update
         uphill = jacobian[:rows].T @ predicted - jacobian[rows:].T @ multipliers
         inward = np.where(at_bound, np.where(update <= low, -uphill, uphill), 0.0)
-        if not (inward > RELEASED * np.abs(uphill).max(initial=0.0)).any():
+        if not (inward > SETTLED * np.abs(uphill).max(initial=0.0)).any():
             break
         at_bound[int(np.argmax(inward))] = False
     return update, multipliers, at_bound

@@ -55,7 +55,7 @@ def family(model_name: str, resume: str | None, output: str | None, plot: str | 
         raise ModelFileError(f"orbits of a family are saved as .npz, not as '{output}'")
     if plot is not None:
         check_picture(plot)
-    model = read_model(model_name, choices).with_known_sizes("family")
+    model = read_model(model_name, choices, unused=_unused).with_known_sizes("family")
     with progress_bar(model.family.get("count", COUNT), "orbits") as progress:
         members = _members(model, resume, progress)
     tell(_described(members), **_numbers(members))
@@ -66,6 +66,12 @@ def family(model_name: str, resume: str | None, output: str | None, plot: str | 
             tell(f"wrote {target}")
     if written := [target for target in (output, plot, page) if target]:
         tell(written=written)
+
+
+def _unused(document: Any) -> tuple[str, ...]:
+    """Return what families do not use: a duration, and near an equilibrium a velocity."""
+    settings = document.get("family", {})
+    return ("span", "q_dot") if "amplitude" in settings and "period" not in settings else ("span",)
 
 
 def _check_resumed(context: click.Context) -> None:
@@ -100,7 +106,7 @@ def _start(
     if period is None or amplitude is not None:
         ways = "the period of an orbit (--period) or the amplitude next to an equilibrium (--amplitude)"
         raise ModelFileError(f"give {ways}")
-    value = period(dict(zip(stepper.parameters, stepper._parameters(model.parameters), strict=False)))
+    value = period(dict(zip(stepper.parameters, stepper.products.parameters(model.parameters), strict=False)))
     return periodic_orbit(stepper, model.q, model.p, velocity=model.velocity, period=value, **own, **at)
 
 

@@ -60,7 +60,7 @@ class ConstraintManifold(Reduction):
 
         It is the derivative of the end of a step without duration, whose end is on the constraints, by the parameter.
         """
-        (q, p), seed = np.split(state, 2), np.eye(self.stepper._input_size)[[len(state) + parameter]]
+        (q, p), seed = np.split(state, 2), np.eye(self.stepper.products.tangents)[[len(state) + parameter]]
         ends = self.stepper._products(q, p, MOMENT * period, self.t, self.parameters, None, seed)
         return np.append(ends[0, : len(q)], np.zeros(len(p)))
 

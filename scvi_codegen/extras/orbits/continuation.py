@@ -37,12 +37,11 @@ from scvi_codegen.api.states import Array
 from scvi_codegen.common.errors import EventError, OrbitError, StepFailedError
 from scvi_codegen.extras.orbits.equilibrium import Equilibrium
 from scvi_codegen.extras.orbits.solver import (
+    CONSERVED,
     DIFFERENCE_INCREMENT,
     EASY,
-    NULL_SINGULAR_VALUE,
-    REVERSED,
+    ERROR,
     SAME,
-    SYMPLECTIC,
     TOLERANCES,
     ClosingEquations,
     OrbitSearch,
@@ -70,14 +69,9 @@ LOCATED = 1e-10
 BRANCHES = 1e-6
 """Singular values of the closing equations below which another family crosses: between a bifurcation that is located to
 1e-10, where it is the error of the derivatives, 1e-9, and the next orbit, where it is the step."""
-SMALL_CHANGE = 1e-9
-"""Relative change of a monodromy matrix above rounding errors; 2^16 times as much is small, too."""
 FLAT = 1e-6
 """Square of the change of period and parameter along a family below which they are stationary: that of the energy, in
 units of the motion, has the error 1e-9 of the orbit."""
-RANK = 1e-3
-"""Part of the largest of some directions below which the others depend on them: gradients by differences have errors
-of 1e-6, and independent ones in units of the motion differ by their size."""
 BEYOND = {"branch": 1.0, "period doubling": -1.0}
 """Values that real indices pass at bifurcations."""
 PHASES = 64
@@ -175,7 +169,7 @@ class FamilyPoint:
     @property
     def symplectic(self) -> bool:
         """Return whether the steps of the orbit are symplectic."""
-        return self.orbit.symplectic_error <= SYMPLECTIC
+        return self.orbit.symplectic_error <= ERROR
 
     @cached_property
     def others(self) -> NDArray[np.complex128]:
@@ -425,7 +419,7 @@ class Continuation:
             orbit = self._found(search, y).described(y[:end], linear.closing, corrections, guess=y[:end])
             if orbit.error <= self.bound or self.search.sequence is not None:
                 break
-        if self.parameter is not None and search.reversor and search.irreversibility(y[:end]) > REVERSED:
+        if self.parameter is not None and search.reversor and search.irreversibility(y[:end]) > ERROR:
             raise OrbitError("the reversor= is no symmetry at another value of parameter=: omit it")
         gradient = search.integral_gradients(y[: end - 1], search.t, linear.closing.sizes)[0]
         gradient = gradient @ linear.closing.motion.inward
@@ -498,7 +492,7 @@ class Continuation:
                 columns = row[:size] @ linear.into[:size] + row[size:] @ linear.into[-tail:]
                 defects = np.append(defects, row @ away)
                 jacobian = np.vstack([jacobian, columns * linear.units])
-            change = np.linalg.pinv(jacobian, NULL_SINGULAR_VALUE) @ defects
+            change = np.linalg.pinv(jacobian, ERROR) @ defects
             length = float(np.linalg.norm(change))
             if length <= SETTLED or (length <= STAGNANT and length > last / 2.0):
                 return np.append(y[:size], y[-tail:]), count
@@ -591,7 +585,7 @@ class Continuation:
         for change in 2.0 ** np.arange(-320, 320, 16):
             other = self._with_parameter(search, np.append(y[:-1], y[-1] + change)).closing_equations(y[:-1])
             matrices = [part.monodromy / reduced[:, np.newaxis] * reduced for part in (closing, other)]
-            if (part := float(np.abs(matrices[1] - matrices[0]).max() / np.abs(matrices[0]).max())) > SMALL_CHANGE:
+            if (part := float(np.abs(matrices[1] - matrices[0]).max() / np.abs(matrices[0]).max())) > ERROR:
                 return float(change) / part
         if effect > 0.0:
             return math.inf
@@ -617,7 +611,7 @@ class Continuation:
         fields = np.vstack([fields, np.zeros((len(units) - size, fields.shape[1]))])
         fields = _range(np.column_stack([fields, np.eye(len(units))[:, np.flatnonzero(search.drifts)]]))
         rows = linear.jacobian[len(closing.defects) :]
-        return _range(fields @ _smallest(rows @ fields, 0, RANK)), gradients.shape[1]
+        return _range(fields @ _smallest(rows @ fields, 0, CONSERVED)), gradients.shape[1]
 
 
 def _states_along(orbit: PeriodicOrbit, t: float, state: Array, duration: float) -> tuple[Array, Array]:
@@ -633,7 +627,7 @@ def _states_along(orbit: PeriodicOrbit, t: float, state: Array, duration: float)
 def _range(vectors: Array) -> Array:
     """Return an orthonormal basis of the span of columns."""
     basis, strengths, _ = np.linalg.svd(vectors, full_matrices=False)
-    return basis[:, strengths > RANK * strengths.max(initial=0.0)]
+    return basis[:, strengths > CONSERVED * strengths.max(initial=0.0)]
 
 
 def _smallest(matrix: Array, count: int, least: float = 0.0) -> Array:

@@ -21,20 +21,15 @@ from scvi_codegen.api.text import summary
 from scvi_codegen.common.errors import OrbitError, StateError, StepFailedError
 from scvi_codegen.extras.fits.fixed_steps import tangents_along
 from scvi_codegen.extras.orbits.constraint_manifold import reduction_of
+from scvi_codegen.extras.orbits.solver import MOST_ITERATIONS, SAME, SETTLED
 from scvi_codegen.extras.paths.size import ROUNDOFF
 from scvi_codegen.runs.stepper import Stepper
 
 LEAST_CHANGE = 0.1
 """Least |mu - 1| of the steps, whose eigenvalues have the error of one short step."""
-HALVINGS, MOST_ITERATIONS = 60, 50
+HALVINGS = 60
 NULL = 1e-10
 """Singular values below this fraction of the largest belong to directions in which the system is free."""
-SAME = 1e-6
-"""Relative change of the eigenvalues by the last but one iterate; the last one is accurate to its square."""
-OSCILLATES = 1e-6
-"""Real part of an eigenvalue, relative to its modulus, and modulus, relative to the largest, of rounding errors."""
-ACCURATE = 1e-13
-"""Relative error of eigenvalues at which the step is not halved further."""
 FLAT = 1e-3
 """Part of the eigenvalues at the guess below which the iteration leaves for infinity, where no force is left."""
 
@@ -67,7 +62,7 @@ class Equilibrium:
     @property
     def _oscillations(self) -> NDArray[np.bool_]:
         values, sizes = self.eigenvalues, np.abs(self.eigenvalues)
-        return np.asarray((values.imag > OSCILLATES * sizes.max()) & (np.abs(values.real) <= OSCILLATES * sizes))
+        return np.asarray((values.imag > SAME * sizes.max()) & (np.abs(values.real) <= SAME * sizes))
 
     @property
     def frequencies(self) -> Array:
@@ -82,7 +77,7 @@ class Equilibrium:
     @property
     def stable(self) -> bool:
         """Return whether no eigenvalue has a positive real part, up to rounding."""
-        return bool((self.eigenvalues.real <= OSCILLATES * np.abs(self.eigenvalues).max()).all())
+        return bool((self.eigenvalues.real <= SAME * np.abs(self.eigenvalues).max()).all())
 
 
 @checks_arguments(StateError, stepper=Stepper.KIND)
@@ -102,10 +97,7 @@ def equilibrium(stepper: Stepper, q: ArrayLike, *, t: float = 0.0, parameters: P
     stepper = stepper.bind(q, parameters)[0]._known_with_events
     stepper.products.require("periodic_orbit")
     stepper.products.check_given(parameters, step=True)
-    values, rest = stepper._parameters(parameters), np.zeros(stepper.dimension)
-    positions, _, velocity = stepper._states.start(q, None, rest)
-    momenta = stepper._initial_momenta(positions, None, velocity, t, values)
-    state = np.concatenate(stepper._states.pair(positions, momenta))
+    state, values = stepper.products.start(q, None, np.zeros(stepper.dimension), t, parameters)
     reduction = reduction_of(stepper, t, values)
     guess = state
     state = np.ravel(reduction.normalised(*np.split(state, 2)))
@@ -166,7 +158,7 @@ class _Motion:
 
     def step(self, state: Array) -> tuple[Array, Array]:
         """Return the change of a state by a step and the derivative of the step."""
-        tangents = np.zeros((len(state), self.stepper._input_size))
+        tangents = np.zeros((len(state), self.stepper.products.tangents))
         tangents[:, : len(state)] = np.eye(len(state))
         at = np.array([self.t]), np.array([self.h]), tangents, self.parameters
         states, vectors, _ = tangents_along(self.stepper, state, *at)
@@ -182,7 +174,7 @@ class _Motion:
     def at_rest(self, state: Array) -> Equilibrium:
         """Return the equilibrium at a state; the step is halved while its eigenvalues approach those of half of it."""
         motion, error, (values, vectors) = self, math.inf, self._spectrum(state)
-        while error > ACCURATE:
+        while error > SETTLED:
             motion = replace(motion, h=motion.h / 2.0)
             finer, finer_vectors = motion._spectrum(state)
             difference = float(np.abs(values[:, np.newaxis] - finer).min(axis=1).max())

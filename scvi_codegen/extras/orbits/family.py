@@ -31,6 +31,7 @@ from scvi_codegen.extras.orbits.continuation import Continuation, FamilyPoint, F
 from scvi_codegen.extras.orbits.equilibrium import Equilibrium
 from scvi_codegen.extras.orbits.reversor import Reversor
 from scvi_codegen.extras.orbits.solver import (
+    SAME,
     ErrorsOfOrbit,
     OrbitSearch,
     PeriodicOrbit,
@@ -42,8 +43,6 @@ from scvi_codegen.extras.orbits.solver import (
 from scvi_codegen.extras.orbits.step_sequence import StepSequence
 from scvi_codegen.runs.stepper import Stepper
 
-SAME_ORBIT = 1e-6
-"""Relative distance, far above errors of orbits, from which an orbit of a file is another one than the recomputed."""
 OTHERS = ("stepper", "sequence", "options", "errors")
 OF_ORBITS = tuple(name for name in PeriodicOrbit.__dataclass_fields__ if name not in OTHERS)
 """Fields of orbits that are saved as they are."""
@@ -257,7 +256,7 @@ class Family:
             first, last, *others = (
                 replace(continuation, search=own).corrected(*point) for own, point in zip(searches, points, strict=True)
             )
-            same = np.abs(first.y - points[0, 0]).max() <= SAME_ORBIT * np.abs(first.y).max()
+            same = np.abs(first.y - points[0, 0]).max() <= SAME * np.abs(first.y).max()
         except OrbitError:
             same = False
         if not same:

@@ -53,12 +53,14 @@ from scvi_codegen.extras.paths.size import ROUNDOFF, SizeOfMotion
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.trajectory import Trajectory
 
-SYMPLECTIC = 1e-9
-"""Symplecticity defect of a monodromy matrix, relative to its squared norm, above which it is not due to rounding."""
 SAME = 1e-6
-"""Deviation of a stability index from 1 that rounding may cause."""
+"""Relative difference below which states, motions and eigenvalues are the same: rounding errors of monodromy matrices
+move double eigenvalues, stability indices of 1, by so much, and equilibria move less over a period, relative to their
+distance from the guess."""
 ERROR, ERROR_OF_EQUAL_STEPS = 1e-9, 1e-6
-"""Default bounds of the discretisation error, of adaptive steps and of those that the user chose."""
+"""Default bounds of the discretisation error, of adaptive steps and of those that the user chose. The first also bounds
+defects of symplecticity and reversal, and singular values that count as zero: defects of symmetric steps are 1e-16 to
+2e-15 (Henon-Heiles, orbits about L1), those of the motions of a wrong reversor about 0.4."""
 TOLERANCES = (1e-2, 1e-4, 0.0)
 """Local tolerances of adaptive steps, relative to the bound of the discretisation error, until one meets it."""
 
@@ -221,7 +223,7 @@ class PeriodicOrbit:
         Raises:
             MethodError: if the steps are not symplectic.
         """
-        if self.symplectic_error > SYMPLECTIC:
+        if self.symplectic_error > ERROR:
             raise MethodError(
                 f"stability indices are undefined: steps of '{self.stepper.title}' are not symplectic; use multipliers"
             )
@@ -235,7 +237,7 @@ class PeriodicOrbit:
     @property
     def stable(self) -> bool:
         """Return whether no multiplier exceeds 1 in modulus, up to rounding."""
-        if self.symplectic_error > SYMPLECTIC:
+        if self.symplectic_error > ERROR:
             return bool(np.abs(self.multipliers).max() <= 1.0 + SAME)
         indices = self.stability_indices
         return bool((np.abs(indices.real) <= 1.0 + SAME).all() and (np.abs(indices.imag) <= SAME).all())
@@ -297,8 +299,6 @@ CIRCLE = 32
 MOST_ITERATIONS, MOST_HALVINGS = 50, 12
 EASY, GROWTH = 10.0, 4.0
 """Growth of tangent vectors in a period up to which one segment is enough, and that in each of more segments."""
-NULL_SINGULAR_VALUE = 1e-9
-"""Singular values below this fraction of the largest count as zero in the pseudoinverse."""
 CLOSED = 1e-11
 """Largest closing error, relative to the size of the motion and the norm of the monodromy matrix."""
 OPEN = 1e-3
@@ -314,8 +314,6 @@ SETTLED = 1e-13
 """Newton step, relative to the motion and the period, below which the iteration ends."""
 MOST_INCREASE = 10.0
 """Largest factor by which a Newton step may increase the residual."""
-LEAST_SIZE = 1e-300
-"""Size of a motion at rest at the origin."""
 FREEDOM = 3.0
 """Largest factor by which the period of an orbit may differ from its guess."""
 FAR = 1.5
@@ -324,13 +322,8 @@ orbit is not the guessed one."""
 RESTORATIONS = 4
 """Newton iterations, of quadratic convergence, that restore fixed entries after a state is normalised: 0.1^(2^4) is
 rounding, so that a tenth of the size of the motion is restored."""
-REVERSED = 1e-9
-"""Largest distance of a step from one that a reversor reverses, relative to the motion: that which ``ERROR`` bounds. Of
-symmetric steps it is 1e-16 to 2e-15 (Henon-Heiles, orbits about L1), of the motions of a wrong reversor about 0.4."""
 OTHER = 1.0 / 3.0
 """Part of the amplitude of an orbit from which its distance to the guess is reported."""
-EQUILIBRIUM_MOTION = 1e-6
-"""Ranges over a period, relative to the distance from the guess, below which an orbit counts as an equilibrium."""
 
 
 @checks_arguments(StateError, stepper=Stepper.KIND)
@@ -398,7 +391,6 @@ def periodic_orbit(
         StepFailedError: if a step from the initial guess fails.
     """
     stepper = stepper.bind(q, parameters)[0]._known_with_events
-    q, p, velocity = stepper._states.start(q, p, velocity)
     stepper.products.require("periodic_orbit")
     stepper.products.check_given(parameters)
     if energy is not None:
@@ -410,9 +402,8 @@ def periodic_orbit(
         raise StateError(f"max_step={max_step:g} requires adaptive steps: omit it, or steps and h")
     if sequence is None:
         stepper.products.require("adaptive")
-    t, values = checked_number(t, "the time t"), stepper._parameters(parameters)
-    momenta = stepper._initial_momenta(q, p, velocity, t, values)
-    start = np.concatenate(stepper._states.pair(q, momenta))
+    t = checked_number(t, "the time t")
+    start, values = stepper.products.start(q, p, velocity, t, parameters)
     search = OrbitSearch.at(
         stepper,
         start[: stepper.dimension],
@@ -464,7 +455,7 @@ def gains_of(stepper: Stepper, gain: ArrayLike | Sequence[float | None] | None) 
         if len(stepper.interface.constraints) > stepper.interface.masked:
             raise StateError("a gain of None requires a system without constraints: give its number")
         entries = [0.0 if entry is None else entry for entry in entries]
-    return {"gain": stepper._states.vector(entries, "gain"), "drifts": drifts}
+    return {"gain": stepper.products.states.vector(entries, "gain"), "drifts": drifts}
 
 
 def _equal_steps(period: float, steps: int | None, h: float | None) -> StepSequence | None:
@@ -561,7 +552,7 @@ class OrbitSearch:
         detects = reversor == "detect"
         for own in Reversor.fitting(state) if detects else [Reversor.of(stepper.coordinates, texts)]:
             guess = guess_of(own)
-            if self.of_reversor(own).irreversibility(guess) <= REVERSED:
+            if self.of_reversor(own).irreversibility(guess) <= ERROR:
                 return self.of_reversor(own), np.append((guess[:-1] + own(guess[:-1])) / 2.0, guess[-1])
         tried = "no change of signs that keeps the guess reverses" if detects else "it does not reverse"
         raise StateError(f"reversor={reversor!r}: {tried} the steps of '{stepper.title}'; give a symmetry, or omit it")
@@ -577,7 +568,7 @@ class OrbitSearch:
         """Return the distance of mirror images of states from steps back to them, relative to the motion."""
         assert self.reversor is not None
         search = self if self.sequence is not None else self.adapted(z, TOLERANCES[0] * ERROR)
-        at: Any = np.zeros((0, self.stepper._input_size)), self.parameters, self.options
+        at: Any = np.zeros((0, self.stepper.products.tangents)), self.parameters, self.options
         times = z[-1] * search.steps.ends
         states = tangents_along(self.stepper, z[:-1], self.t + times[:-1], np.diff(times), *at)[0]
         images, away = self.reversor(states), []
@@ -671,7 +662,7 @@ class OrbitSearch:
             sizes.reshape(2, m).max(axis=1) for sizes in (np.ptp(motion.states, axis=0), abs(z - guess)[:-1])
         )
         rounding = Products.RESOLVED * ROUNDOFF * np.abs(z[:m]).max()
-        at_rest = (ranges < EQUILIBRIUM_MOTION * distances).any() and not self.gain.any()  # momenta may be constant
+        at_rest = (ranges < SAME * distances).any() and not self.gain.any()  # momenta may be constant
         if at_rest or ranges[0] <= rounding:
             raise OrbitError(
                 f"the iteration converged to an equilibrium, q = {_listed(z[:m])}, p = {_listed(z[m:-1])}: fix an "
@@ -833,7 +824,7 @@ class OrbitSearch:
             if not away.any():
                 break
             into = block_diagonal([*(space.inward(*state) for space, state in self._nodes(moved)), np.eye(1)])
-            moved += into @ np.linalg.lstsq(rows @ into, away, rcond=NULL_SINGULAR_VALUE)[0]
+            moved += into @ np.linalg.lstsq(rows @ into, away, rcond=ERROR)[0]
         return moved
 
     def _nodes(self, z: Array) -> Iterator[tuple[Reduction, Array]]:
@@ -861,13 +852,13 @@ class OrbitSearch:
         fixed = self.fixed_changes(equations.into, units)
         free = np.linalg.svd(fixed)[2][np.linalg.matrix_rank(fixed) :].T
         scaled = equations.partials * units / rows[:, np.newaxis] @ free
-        inverse: Array = free @ np.linalg.pinv(scaled, NULL_SINGULAR_VALUE)
+        inverse: Array = free @ np.linalg.pinv(scaled, ERROR)
         return units[:, np.newaxis] * inverse / rows
 
     def fixed_changes(self, into: Array, units: Array) -> Array:
         """Return (n, r) changes of fixed entries by the reduced unknowns in units, each relative to the largest one."""
         fixed = self.fixed_rows(len(into)) @ into * units
-        return np.asarray(fixed / np.fmax(np.abs(fixed).max(axis=1, initial=0.0), LEAST_SIZE)[:, np.newaxis])
+        return np.asarray(fixed / np.fmax(np.abs(fixed).max(axis=1, initial=0.0), np.finfo(float).tiny)[:, np.newaxis])
 
     def fixed_rows(self, count: int) -> Array:
         """Return (n, count) rows of fixed entries of z, and of changes across the fixed set of the reversor."""
@@ -888,7 +879,7 @@ class OrbitSearch:
     def sizes_of(self, states: Array) -> Array:
         """Return the (2m,) sizes of positions and momenta along states, at least their rounding errors."""
         size = self._size_of(states)
-        least = (Products.RESOLVED * rounding or LEAST_SIZE for rounding in size.rounding)
+        least = (Products.RESOLVED * rounding or np.finfo(float).tiny for rounding in size.rounding)
         return np.repeat(list(map(max, (size.position, size.momentum), least)), self.stepper.dimension)
 
     def closing_equations(self, z: Array) -> ClosingEquations:
@@ -956,7 +947,7 @@ class OrbitSearch:
         size, ends, widths = self.reduction.size, steps.ends[first : last + 1], steps.widths[first:last]
         space = self.reduction.at(self.t + period * float(ends[0]), self.parameters)
         inward, shift = space.inward(*np.split(start, 2)), np.zeros(len(start))
-        tangents = np.zeros((size + 2 + (self.varied is not None), self.stepper._input_size))
+        tangents = np.zeros((size + 2 + (self.varied is not None), self.stepper.products.tangents))
         tangents[:size, : len(start)] = inward.T
         if self.varied is not None:
             tangents[-1, len(start) + self.varied] = 1.0
@@ -1066,7 +1057,7 @@ class OrbitSearch:
                 values = self._integrals(states, np.linspace(segment.start_time, segment.end_time, len(states)))
                 conserved_masks.append(np.ptp(values, axis=0) <= CONSERVED * np.linalg.norm(begin, axis=1))
         conserved = begins[0][np.all(conserved_masks, axis=0)]
-        conserved /= np.maximum(np.linalg.norm(conserved, axis=1), LEAST_SIZE)[:, np.newaxis]
+        conserved /= np.maximum(np.linalg.norm(conserved, axis=1), np.finfo(float).tiny)[:, np.newaxis]
         directions, strengths, _ = np.linalg.svd(conserved.T, full_matrices=False)
         directions = directions[:, strengths > max(CONSERVED, IMPLIED * error) * strengths.max(initial=0.0)]
         projection = np.eye(self.reduction.size) - directions @ directions.T

@@ -327,7 +327,7 @@ def _entry(model: Model, interface: Interface, initial: Sequence[str], adaptive:
     if model.system.bath:
         model.start()  # checks the seed and the rule of Metropolis
     events = interface.searched(model.events)
-    axes = {name: np.ravel(nodes).tolist() for name, nodes in model.mesh.points.items()} if model.mesh else {}
+    points = model.mesh.points if model.mesh else {}
     return (
         plain_template("page/entry.c.jinja").render(
             array=model.array_system is not None, m=size, capacity=256 if size < 64 else 16,
@@ -341,7 +341,7 @@ def _entry(model: Model, interface: Interface, initial: Sequence[str], adaptive:
             velocities=not starts_from_momenta(model),
             level=interface.energy_index if interface.in_tau else None,
             noise=model if model.system.bath else None,
-            axes={f"at_{name}": nodes for name, nodes in axes.items()},
+            axes={f"at_{name}": np.ravel(nodes).tolist() for name, nodes in points.items()},
             names={f"at_{name}": k for k, name in enumerate(interface.parameters)},
         )
     )  # fmt: skip

@@ -48,7 +48,7 @@ def path(model_name: str, output: str | None, plot: str | None, **choices: Any) 
     if plot is not None:
         check_writable(FilePath(plot), "'--plot'")
         check_picture(plot)
-    model = read_model(model_name, choices).with_known_sizes("path")
+    model = read_model(model_name, choices, unused=_unused).with_known_sizes("path")
     paths = _paths(model)
     title = f"{model.system.name}\n{model.method.title}; {counted(len(paths), 'path')}"
     tell("\n".join([title, *map(_described, paths)]), **_numbers(model, paths))
@@ -59,6 +59,12 @@ def path(model_name: str, output: str | None, plot: str | None, **choices: Any) 
             tell(f"wrote {target}")
     if written := [target for target in (output, plot) if target]:
         tell(written=written)
+
+
+def _unused(document: Any) -> tuple[str, ...]:
+    """Return what paths do not start from: a velocity, and where they start elsewhere the coordinates."""
+    settings = document.get("path", {})
+    return () if "closed" in settings else ("q_dot", "q") if "from" in settings else ("q_dot",)
 
 
 def _paths(model: Model) -> list[Path]:

@@ -21,7 +21,7 @@ from scvi_codegen.extras.paths import solver
 from scvi_codegen.extras.paths.discretisation import Discretisation, discretisation_of, kinetic_energy_is_positive
 from scvi_codegen.extras.paths.equations import Band, condensed_hessian, hessian_blocks, negative_pivots
 from scvi_codegen.extras.paths.intervals import Intervals, ManyCoordinates, ReducedIntervals
-from scvi_codegen.extras.paths.size import largest_range, size_for_updates
+from scvi_codegen.extras.paths.size import SAME, largest_range, size_for_updates
 from scvi_codegen.extras.paths.starts import curves_around, curves_at_random
 
 if TYPE_CHECKING:
@@ -31,10 +31,10 @@ MANY_COORDINATES = 48
 """Number of coordinates from which derivatives are computed as sparse matrices."""
 RANDOM_STARTS, FEW_ITERATIONS, SAME_PATH, MOST_REVOLUTIONS = 10, 25, 1e-6, 10**6
 """Number of starts at random and of their iterations, relative distance of equal paths, and most revolutions."""
+MOST_REPETITIONS = 1000
+"""Longest period of a closed path in multiples of T."""
 TOLERABLE_ERROR = 1e-3
 """Largest discretisation error without a warning."""
-SAME_MATRIX, MOST_REPETITIONS = 1e-9, 1000
-"""Distance of equal symmetries of closed paths, and the longest period in multiples of T."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -185,23 +185,24 @@ def path_of(
     stepper.products.require("path")
     count = checked_count(steps, "steps", least=2)
     duration, begin = _checked_duration(T), checked_number(t, "the time t")
+    states = stepper.products.states
     kind = _kind_of_intervals(stepper, closed=closed is not None, energy=energy is not None)
     h = np.full(count, duration / count)
     times = begin + np.arange(count) * h
     intervals = kind(stepper, times, h, _parameters_of_steps(stepper, parameters, inputs, times + h / 2.0), options)
     arguments = {"parameters": parameters, "options": options, **({"inputs": inputs} if inputs is not None else {})}
-    nodes = _nodes_of_start(stepper._states, start, begin, duration, count)
+    nodes = _nodes_of_start(states, start, begin, duration, count)
     start_energy = None if energy is None else checked_number(energy, "energy")
-    states = partial(_energies_and_velocities, stepper, begin, intervals.parameters)
+    energies = partial(_energies_and_velocities, stepper, begin, intervals.parameters)
     if closed is not None:
         M = _symmetry(stepper.interface, closed)
-        solution = _closed_solution(intervals, nodes, M, start_energy, states)
+        solution = _closed_solution(intervals, nodes, M, start_energy, energies)
         closed_path = _described(stepper, solution, begin, arguments, _checked(solution), M=M)
         _warn_at_rest(closed_path, duration)
         return closed_path
     if q0 is None or q1 is None:
         raise StateError("path: give both positions q0 and q1, or closed= and start=")
-    ends = [stepper._vector(stepper._states.positions(q, name), name) for q, name in ((q0, "q0"), (q1, "q1"))]
+    ends = [states.vector(states.positions(q, name), name) for q, name in ((q0, "q0"), (q1, "q1"))]
     intervals.range_of_start = largest_range(np.array(ends) if nodes is None else nodes)
     if revolutions is not None:
         attempts: list[Attempt] = [
@@ -212,7 +213,7 @@ def path_of(
         attempts = _attempts(intervals, ends, nodes, duration)
     solution, comparison, dropped = _first_motion(attempts)
     if start_energy is not None:
-        solution = solver.AtEnergy(solution.intervals, start_energy, states).solved(solution.q, solution.iterations)
+        solution = solver.AtEnergy(solution.intervals, start_energy, energies).solved(solution.q, solution.iterations)
         comparison = _checked(solution)
     return _described(stepper, solution, begin, arguments, comparison, dropped=dropped)
 
@@ -268,7 +269,7 @@ def different_paths(
         arguments: further ones of :meth:`~scvi_codegen.Stepper.path`.
     """
     paths, reason = list[Path](), None
-    ends = [real_array(stepper._states.positions(end, "the ends"), "the ends") for end in (q0, q1)]
+    ends = [real_array(stepper.products.states.positions(end, "the ends"), "the ends") for end in (q0, q1)]
     line = _line(ends, arguments["steps"])
     tried: list[dict[str, Any]] = [{}]
     if revolutions is not None:
@@ -462,9 +463,9 @@ def _parameters_of_steps(stepper: Any, parameters: Parameters, inputs: Mapping[s
     """Return the (k,) parameters of all steps, or (N, k) with inputs, those of the piece in the middle of each step."""
     if inputs is None:
         stepper.products.check_given(parameters)
-        return np.ascontiguousarray(stepper._parameters(parameters))
+        return np.ascontiguousarray(stepper.products.parameters(parameters))
     functions = stepper.products.inputs_of(inputs)
-    values = np.tile(stepper._parameters(parameters), (len(times), 1))
+    values = np.tile(stepper.products.parameters(parameters), (len(times), 1))
     columns = stepper.products.input_columns
     for k, time in enumerate(times.tolist()):
         values[k, columns] = np.concatenate([functions[name].parameters(time) for name in stepper.interface.inputs])
@@ -509,7 +510,7 @@ def _symmetry(interface: Any, closed: Any) -> Array:
             M[row, names.index(name)] = -1.0 if entry.startswith("-") else 1.0
         return M
     M = real_array(closed, "closed")
-    if M.shape != (m, m) or np.abs(M @ M.T - np.eye(m)).max(initial=0.0) > SAME_MATRIX:
+    if M.shape != (m, m) or np.abs(M @ M.T - np.eye(m)).max(initial=0.0) > SAME:
         raise StateError(
             f"closed must be True, the names of the {m} coordinates that follow after T, or an orthogonal matrix "
             f"({m}, {m})"
@@ -521,7 +522,7 @@ def _order(M: Array) -> int:
     """Return the least n with M^n = 1, 0 if there is none up to ``MOST_REPETITIONS``."""
     power = M
     for n in range(1, MOST_REPETITIONS + 1):
-        if np.abs(power - np.eye(len(M))).max() < SAME_MATRIX * n:
+        if np.abs(power - np.eye(len(M))).max() < SAME * n:
             return n
         power = power @ M
     return 0

@@ -6,8 +6,10 @@ import numpy as np
 
 from scvi_codegen.api.states import Array
 
-ROUNDOFF = 2.0**-53
+ROUNDOFF = float(np.finfo(float).eps) / 2.0
 """Largest relative rounding error of a number."""
+SAME = 1e-9
+"""Relative difference, far above rounding, below which matrices of symmetries are equal and positions at rest."""
 UPDATE_ROUNDING = 4.0
 """Newton updates of so many roundings of the largest value cannot be reduced."""
 

@@ -18,14 +18,12 @@ from scvi_codegen.api.states import Array
 from scvi_codegen.common.errors import PathError, StateError, StepFailedError
 from scvi_codegen.extras.paths.equations import Bordered, BorderedClosed, Closed, closed_residual, factors_of
 from scvi_codegen.extras.paths.intervals import Intervals, Linearised
-from scvi_codegen.extras.paths.size import ROUNDOFF, SizeOfMotion, largest_range, size_for_updates
+from scvi_codegen.extras.paths.size import ROUNDOFF, SAME, SizeOfMotion, largest_range, size_for_updates
 
 TOLERANCE = 1e-11
 """Newton correction, relative to the range of the path, at which the iteration ends."""
 ROUNDING, ILL_CONDITIONED = 1e-14, 1e-7
 """Residual, relative to the momenta, that is rounding, and the correction that then ends the iteration."""
-AT_REST = 1e-9
-"""Range of the positions of a path at rest, relative to that of the start of the search."""
 GAUGED = 1.2
 """Ratio of momenta to those of velocities from which on the latter are their size."""
 MOST_ITERATIONS, LEAST_STEP = 60, 1e-4
@@ -59,7 +57,7 @@ class Solution:
     def at_rest(self) -> bool:
         """True if all positions are equal, up to rounding or relative to the start of the search."""
         rounding = Products.RESOLVED * ROUNDOFF * float(np.abs(self.q).max())
-        return largest_range(self.q) <= max(AT_REST * self.intervals.range_of_start, rounding)
+        return largest_range(self.q) <= max(SAME * self.intervals.range_of_start, rounding)
 
     @property
     def momenta(self) -> Array:
@@ -130,7 +128,7 @@ def newton(
 
 def _relative(intervals: Intervals, q: Array, correction: Array) -> float:
     """Return the largest correction of a node relative to the range of the path, or to that of a path at rest."""
-    size = size_for_updates(q, TOLERANCE, AT_REST * intervals.range_of_start)
+    size = size_for_updates(q, TOLERANCE, SAME * intervals.range_of_start)
     return float(np.abs(correction).max(initial=0.0)) / (size or 1.0)
 
 

@@ -6,11 +6,10 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.api.states import Array
+from scvi_codegen.extras.paths.size import SAME
 
 WAVES = 3
 """Number of sine waves of a curve at random."""
-ROTATION = 1e-9
-"""Largest relative deviation of the generator of a rotation from an antisymmetric matrix."""
 MOST_ROTATED = 64
 """Largest number of coordinates that are searched for rotations."""
 
@@ -48,7 +47,7 @@ def curves_around(stepper: Any, line: Array, t: float, parameters: Array, revolu
         values, vectors = np.linalg.eigh(1j * generator)
         planar = -generator @ generator  # projection onto the planes that turn
         angle = float(np.arctan2(last @ generator @ first, last @ planar @ first))
-        angle = np.pi if angle <= -np.pi * (1.0 - ROTATION) else angle
+        angle = np.pi if angle <= -np.pi * (1.0 - SAME) else angle
         if not (np.any(generator @ first) and np.any(generator @ last)):
             continue
         total = angle + 2.0 * np.pi * revolutions
@@ -73,9 +72,9 @@ def _rotations(stepper: Any, t: float, parameters: Array) -> Iterator[tuple[Arra
     maps = maps - np.asarray(stepper.momentum_maps(q, 0.0 * p, np.full(len(q), t), parameters)).reshape(maps.shape)
     for shift, rates in zip(maps[0].T, (maps[1:] - maps[0]).transpose(2, 1, 0), strict=True):
         size = float(np.linalg.norm(rates, 2))
-        if not size or np.abs(rates + rates.T).max() > ROTATION * size:
+        if not size or np.abs(rates + rates.T).max() > SAME * size:
             continue
         generator = rates / size
-        if np.abs(generator @ generator @ generator + generator).max() > ROTATION:
+        if np.abs(generator @ generator @ generator + generator).max() > SAME:
             continue  # turns planes at different rates
         yield generator, -np.linalg.pinv(generator) @ (shift / size)

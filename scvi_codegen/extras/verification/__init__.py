@@ -194,10 +194,9 @@ def _initial_state(
 ) -> State:
     if all(part is None for part in state):
         return _random_state(system, stepper, h, t)
-    q, p, velocity = stepper._states.start(*state)
-    if q is None:
+    if state[0] is None:
         raise StateError("p or velocity was passed without q: give the whole state, or none")
-    position, momentum = stepper._states.pair(q, stepper._initial_momenta(q, p, velocity, t, None))
+    position, momentum = np.split(stepper.products.start(*state, t, None)[0], 2)
     if system.constraints:
         position, momentum = stepper.project(position, momentum, t=t)
     return State(position, momentum, t, h if h else _step(stepper, position, momentum, t))

@@ -53,7 +53,7 @@ class _Map:
         """Return J v of the compiled Jacobian J, or J^T v."""
         vectors = np.zeros((2, 1, len(vector)))
         vectors[int(back)] = vector
-        self.stepper._propagate(_starts(self.state), vectors, self.parameters, None, transpose=back)
+        self.stepper.products.propagate(_starts(self.state), vectors, self.parameters, None, transpose=back)
         return np.asarray(vectors[int(not back), 0])
 
     def moved_end(self, change: Array) -> Array:
@@ -137,7 +137,7 @@ def _largest(tested: SystemUnderTest, error: Callable[[_Map], float]) -> Finding
 def _differentiable(tested: SystemUnderTest) -> bool:
     """Return True if the stepper has derivatives; those of generated folders have none."""
     try:
-        return tested.stepper._input_size > 0
+        return tested.stepper.products.tangents > 0
     except MethodError:
         return False
 
@@ -185,10 +185,10 @@ def _weights(step: _Map) -> Array:
 
 def _hessian(step: _Map) -> Array:
     """Return the compiled Hessian (n, n) of the weighted sum of the end state, n the number of arguments."""
-    size, starts = step.stepper._input_size, _starts(step.state)
+    size, starts = step.stepper.products.tangents, _starts(step.state)
     changes, vectors = np.zeros((2, size, size)), np.zeros((2, 2, size, size))
     changes[0], vectors[1, 0, :, : len(step.scales)] = np.eye(size), _weights(step)
-    step.stepper._propagate(starts, changes, step.parameters, None)
+    step.stepper.products.propagate(starts, changes, step.parameters, None)
     step.stepper._second_order_adjoint(starts, changes, vectors, step.parameters, None)
     return np.asarray(vectors[0, 1])
 

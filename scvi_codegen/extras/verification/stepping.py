@@ -36,7 +36,7 @@ from scvi_codegen.extras.verification.system_under_test import (
 )
 from scvi_codegen.runs.stepper import Stepper
 
-ANY_UPDATE = SolverOptions(tolerance=1e300)
+ANY_UPDATE = SolverOptions(tolerance=1e300, absolute=True)
 """Solver options that accept any update, so that a step makes one iteration."""
 LEAST_UPDATE = 1e6
 """Least size of the first update in units of rounding, for it to distinguish a wrong matrix."""

@@ -66,7 +66,7 @@ class VariableSteps:
     def at_energy(self, state: State) -> dict[str, float]:
         """Return the parameters with the energy of a state."""
         energy = self.stepper.energy(state.q, state.p, state.t, self.parameters)
-        return {**self.parameters, self.stepper.interface.energy_parameter: energy}
+        return {**self.parameters, str(self.stepper.interface.energy_parameter): energy}
 
     @property
     def tau(self) -> float:

@@ -33,6 +33,7 @@ from scvi_codegen.common.errors import (
     SystemDefinitionWarning,
     UnresolvedError,
     closest,
+    speaking,
 )
 from scvi_codegen.common.registry import EXTRAS, part
 
@@ -127,19 +128,18 @@ class Commands(click.Group):
 def _in_flags(message: str, arguments: Sequence[str]) -> str:
     """Return a message that names options by the flags of the command line, where these have set them.
 
-    ``[run] save_every`` of a model file and ``save_every =`` of a call are ``--save-every``.
+    ``[run] save_every`` is ``--save-every``.
     """
     flags = {word.partition("=")[0] for word in arguments if word.startswith("--")}
     if not flags:
         return message
-    from scvi_codegen.interfaces.models.options import METHOD, OPTIONS
+    from scvi_codegen.codegen.options import METHOD
+    from scvi_codegen.interfaces.models.options import OPTIONS
 
-    for option in OPTIONS:
-        if option.flag in flags and option.section:
-            key = "" if option.is_section or option.kind == METHOD else rf" {option.key}\b"
+    for option in reversed(OPTIONS):  # the name of a method last, whose section has other options
+        if option.section and not flags.isdisjoint(option.flag.split("/")):
+            key = "" if option.is_section else r"( method\b)?" if option.kind == METHOD else rf" {option.key}\b"
             message = re.sub(rf"\[{option.section}\]{key}", option.flag, message)
-            if option.section == "run":  # others are variables of formulas, too: t, q
-                message = re.sub(rf"(?<![\w-]){option.field} ?= ?", f"{option.flag} ", message)
     return re.sub(r"(--[\w-]+) (?=[,.;:)])", r"\1", message)
 
 
@@ -161,7 +161,7 @@ def errors_as_messages(arguments: Sequence[str] = ()) -> Iterator[None]:
     Messages name options by the flags among the arguments of the command line.
     """
     try:
-        with _warnings_as_lines():
+        with _warnings_as_lines(), speaking("command"):
             yield
     except (StepFailedError, UnresolvedError, PathError, BuildError, RecordingError) as error:
         raise CommandFailure(str(error)) from error

@@ -11,34 +11,33 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
+from scvi_codegen.codegen.options import (
+    ASSIGNMENTS,
+    COUNT,
+    EVENTS,
+    INPUTS,
+    METHOD,
+    NUMBER,
+    NUMBER_OR_NAMED,
+    NUMBERS,
+    NUMBERS_OR_NAME,
+    SIZES,
+    SWITCH,
+    Option,
+    check_agreement,
+)
 from scvi_codegen.common.atomic import NamedFile, naming_folders
-from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.common.errors import ModelFileError, SystemDefinitionError
 from scvi_codegen.common.toml_text import MAX_CHARACTERS
 from scvi_codegen.common.validation import ExactNumber
 from scvi_codegen.interfaces.cli.command_group import Command
 from scvi_codegen.interfaces.models.model import Model
 from scvi_codegen.interfaces.models.model_files.entries import ROBOT_FILES
 from scvi_codegen.interfaces.models.model_files.model_file import catalogue_model, load_model, parse_model
-from scvi_codegen.interfaces.models.model_files.sections import event_entry
-from scvi_codegen.interfaces.models.options import (
-    ASSIGNMENTS,
-    COUNT,
-    EVENTS,
-    INPUTS,
-    METHOD,
-    METHOD_KEYS,
-    NUMBER,
-    NUMBER_OR_NAMED,
-    NUMBERS,
-    NUMBERS_OR_NAME,
-    OPTIONS,
-    SIZES,
-    SWITCH,
-    Option,
-    excluded,
-)
+from scvi_codegen.interfaces.models.model_files.sections import UNUSED, Unused, event_entry
+from scvi_codegen.interfaces.models.options import OPTIONS, ROWS
 from scvi_codegen.interfaces.models.problems import PROBLEMS, problem
-from scvi_codegen.methods import ARGUMENTS, METHODS, size_of, specification_of
+from scvi_codegen.methods import METHODS, size_of
 
 Choices = Mapping[str, Any]
 """Options of the command line that override MODEL, by name; ``None`` or an empty tuple for options that are absent."""
@@ -207,44 +206,34 @@ def model_arguments(*further: str, required: bool = True) -> Callable[[Command],
     return decorated
 
 
+def by_field(choices: Choices) -> dict[str, Any]:
+    """Return the options of the command line by field."""
+    return {option.field: choices.get(option.name) for option in OPTIONS}
+
+
 def check_exclusive(choices: Choices) -> None:
     """Reject options that exclude each other."""
-    names = [name for name, value in choices.items() if value is not None]
-    if pair := next(excluded(names, "initial", "run"), None):
-        raise click.UsageError(f"{pair[0].flag} and {pair[1].flag} exclude each other")
+    check_agreement(by_field(choices), ModelFileError, rows=ROWS, partly=True)
 
 
-def check_flag(option: Option, situation: str) -> None:
-    """Reject an option of the command line if it is not available in a situation."""
-    if situation in option.unavailable:
-        raise click.UsageError(f"{option.flag} is not available {situation}: {option.unavailable[situation]}")
-
-
-def _check_method(choices: Choices) -> None:
-    """Reject options that the chosen method does not take or that contradict the number in its name."""
-    method = choices.get("method")
-    if method is None:
-        return
-    message = specification_of(method)
-    taken, flags = ARGUMENTS[message["method"]], {option.name: option.flag for option in OPTIONS}
-    for option in METHOD_KEYS[1:]:
-        value = choices.get(option)
-        if value is not None and option not in taken:
-            takes = ", ".join(flags[key] for key in taken if key in METHOD_KEYS) or "no options"
-            raise click.UsageError(f"--method {method} takes no {flags[option]}; it takes {takes}")
-        if value is not None and message.get(option, value) != value:
-            raise click.UsageError(
-                f"--method {method} and {flags[option]} {value} contradict each other: leave one of them out"
-            )
-
-
-def read_model(name: str, choices: Choices, steps: Mapping[str, float] | None = None) -> Model:
+def read_model(
+    name: str, choices: Choices, steps: Mapping[str, float] | None = None, unused: Unused | None = None
+) -> Model:
     """Return the model of a file, of standard input (``-``) or the catalogue, with the options of the command line.
 
-    ``steps``: entries of [run] that replace a step size, without which options of adaptive steps would be refused.
+    Args:
+        name: of the model.
+        choices: the options.
+        steps: entries of [run] that replace a step size, without which options of adaptive steps would be refused.
+        unused: required keys that a file may lack, of its sections.
     """
+    if unused is not None:
+        token = UNUSED.set(unused)
+        try:
+            return read_model(name, choices, steps)
+        finally:
+            UNUSED.reset(token)
     check_exclusive(choices)
-    _check_method(choices)
     sections = sections_of(choices)
     if steps:
         sections["run"] = {**sections.get("run", {}), **steps}

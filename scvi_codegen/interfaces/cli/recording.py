@@ -14,6 +14,7 @@ from typing import Any
 import click
 import numpy as np
 
+from scvi_codegen.codegen.options import DURATION
 from scvi_codegen.common.errors import ModelFileError, StepFailedError
 from scvi_codegen.common.representation import counted
 from scvi_codegen.interfaces.cli.command_group import check_writable
@@ -23,7 +24,7 @@ from scvi_codegen.interfaces.cli.running import conserved, event_counts, final_s
 from scvi_codegen.interfaces.cli.supervision import interruptions, progress_bar
 from scvi_codegen.interfaces.models.model import Model
 from scvi_codegen.interfaces.models.model_files.model_file import dump_model
-from scvi_codegen.interfaces.models.options import DURATION, OPTIONS
+from scvi_codegen.interfaces.models.options import OPTIONS
 from scvi_codegen.interfaces.models.time_span import whole_steps_in
 from scvi_codegen.runs.driver.run import Run
 from scvi_codegen.runs.recording import RecordedRun, load_run, record_run, resume_run

@@ -7,11 +7,11 @@ from typing import Any
 
 import click
 
+from scvi_codegen.codegen.options import OPTION
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.common.errors import AccuracyWarning, StateError
 from scvi_codegen.common.registry import part
 from scvi_codegen.common.representation import counted
-from scvi_codegen.common.validation import check_tolerance
 from scvi_codegen.interfaces.cli.command_group import tell
 from scvi_codegen.interfaces.cli.reports import duration
 from scvi_codegen.interfaces.models.model import Model
@@ -28,7 +28,7 @@ MAX_STEPS = 10**9
 
 def model_with_adaptive_steps(model: Model, tolerance: float) -> Model:
     """Return the model with adaptive steps whose local error is bounded by the tolerance, or by round-off."""
-    check_tolerance(tolerance)
+    OPTION["tolerance"].checked(tolerance)
     if tolerance < ROUND_OFF and not model.in_double_double:
         click.echo(f"Warning: tolerance {tolerance:g} is below double precision: round-off is used instead", err=True)
     allowed = tolerance if tolerance >= ROUND_OFF or model.in_double_double else None

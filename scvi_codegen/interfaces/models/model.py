@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scvi_codegen.codegen.lowering.arrays import check_solver
+from scvi_codegen.codegen.options import VELOCITY, check_agreement, check_given
 from scvi_codegen.codegen.variants import SUMS
 from scvi_codegen.common.display.cards import Html, card, listed, plain
-from scvi_codegen.common.errors import ArgumentError, ModelFileError, StateError
+from scvi_codegen.common.errors import ArgumentError, ModelFileError, StateError, speaking
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import check_kind, keyword_hint
 from scvi_codegen.interfaces.models.options import (
     FURTHER,
+    ROWS,
     RUN_FIELDS,
     STATE,
-    VELOCITY,
-    check_alternatives,
     checked_value,
     real,
     with_exact_numbers,
@@ -124,6 +124,7 @@ class Model(TimeSpan):
         formula = self.system._repr_html_()
         return card(self.system.name, facts, Html(formula) if formula else plain(repr(self.system)))
 
+    @speaking("model")
     def __post_init__(self) -> None:
         check_kind(MechanicalSystem.OR_ARRAYS, self.system, "system", ModelFileError)
         if self.mesh is None:
@@ -155,10 +156,11 @@ class Model(TimeSpan):
     def _take_vectors(self) -> None:
         """Check the fields of a model of named coordinates, whose state becomes numbers in order."""
         self._take_attitudes()
-        check_alternatives(self, VELOCITY)
+        check_agreement({name: getattr(self, name) for name in STATE.values()}, ModelFileError)
+        check_given(self, VELOCITY, ModelFileError)
         if self.threads is not None:
             raise ModelFileError(
-                "threads require arrays whose sizes are names, coordinates = ['q[N]']: omit threads (--threads)"
+                f"{ROWS['threads']} requires arrays whose sizes are names, coordinates = ['q[N]']: omit it"
             )
         for name in STATE.values():
             if (vector := getattr(self, name)) is not None:
@@ -181,8 +183,7 @@ class Model(TimeSpan):
         """Check the fields of a model of arrays, and supplement the values of arrays and tables by their defaults."""
         if self.solver != "auto":
             check_solver(self.solver, ModelFileError)
-        if self.p is not None and self.velocity is not None:
-            raise ModelFileError("give p or velocity (q_dot), not both")
+        check_agreement({name: getattr(self, name) for name in STATE.values()}, ModelFileError)
         if self.time_transformation is not None:
             raise ModelFileError(
                 "a time transformation requires known array sizes: use that of the model with_known_sizes()"
@@ -237,9 +238,9 @@ class Model(TimeSpan):
         """Return the absolute tolerance of each coordinate; none if all are 0."""
         if self.absolute_tolerance is None:
             return ()
-        from scvi_codegen.runs.stepping.step_plan import absolute_tolerances, checked_absolute_tolerance
+        from scvi_codegen.runs.stepping.step_plan import ErrorControl, absolute_tolerances
 
-        values = checked_absolute_tolerance(self.absolute_tolerance)
+        values = ErrorControl(absolute_tolerance=self.absolute_tolerance).checked()["absolute_tolerance"]
         return tuple(absolute_tolerances(interface, interface.dimension, values).tolist())
 
     @property
@@ -490,7 +491,7 @@ class Model(TimeSpan):
 
     def _run_arguments(self) -> dict[str, Any]:
         """Return the arguments of :meth:`Stepper.integrate` and ensembles for time, steps, saved states and inputs."""
-        others = ("span", "threads", "action")  # and choices, which are arguments of the stepper
+        others = ("span", "threads", "action", "precision", "sums", "controller", "observe")  # those of the stepper
         arguments = {
             option.field: getattr(self, option.field)
             for option in RUN_FIELDS
@@ -506,8 +507,6 @@ class Model(TimeSpan):
 
     def _common(self, options: SolverOptions | None, threads: int | None) -> dict[str, Any]:
         options, threads = options or self.solver_options, threads or self.threads
-        if threads is not None and self.array_system is None:
-            raise ModelFileError("threads require arrays whose sizes are names, coordinates = ['q[N]']: omit threads")
         return {"options": options} if threads is None else {"options": options, "threads": threads}
 
     def _vector(self, name: str, values: Sequence[float]) -> tuple[float, ...]:

@@ -7,26 +7,23 @@ from fractions import Fraction
 from typing import Any, Self
 
 from scvi_codegen.codegen.native.options import SolverOptions
-from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
-from scvi_codegen.codegen.variants import SUMS
+from scvi_codegen.codegen.options import DURATION, STEP_SIZE, check_agreement, check_given, in_words
+from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE
 from scvi_codegen.common.errors import MethodWarning, ModelFileError, warn
 from scvi_codegen.common.validation import LARGEST_COUNT
 from scvi_codegen.interfaces.models.options import (
-    DURATION,
     OF_ADAPTIVE_STEPS,
     OPTIONS,
+    ROWS,
     RUN_FIELDS,
-    STEP_SIZE,
-    RunOptions,
-    check_alternatives,
+    ModelOptions,
     options_of,
 )
 from scvi_codegen.methods.controllers import default_controller
-from scvi_codegen.runs.ensembles.observation import OBSERVED
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class TimeSpan(RunOptions):
+class TimeSpan(ModelOptions):
     """Step size or tolerance, and time span or number of steps; models derive from it.
 
     Attributes:
@@ -60,31 +57,15 @@ class TimeSpan(RunOptions):
 
     def _check_time_span(self) -> None:
         """Raise :class:`ModelFileError`, naming the field, for invalid values, and convert the others."""
-        check_alternatives(self, STEP_SIZE, DURATION)
-        for option in RUN_FIELDS:
-            if (value := getattr(self, option.field)) is not None:
-                object.__setattr__(self, option.field, option.checked(value))
-        for name, choices in (("precision", PRECISIONS), ("sums", SUMS), ("observe", OBSERVED[:2])):
-            if (value := getattr(self, name)) not in (None, *choices):
-                raise ModelFileError(f"unknown {name} {value!r}: use {' or '.join(map(repr, choices))}")
-        if self.h is not None and (control := self._control):
-            name, value = next(iter(control.items()))
-            raise ModelFileError(
-                f"{name} = {value} is for adaptive steps, but the step size is fixed, h = {self.h:g}: omit one of them"
-            )
-        if self.h is None:
-            if self.span is None:
-                raise ModelFileError("adaptive steps require a time span: give span, not steps")
-            if self.span == 0.0:
-                raise ModelFileError("span is 0: it must be positive, or negative for a run backward in time")
-            return
-        if self.span is not None and not 0.0 < self.span / abs(self.h) <= LARGEST_COUNT:
-            backward = (
-                f"a run backward in time has a negative step, --step {-abs(self.h):g} --span {abs(self.span):g} "
-                f"(step = {-abs(self.h):g} and span = {abs(self.span):g} in files, h={-abs(self.h):g} in Python)"
-            )
-            remedy = backward if self.span < 0.0 else "give a positive span of less than 2^53 steps"
-            raise ModelFileError(f"span is {self.span:g} with a step size of {self.h:g}: {remedy}")
+        given = {row.field: value for row in RUN_FIELDS if (value := getattr(self, row.field)) is not None}
+        check_agreement(given, ModelFileError, rows=ROWS)
+        for name, value in given.items():
+            object.__setattr__(self, name, ROWS[name].checked(value, ModelFileError))
+        check_given(self, DURATION, ModelFileError)
+        if None not in (self.h, self.span) and not 0.0 < self.span / abs(self.h) <= LARGEST_COUNT:  # type: ignore
+            backward = f"a run backward in time has {{h}} = {-abs(self.h):g} and {{t_end}} = {abs(self.span):g}"  # type: ignore
+            remedy = in_words(backward) if self.span < 0.0 else "give a positive one of less than 2^53 steps"  # type: ignore
+            raise ModelFileError(f"{ROWS['span']} = {self.span:g} with a step size of {self.h:g}: {remedy}")
 
     def _check_controller(self) -> None:
         """Raise an error if a controller of adaptive steps is given beside a step size."""

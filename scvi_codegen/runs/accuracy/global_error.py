@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.codegen.native.arguments import checked_number
+from scvi_codegen.codegen.options import OPTION, check_agreement
 from scvi_codegen.common.errors import AccuracyWarning, ScviCodegenError, StateError, StepFailedError, warn
 from scvi_codegen.runs.accuracy.narrow_forces import differences_in_pieces, longest_piece
 from scvi_codegen.runs.accuracy.run_error import (
@@ -156,15 +156,8 @@ def warn_of_unconfirmed(confirmations: Sequence[GlobalError | None]) -> None:
 
 def checked_error(error: Any, others: Mapping[str, Any], stepper: Any = None) -> float:
     """Return the requested global error; raise StateError if it is unattainable or another option sets step sizes."""
-    bound = checked_number(error, "the global error")
-    if not 0.0 < bound < 1.0:
-        raise StateError(f"error={bound:g} must be between 0 and 1: it bounds the relative global error")
-    for name, value in others.items():
-        if value is not None:
-            raise StateError(
-                f"error={bound:g} and {name}={value!r} both determine the step size: error= requires adaptive steps; "
-                f"omit {name} and give t_end"
-            )
+    check_agreement({"error": error, **others})
+    bound: float = OPTION["error"].checked(error)
     if stepper is not None:
         words = max(stepper.interface.words, 1 + (stepper._precise is not None))
         if bound < (least := smallest_estimate(words)):

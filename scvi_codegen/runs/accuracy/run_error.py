@@ -8,8 +8,8 @@ is the error of x_{k+1}, up to terms of the order of delta^2 and the error of ph
 Solving Ordinary Differential Equations I, II.4; R. D. Skeel, Thirteen ways to estimate global error, Numer. Math. 48
 (1986) 1-20). It holds for any sequence of states: phi is one step where all states are saved, else a run at round-off
 from one state to the next, over events, so that no interval ends at one. The differences need no derivatives and are
-those of intervals shared by threads; the derivatives are those of the run's own steps. Further vectors rho transport
-samples of the rounding errors of the states, u |x| with a random sign for each step of the run.
+those of intervals shared by threads; the derivatives are those of the run's own method along the curves of phi. Further
+vectors rho transport samples of the rounding errors of the states, u |x| with a random sign for each step of the run.
 """
 
 from __future__ import annotations
@@ -61,8 +61,9 @@ mean square of k is Student's t with k degrees of freedom, above 6 in 0.9 % for 
 """
 ROUNDINGS = 1024.0
 """Errors of coordinates that constraints determine, and differences, below so many roundings are those of rounding."""
-MOST_STEPS = 8192
-"""Number of steps of one call of C, several times as long as the start of the threads that share such calls."""
+MOST_STEPS, PARTS_AT_ONCE = 8192, 16
+"""Number of steps of one call of C, several times as long as the start of the threads that share such calls; calls
+whose curves are in memory."""
 LEFT = 1e-6
 """Relative change of transported errors that the iterations of all steps together leave, as it compounds.
 
@@ -74,6 +75,8 @@ CONVERGED = 1e-4
 Errors of orders r and R of one motion are d and about d^(R/r): a tenth of the defect where d is 10^(-r / (R - r)), and
 R - r is a quarter of r or more (``finer_method``).
 """
+PART_OF_DEFECT = 1e-4
+"""Of defects, which iterations of the finer method leave where no differences of its steps are taken."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -464,22 +467,27 @@ class _Replay:
                     self._by_run(piece, float(piece.t[j]), piece.q[j], piece.p[j], j + 1, steps=1.0)
                     self._store(first + j + 1)
 
-    def _defects(self, starts: Starts, parameters: Array) -> list[tuple[Starts, Defects]]:
-        """Return parts of the steps and their defects, which threads share.
+    def _defects(self, starts: Starts, parameters: Array) -> Iterator[tuple[Starts, Defects]]:
+        """Yield parts of the steps and their defects, ``PARTS_AT_ONCE`` of which are in memory and shared by threads.
 
         Steps are resolved where the error of the finer method's step is a tenth of the defect, or of rounding.
         """
         parts = [starts.part(k, k + MOST_STEPS) for k in range(0, len(starts.h), MOST_STEPS)]
-        limits, defects = np.array([CONVERGED, LOST, RESOLVED * self.u]), dict[int, Defects]()
+        limits, defects = self._limits(PART_OF_DEFECT), dict[int, Defects]()
 
         def find(k: int, _: object = None) -> None:
-            defects[k] = self.finer._defects(parts[k], parameters, self.size, limits)
+            defects[k] = self.finer._defects(here[k], parameters, self.size, limits)
 
-        if len(parts) == 1:
-            find(0)
-        else:
-            run_jobs(len(parts), find, progress=None, threads=None)
-        return [(part, defects[k]) for k, part in enumerate(parts)]
+        for first in range(0, len(parts), PARTS_AT_ONCE):
+            here = parts[first : first + PARTS_AT_ONCE]
+            if len(here) == 1:
+                find(0)
+            else:
+                run_jobs(len(here), find, progress=None, threads=None)
+            yield from ((part, defects[k]) for k, part in enumerate(here))
+
+    def _limits(self, left: float) -> Array:
+        return np.array([CONVERGED, LOST, RESOLVED * self.u, left])
 
     def _transport(
         self, starts: Starts, defects: Defects, results: Array, parameters: Array, steps: float = 1.0
@@ -494,9 +502,10 @@ class _Replay:
                 first += self.linear._transport_errors(*rest, *into, self.left / steps, rounding, self.calls)
             if first < len(starts.h):
                 self.calls += 1
-                part = [of.part(first, first + length) for of in (starts, defects)]
+                part = starts.part(first, first + length)
+                exact = self.finer._defects(part, parameters, self.size, self._limits(0.0))
                 into = self.now, results[:, :, first:], parameters
-                self.finer._transport_by_differences(*part, *into, self.size, rounding, self.calls)
+                self.finer._transport_by_differences(part, exact, *into, self.size, rounding, self.calls)
                 first, length = first + length, 2 * length  # so that calls are few where iterations fail again
 
     def _by_run(self, piece: Any, t: float, q: Array, p: Array, end: int, *, steps: float) -> None:
@@ -511,7 +520,7 @@ class _Replay:
         if not (len(times_of_changes(fine)) or (fine.modes is not None and len(fine.modes.t))):
             h, sides = steps_after(fine, 0, len(fine) - 1), fine.parameters_on_sides(t)
             times, h, x, y = (np.ascontiguousarray(of) for of in (fine.t, h, fine.q, fine.p))
-            parts = self._defects(Starts(times, h, x, y), sides)  # of rounding, as states have no low words
+            parts = [*self._defects(Starts(times, h, x, y), sides)]  # of rounding, as states have no low words
         if parts and all(defects.parts.all() for _, defects in parts):
             for part, defects in parts:
                 results = np.empty((2, 2 * self.m, len(part.h)))  # of the states in between

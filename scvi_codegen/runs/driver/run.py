@@ -6,9 +6,10 @@ from typing import Any, Self, cast
 
 import numpy as np
 
-from scvi_codegen.codegen.native.binding import IN_DOUBT
+from scvi_codegen.codegen.native.binding import BY_VELOCITY, IN_DOUBT
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.validation import LARGEST_COUNT
+from scvi_codegen.runs.accuracy.growth import measures_growth, warn_of_error_growth
 from scvi_codegen.runs.accuracy.local_error import warn_of_inaccuracy
 from scvi_codegen.runs.accuracy.warning_switch import warn_of_failed_check
 from scvi_codegen.runs.driver.observation import Observation, Saver, saver_of
@@ -22,9 +23,10 @@ from scvi_codegen.runs.states.validation import Array, Parameters, States
 from scvi_codegen.runs.states.words import scalar
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.memory import Memory, alone
-from scvi_codegen.runs.stepping.noise import BathReport, report_of
+from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, BathReport, Noise, report_of
 from scvi_codegen.runs.stepping.projection import constraint_values, multipliers
-from scvi_codegen.runs.stepping.step_plan import Fixed, StepPlan, Until
+from scvi_codegen.runs.stepping.state_functions import neither_or_both
+from scvi_codegen.runs.stepping.step_plan import Fixed, FixedSteps, StepPlan, Until
 from scvi_codegen.runs.trajectory import Trajectory
 
 MOST_KEPT = 2**16
@@ -195,3 +197,52 @@ def _restored(
     run = Run.restored(stepper, saved, parameters=parameters, options=options, plan=plan)
     run.longest = longest
     return run
+
+
+def integrated(
+    stepper: Any,
+    initial: InitialData,
+    plan: StepPlan,
+    steps: int | None,
+    output: Output | None,
+    segments: Any,
+    check_growth: bool | None,
+    noise: Noise | None,
+) -> Trajectory:
+    """Return a run of validated steps, ``None`` to the target time, with its warnings.
+
+    Args:
+        output: ``None`` for all states.
+        segments: of inputs, :class:`~scvi_codegen.runs.driver.segments.InputSegments` or ``None``.
+    """
+    by_velocity, begins_by = initial.velocity is not None, stepper._begins_by
+    if (initial.p is not None) == by_velocity:
+        raise neither_or_both(initial.p)
+    if begins_by is not None and segments is None:
+        begins_by |= BY_VELOCITY * by_velocity
+    else:
+        q, p = stepper._consistent_state(initial, plan)
+        initial, begins_by = initial._replace(q=q, p=p, velocity=None), 0
+    fixed, output = isinstance(plan, FixedSteps), output or ALL_STATES
+    growth = not (fixed and not check_growth) and measures_growth(stepper, plan, check_growth)
+    try:
+        run: Run = stepper._released_runs.pop()
+    except IndexError:  # all are in use
+        run = Run._reusable(stepper)
+    run._set_up(plan, initial)
+    run._noise = DEFAULT_NOISE if noise is None else noise
+    if segments is None:
+        trajectory = run._integrated(initial, begins_by, growth, steps, output)
+    else:
+        run._start_from(initial, begins_by, growth)
+        trajectory = segments.record(run, output.save_every, output.progress)
+    try:
+        if segments is None:
+            warn_of_inaccuracy(trajectory, run)
+        if growth:
+            warn_of_error_growth(run, float(trajectory.t[-1]), requested=check_growth is True)
+    except Exception as failure:  # noqa: BLE001  (the run is complete)
+        warn_of_failed_check(failure)
+    if run._rows is not None:  # large memory is freed instead
+        stepper._released_runs.append(run)
+    return trajectory

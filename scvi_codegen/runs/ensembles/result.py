@@ -8,7 +8,7 @@ from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, TypeAlias, cast, overload
+from typing import IO, TYPE_CHECKING, Any, TypeAlias, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,7 +136,8 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, OfEnsembles, TwoWor
         """Return trajectory j, or the values (n, k) of a name, as of :class:`Trajectory`: ``runs["x"]``."""
         if isinstance(j, str):
             return self._quantity(j)
-        trajectory: type[Trajectory] = cast(Any, self.stepper)._trajectory_type
+        from scvi_codegen.runs.trajectory import Trajectory  # imported here: it makes ensembles
+
         j = checked_row(j, len(self))
         parts = [(good, parameters) for _, good, parameters in self._with_parameters([j])]
         times, tau = self.times[:, j], self.tau
@@ -149,7 +150,7 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, OfEnsembles, TwoWor
         for number, (good, parameters) in enumerate(parts):
             rows = np.insert(good, 0, good[0] - 1) if number else good  # the state at a breakpoint belongs to both
             q, p = (self.stepper.named(states[rows, j].copy()) for states in (self.q, self.p))
-            piece = trajectory(
+            piece = Trajectory(
                 t=times[rows],
                 q=q,
                 p=p,

@@ -10,24 +10,23 @@ next one, and to its end.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import groupby
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
-from scvi_codegen.common.errors import EventError, MethodError, StateError, StepFailedError
+from scvi_codegen.common.errors import EventError, StateError, StepFailedError
 from scvi_codegen.runs.events.detection import CrossingSearch
-from scvi_codegen.runs.events.functions import EventFunctions, TimedState
+from scvi_codegen.runs.events.functions import TimedState
 from scvi_codegen.runs.results.dense_output import stepped_to
 from scvi_codegen.runs.states.times import WHOLE
 from scvi_codegen.runs.states.words import Word, block_of, fraction_of, stacked, with_low, word_of
 from scvi_codegen.runs.stepping.memory import Memory
 from scvi_codegen.runs.stepping.step_plan import Fixed, FixedSteps, Until
-from scvi_codegen.systems.event import Crossings, Event
+from scvi_codegen.systems.event import Crossings
 
 if TYPE_CHECKING:
     from scvi_codegen.runs.results.saved_states import Array, SavedStates
@@ -258,45 +257,6 @@ def _set(run: Memory, at: TimedState) -> None:
     run._q[:], run._p[:] = at.q, at.p
     if hasattr(memory, "density"):
         memory.density = 0.0
-
-
-def constantly(stepper: Any) -> Callable[[], Any]:
-    """Return a function that returns a stepper, and can be pickled."""
-    return partial(_itself, stepper)
-
-
-def _itself(stepper: Any) -> Any:
-    return stepper
-
-
-class WithEventsInDouble:
-    """Mixin of integrators in double-double, whose events are located by an integrator in double."""
-
-    _doubles: Callable[[], Any] | None = None
-    """Function that returns the integrator in double, without events."""
-    interface: Any
-    events: tuple[Event, ...]
-
-    @property
-    def _in_double(self) -> Any:
-        """The integrator in double with the same events."""
-        if self._doubles is None:
-            raise MethodError(
-                "events= with precision='double-double' require the integrator in double, which a stepper that was "
-                "loaded or pickled without events lacks: compile the system"
-            )
-        return self._doubles().with_events(self.events)
-
-    def _compile(self) -> None:
-        super()._compile()  # type: ignore[misc]
-        if self.interface.words > 1 and self.events and self._doubles is not None:
-            self._in_double._compile()
-            _ = self._event_functions
-
-    @cached_property
-    def _event_functions(self) -> EventFunctions:
-        """The functions of the events in 40 digits."""
-        return EventFunctions(cast(Any, self), self.events)
 
 
 def search_of(stepper: Any, watch: Any = None, *, terminal: bool = True) -> CrossingSearch:

@@ -21,10 +21,10 @@ from scvi_codegen.codegen.rendering.source import Interface, Source, check_inter
 from scvi_codegen.codegen.variants import NewtonFallback
 from scvi_codegen.common.atomic import read_text, regular, sync_folder, write_atomically, write_text
 from scvi_codegen.common.errors import RecordingError
+from scvi_codegen.common.once import constantly
 from scvi_codegen.common.registry import part
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.driver.run import Run
-from scvi_codegen.runs.events.refinement import constantly
 from scvi_codegen.runs.results.export import COLUMNS, Piece, loaded
 from scvi_codegen.runs.states.layout import layout_of
 from scvi_codegen.runs.states.words import Words, low_words, with_low

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, Self, cast
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,10 +21,11 @@ from scvi_codegen.common.errors import MethodError
 from scvi_codegen.common.representation import LONGEST, clipped
 from scvi_codegen.runs.states.layout import layout_of
 from scvi_codegen.runs.states.validation import Array
-from scvi_codegen.runs.stepping.array_binding import ArrayBinding, EventBinding
-from scvi_codegen.runs.stepping.array_interface import RunSizes, check_few_coordinates
 from scvi_codegen.runs.stepping.features import Support, check_features, refusal_of, require
 from scvi_codegen.systems.event import Event, EventLike, as_events, modes_of
+
+if TYPE_CHECKING:
+    from scvi_codegen.runs.stepping.array_interface import RunSizes
 
 MOST_EVENT_SETS = 16
 """Number of event sets whose compiled integrators are cached, so that repeated calls do not parse formulas again."""
@@ -158,6 +159,8 @@ class CompiledMethod:
         if self.problem is None or self.origin is None:
             interface = self.interface
             return Binding(library, interface.prefix, interface.workspace, fallback=self._load_fallback)
+        from scvi_codegen.runs.stepping.array_binding import ArrayBinding, EventBinding
+
         arrays = library, self.origin.interface, self.problem
         return EventBinding(*arrays, self._located) if self._located else ArrayBinding(*arrays)
 
@@ -248,6 +251,8 @@ class CompiledMethod:
             MethodError: if a size is missing, there are more than 2000 coordinates, or the stepper was unpickled or
                 loaded from a folder and hence lacks its system.
         """
+        from scvi_codegen.runs.stepping.array_interface import check_few_coordinates
+
         values = {**(sizes or {}), **named}
         if not self.run_time_sizes:
             require(self, "with_sizes")

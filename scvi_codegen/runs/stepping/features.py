@@ -2,23 +2,25 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
+from scvi_codegen.codegen.options import in_words
 from scvi_codegen.codegen.variants import Derivatives
 from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError, closest
-from scvi_codegen.systems.checks.unlocated_kinks import warn_of_formulas
+from scvi_codegen.systems.event import warn_of_formulas
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
 
 OPERATIONS = {
-    "adaptive": "adaptive step size (t_end without h)",
-    "error": "error=",
+    "adaptive": "adaptive step size ({t_end} without {h})",
+    "error": "{error=}",
     "run_error": "run.error",
     "check_growth": "check_growth=True",
     "t_eval": "t_eval",
     "observe": "observe",
     "events": "events=",
     "inputs": "inputs=",
-    "threads": "threads=",
+    "threads": "{threads=}",
     "tables": "tables=",
     "with_sizes": "with_sizes",
     "ensembles": "integrate_ensemble",
@@ -50,19 +52,19 @@ OPERATIONS = {
     "flow": "flow of JAX, PyTorch or CasADi",
     "advice": "--advise",
 }
-"""Names of :meth:`~scvi_codegen.Stepper.supports`, and what messages call them."""
+"""Names of :meth:`~scvi_codegen.Stepper.supports`, and what messages call them, options in the words of a face."""
 
 BY_FORMULAS = ("flow", "chaos_ensemble", "path")
 """Operations with many steps that do not locate kinks."""
 SHORT_STEPS = ("svi-1-", "svi-2-", "stoermer-verlet", "composition")
 """Beginnings of the names of methods whose steps are short enough for the interpolation of the shadow energy."""
-PROPERTIES: dict[str, Callable[[Any], bool]] = {
-    "with a time transformation": lambda stepper: stepper.interface.time_transformation is not None,
-    "in transformed time": lambda stepper: stepper.in_tau,
-    "in transformed time of a first-order system": lambda stepper: bool(stepper.in_tau and stepper.interface.variables),
-    "for a first-order system": lambda stepper: bool(stepper.interface.variables),
-    "in a heat bath": lambda stepper: stepper.interface.temperature is not None,
-    "with events that change the state": lambda stepper: stepper.changes_states,
+PROPERTIES: dict[str, str | Callable[[Any], bool]] = {
+    "with a time transformation": "interface.time_transformation",
+    "in transformed time": "in_tau",
+    "in transformed time of a first-order system": "in_tau interface.variables",
+    "for a first-order system": "interface.variables",
+    "in a heat bath": "interface.temperature",
+    "with events that change the state": "changes_states",
     "with constraints": lambda stepper: bool(
         len(stepper.interface.constraints) > stepper.interface.masked or stepper.interface.layout.constraints
     ),
@@ -71,39 +73,46 @@ PROPERTIES: dict[str, Callable[[Any], bool]] = {
         for name in ("_dot", *(f"{rate}_" for text in stepper.interface.rotations for rate in text.split()[2:]))
         for formula in stepper.interface.constraints[: len(stepper.interface.constraints) - stepper.interface.masked]
     ),
-    "with constraints of arrays": lambda stepper: bool(stepper.interface.layout.constraints),
+    "with constraints of arrays": "interface.layout.constraints",
     "with constraints of arrays by a composition": lambda stepper: bool(
         stepper.interface.layout.constraints and stepper.interface.method.startswith("composition")
     ),
-    "with kinks that runs locate": lambda stepper: bool(stepper.interface.modes),
+    "with kinks that runs locate": "interface.modes",
     "where L or H jumps": lambda stepper: any("jumps" in mode for mode in stepper.interface.modes),
     "with events that set parameters": lambda stepper: len(stepper.modes) > len(stepper.interface.mode_names),
-    "with contacts": lambda stepper: stepper.interface.masked > 0,
-    "without constraints": lambda stepper: not (stepper.interface.constraints or stepper.interface.layout.constraints),
+    "with contacts": "interface.masked",
+    "without constraints": "!interface.constraints !interface.layout.constraints",
     "with the long steps of this method": lambda stepper: not stepper.interface.method.startswith(SHORT_STEPS),
-    "where the energy changes": lambda stepper: bool(stepper.interface.changes_energy),
-    "without a mesh": lambda stepper: stepper.interface.layout.mesh is None,
-    "with sizes known when compiled": lambda stepper: not stepper.run_time_sizes,
-    "with sizes known at run time": lambda stepper: stepper.run_time_sizes,
+    "where the energy changes": "interface.changes_energy",
+    "without a mesh": "!interface.layout.mesh",
+    "with sizes known when compiled": "!run_time_sizes",
+    "with sizes known at run time": "run_time_sizes",
     "with precision='double-double'": lambda stepper: stepper.interface.words > 1,
-    "without trajectories in SIMD lanes": lambda stepper: not stepper.run_time_sizes and stepper.ensemble is None,
+    "without trajectories in SIMD lanes": "!run_time_sizes !ensemble",
     "without derivatives": lambda stepper: stepper._lacks(Derivatives()),
     "without second derivatives": lambda stepper: stepper._lacks(Derivatives(order=2)),
-    "without a tangent vector along runs": lambda stepper: not stepper._carries_errors,
-    "without an error estimate": lambda stepper: not (stepper._has_error_estimate or stepper._has_tau),
+    "without a tangent vector along runs": "!_carries_errors",
+    "without an error estimate": "!_has_error_estimate !_has_tau",
 }
-"""Whether a stepper has a property."""
+"""Properties of a stepper: attributes that are all true, or with ``!`` false, or a condition."""
 
-PROPERTIES_OF_SIZES: dict[str, Callable[[Any], bool]] = {
+PROPERTIES_OF_SIZES: dict[str, str | Callable[[Any], bool]] = {
     "with constraints that prescribe the motion": lambda stepper: (
         len(stepper.interface.constraints) - stepper.interface.masked == stepper.dimension
     ),
-    "with forces": lambda stepper: bool(stepper.interface.exchange_names),
-    "without the work of forces": lambda stepper: not stepper.interface.exchange_names,
-    "without an action": lambda stepper: not stepper.interface.has_action,
-    "without a sum of L along steps": lambda stepper: not stepper.interface.sums_action,
+    "with forces": "interface.exchange_names",
+    "without the work of forces": "!interface.exchange_names",
+    "without an action": "!interface.has_action",
+    "without a sum of L along steps": "!interface.sums_action",
 }
 """Properties of a stepper of known sizes; one of arrays of run-time sizes has none of them."""
+
+
+def _has(stepper: Any, condition: str | Callable[[Any], bool]) -> bool:
+    if callable(condition):
+        return condition(stepper)
+    return all(bool(attrgetter(name.lstrip("!"))(stepper)) != name.startswith("!") for name in condition.split())
+
 
 _FIRST = "jacobian tangent pullback sensitivity"
 _DERIVATIVES = f"{_FIRST} chaos chaos_ensemble periodic_orbit fit flow"
@@ -113,7 +122,7 @@ _IN_DOUBLE = (
     f"observe_ensemble single work discrete_lagrangian chaos_ensemble periodic_orbit energy fit flow {_ACTIONS}"
 )
 _RUNS = "chaos chaos_ensemble periodic_orbit fit flow work"
-_ORIGINAL = "compile the original system, with fixed steps h, or with time_transformation=... or t_end=..."
+_ORIGINAL = "compile the original system, with fixed steps {h}, or with time_transformation=... or {t_end}"
 FEATURES = {
     (operation, property_): remedy
     for property_, operations, remedy in (
@@ -121,18 +130,18 @@ FEATURES = {
             "in a heat bath",
             "adaptive error run_error t_eval dense_output events advice single tangent pullback sensitivity "
             f"hessian {_RUNS} {_ACTIONS}",
-            "give h and steps, and use saved states and averages of them; steps alone have derivatives",
+            "give {h} and {steps}, and use saved states and averages of them; steps alone have derivatives",
         ),
         (
             "with a time transformation",
             "ensembles observe_ensemble single chaos_ensemble periodic_orbit fit flow",
-            "this requires fixed steps h; compile the stepper without time_transformation",
+            "this requires fixed steps {h}; compile the stepper without time_transformation",
         ),
         ("with precision='double-double'", _IN_DOUBLE, "omit it, or use precision='double'"),
-        ("with a time transformation", "adaptive", "give h (constant step in tau) and t_end, and no tolerance"),
-        ("with a time transformation", "advice", "use --tolerance (local error)"),
-        ("in transformed time", "advice", "use --tolerance (local error)"),
-        ("in transformed time", "adaptive", "give h (fixed step in tau)"),
+        ("with a time transformation", "adaptive", "give {h} (constant step in tau) and {t_end}, and no {tolerance}"),
+        ("with a time transformation", "advice", "use {tolerance} (local error)"),
+        ("in transformed time", "advice", "use {tolerance} (local error)"),
+        ("in transformed time", "adaptive", "give {h} (fixed step in tau)"),
         ("in transformed time", "inputs", "compile the original system"),
         ("in transformed time", "observe_ensemble single chaos chaos_ensemble periodic_orbit fit flow", _ORIGINAL),
         ("in transformed time", _ACTIONS, _ORIGINAL),
@@ -164,12 +173,12 @@ FEATURES = {
         (
             "with contacts",
             f"observe_ensemble single hessian chaos_ensemble flow advice {_ACTIONS}",
-            "use runs and ensembles with h, or with t_end and a tolerance, without it",
+            "use runs and ensembles with {h}, or with {t_end} and a {tolerance}, without it",
         ),
         ("with constraints", "observe_ensemble", "use coordinates without constraints, or omit it"),
         ("with constraints", "fit", "use coordinates without constraints, such as the angles of rods"),
         ("with nonholonomic constraints", "periodic_orbit", "use coordinates without constraints, or integrate"),
-        ("with constraints of arrays", "threads", "omit threads; the step uses one"),
+        ("with constraints of arrays", "threads", "omit {threads}; the step uses one"),
         (
             "with constraints of arrays by a composition",
             f"{_FIRST} chaos chaos_ensemble hessian work discrete_lagrangian with_sizes recording",
@@ -192,15 +201,15 @@ FEATURES = {
         (
             "without an error estimate",
             "adaptive error",
-            "it requires forces at two or more stages, or velocities that vary along a step; give h and steps (fixed "
-            "step size)",
+            "it requires forces at two or more stages, or velocities that vary along a step; give {h} and {steps} "
+            "(fixed step size)",
         ),
         (
             "without a tangent vector along runs",
             "check_growth",
             "it requires forces or accelerations of at most 1000 operations, by the fixed-point iteration of SVI or a "
             "Gauss method in double precision, without constraints, rotations, contacts, damping=, inputs, arrays of "
-            "run-time sizes, a time transformation and events that change the state; omit it, or use error=",
+            "run-time sizes, a time transformation and events that change the state; omit it, or use {error=}",
         ),
         (
             "with sizes known at run time",
@@ -225,17 +234,17 @@ FEATURES = {
         (
             "with sizes known when compiled",
             "threads",
-            "threads share the steps of arrays whose sizes are known at run time only; omit threads, compile without "
+            "threads share the steps of arrays whose sizes are known at run time only; omit {threads}, compile without "
             "sizes, or compile roll_sums(system).system, whose runs take its tables and parameters",
         ),
-        ("with save_every", "t_eval", "give either t_eval or save_every, not both"),
+        ("with save_every", "t_eval", "give either t_eval or {save_every}, not both"),
         ("with inputs", "t_eval", "omit t_eval"),
         ("with inputs", "observe", "omit observe"),
         ("with inputs", "sensitivity chaos", "use tangent or pullback, or run.pieces"),
         (
             "with precision='single'",
             "adaptive error t_eval events observe_ensemble action",
-            "give h and steps (fixed step size), and save states; or omit precision",
+            "give {h} and {steps} (fixed step size), and save states; or omit precision",
         ),
         ("with events", "observe_ensemble", "count them by observe='events', or pass stepper.with_events(())"),
         ("with t_eval", "observe", "omit observe"),
@@ -243,7 +252,7 @@ FEATURES = {
     )
     for operation in operations.split()
 }
-"""Remedies of the operations that a property of the stepper, or another argument of the run, excludes."""
+"""Remedies of the operations that a property of the stepper, or another argument of the run, excludes; by face."""
 
 
 _EXCLUDING: dict[str, list[str]] = {}
@@ -271,8 +280,9 @@ def check_features(*names: str) -> None:
 def refusal(operation: str, property_: str, title: str = "") -> ScviCodegenError:
     """Return the error of an operation that a property excludes, ``StateError`` for other arguments of the run."""
     of_stepper = property_ in PROPERTIES or property_ in PROPERTIES_OF_SIZES
-    reason = f"{OPERATIONS[operation]} is not available {property_}{title and f' ({title})'}"
-    return (MethodError if of_stepper else StateError)(f"{reason}: {FEATURES[operation, property_]}")
+    called, remedy = in_words(OPERATIONS[operation]), in_words(FEATURES[operation, property_])
+    reason = f"{called} is not available {property_}{title and f' ({title})'}"
+    return (MethodError if of_stepper else StateError)(f"{reason}: {remedy}")
 
 
 def check_together(**arguments: Any) -> None:
@@ -298,9 +308,9 @@ def refusal_of(stepper: Any, operation: str, *together: str) -> ScviCodegenError
     """Return the refusal of an operation of a stepper, or of one together with others; ``None`` if it is available."""
     for property_ in _EXCLUDING.get(operation, ()):
         if property_ in PROPERTIES_OF_SIZES:
-            applies = not stepper.run_time_sizes and PROPERTIES_OF_SIZES[property_](stepper.known)
+            applies = not stepper.run_time_sizes and _has(stepper.known, PROPERTIES_OF_SIZES[property_])
         else:
-            applies = PROPERTIES[property_](stepper) if property_ in PROPERTIES else property_[5:] in together
+            applies = _has(stepper, PROPERTIES[property_]) if property_ in PROPERTIES else property_[5:] in together
         if applies:
             return refusal(operation, property_, stepper.title)
     return None

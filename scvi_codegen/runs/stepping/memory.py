@@ -13,8 +13,8 @@ from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 
-from scvi_codegen.codegen.native.arguments import checked_step
 from scvi_codegen.codegen.native.options import SolverOptions, checked_options, step_failure
+from scvi_codegen.codegen.options import checked_step
 from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.common.validation import LARGEST_COUNT, checked_count
 from scvi_codegen.runs.states.layout import InitialData
@@ -181,10 +181,10 @@ class Memory:
         t: float = 0.0,
         parameters: Parameters = None,
         options: SolverOptions | None = None,
-        noise: Noise = DEFAULT_NOISE,
+        noise: Noise | None = None,
     ) -> None:
         """Start at (q, p) and t; nothing of an earlier run remains."""
-        self._noise = noise
+        self._noise = DEFAULT_NOISE if noise is None else noise
         initial = InitialData(q, p, None, self.stepper._states.time(t), parameters, options)
         self._set_up(plan, initial)
         self._begin(q, p, initial.t)

@@ -10,21 +10,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.codegen.options import OPTION, in_words
 from scvi_codegen.common.errors import MethodError, StateError
-from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.states.times import steps_within, times_after
 from scvi_codegen.runs.states.validation import Array, evaluation
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
 from scvi_codegen.systems.system import BATH_ENERGY
 
-NO_BATH = "requires a heat bath: give temperature= or noise= to the system"
+NO_BATH = "requires a heat bath: give temperature or noise to the system"
 
 
 LARGEST_TEMPERATURE = float(np.sqrt(np.finfo(float).max))
 """kT is the energy of thermal motions; squares of energies are those of its fluctuations."""
-LARGEST_SEED = 2**64 - 1
-"""The key of the noise has 64 bits."""
-
 COLOURED_INPUT = 2
 """Purpose of the numbers of coloured noise, as in ``templates/support/run/normals.h``."""
 WORD = 2**32 - 1
@@ -101,12 +98,12 @@ def with_sequences(
     for name, noise in inputs.items():
         if isinstance(noise, ColouredNoise) and name in names:
             if h is None:
-                raise StateError(
-                    f"the input '{name}' is {noise}, which requires fixed steps: give h and steps or t_end"
-                )
+                remedy = in_words("give {h}, and {steps} or {t_end}")
+                raise StateError(f"the input '{name}' is {noise}, which requires fixed steps: {remedy}")
             steps = np.arange(1 + int(steps_within(abs(float(end()) - float(t)) or abs(h), h)))
-            key = checked_count(seed, "seed", least=0, most=LARGEST_SEED)
-            normals = normal_numbers(key, trajectory, steps, COLOURED_INPUT, names.index(name)).real
+            normals = normal_numbers(
+                OPTION["seed"].checked(seed), trajectory, steps, COLOURED_INPUT, names.index(name)
+            ).real
             times, values = times_after(float(t), h, steps)[0], noise.values(h, normals.T).T
             if h < 0:  # the value of each step at the earlier end
                 times, values = times[::-1], np.roll(values[..., ::-1], -1, axis=-1)
@@ -129,15 +126,17 @@ class Noise(NamedTuple):
         interface = stepper.interface
         coloured = inputs is not None and any(isinstance(value, ColouredNoise) for value in inputs.values())
         if interface.temperature is None and ((seed != 0 and not coloured) or metropolis):
-            raise StateError(f"{'metropolis' if metropolis else 'seed'}= {NO_BATH} '{interface.system}'")
+            raise StateError(f"{OPTION['metropolis' if metropolis else 'seed']} {NO_BATH} '{interface.system}'")
         if metropolis and interface.layout.sizes:
-            raise MethodError(f"metropolis=True is not available with arrays of run-time sizes: {SIZES_REQUIRED}")
+            raise MethodError(
+                f"{OPTION['metropolis']} is not available with arrays of run-time sizes: {SIZES_REQUIRED}"
+            )
         if metropolis and (interface.changes_energy != BATH_ENERGY or "symmetric" not in interface.notes):
             raise MethodError(
-                f"metropolis=True is not available for '{interface.title}' ({', '.join(interface.notes)}; "
+                f"{OPTION['metropolis']} is not available for '{interface.title}' ({', '.join(interface.notes)}; "
                 f"{interface.changes_energy}): it requires a symmetric method and no forces, inputs and time; omit it"
             )
-        return cls(checked_count(seed, "seed", least=0, most=LARGEST_SEED), trajectory, metropolis)
+        return cls(OPTION["seed"].checked(seed), trajectory, metropolis)
 
     def store(self, memory: Any) -> None:
         """Set the stream of a run that starts, in C."""

@@ -13,7 +13,6 @@ from scvi_codegen.codegen.native.options import REASONS
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.runs.states.validation import Array, Parameters, States, coordinate_shapes
 from scvi_codegen.runs.states.words import by_name, low_words, product_of, quotient_of, scalar, sum_of, unnamed
-from scvi_codegen.runs.stepping.array_interface import constraint_shapes
 from scvi_codegen.runs.stepping.compiled_method import CompiledMethod
 
 PROBES = 8
@@ -271,5 +270,7 @@ class StateFunctions(CompiledMethod):
         """Return numbers of all constraints in the form of :attr:`Run.multipliers`."""
         if self.problem is None:
             return values
+        from scvi_codegen.runs.stepping.array_interface import constraint_shapes
+
         shapes = constraint_shapes(self.interface.layout, self.problem.sizes)
         return tuple(by_name(values, enumerate(map(tuple, shapes))).values())

@@ -9,17 +9,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.codegen.native.arguments import checked_number, checked_step, real_array
+from scvi_codegen.codegen.native.arguments import checked_number, real_array
 from scvi_codegen.codegen.native.options import NOT_CONVERGED, REASONS, STATUS, SolverOptions, step_failure
+from scvi_codegen.codegen.options import checked_step
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.runs.states.validation import Array, Parameters, check_step_given
 from scvi_codegen.runs.stepping.state_functions import StateFunctions
+
+MOST_POINTS = 64
+"""Number of points of a step, at most."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -98,14 +103,19 @@ class Defects:
     Attributes:
         misfits: (n, 2m) defects of positions and momenta.
         parts: (n,) numbers of equal parts in which the other method takes each step; 0 where it does not resolve it.
+        curves: (n, m, k) forces or velocities at the points of these steps; NaN where they are unknown.
+        abscissae: (k,) of the points; k = 0: none.
     """
 
     misfits: Array
     parts: NDArray[np.int32]
+    curves: Array
+    abscissae: Array
 
     def part(self, first: int, last: int) -> Defects:
         """Return a view of those of the steps ``first`` to ``last`` - 1."""
-        return Defects(self.misfits[first:last], self.parts[first:last])
+        steps = slice(first, last)
+        return Defects(self.misfits[steps], self.parts[steps], self.curves[steps], self.abscissae)
 
 
 class LinearisedMethod(StateFunctions):
@@ -318,17 +328,25 @@ class LinearisedMethod(StateFunctions):
             parameters: as of :meth:`_propagate`.
             sizes: (2m,) sizes of positions and momenta.
             limits: defects relative to changes of momenta, and differences of defects by halved steps relative to
-                them and in addition to the state, below which they are resolved.
+                them and in addition to the state, below which they are resolved; part of the defect before that the
+                iterations leave.
         """
-        count = len(starts.h)
-        defects = Defects(np.empty((count, 2 * self.dimension)), np.empty(count, np.int32))
-        arrays = starts.t, starts.h, starts.q, starts.p, sizes, limits, defects.misfits
+        count, m, abscissae = len(starts.h), self.dimension, self._abscissae
+        curves = np.empty((count, m, len(abscissae)))
+        defects = Defects(np.empty((count, 2 * m)), np.empty(count, np.int32), curves, abscissae)
+        arrays = starts.t, starts.h, starts.q, starts.p, sizes, limits, defects.curves, defects.misfits
         pointers = map(self.binding.pointer, arrays)
         into = self.binding.pointer(defects.parts)
         status, report = self._call_steps("defects", parameters, None, count, *pointers, into)
         if status:
             raise step_failure(status, report, step=0, h=float(starts.h[0]))
         return defects
+
+    @cached_property
+    def _abscissae(self) -> Array:
+        """(k,) abscissae of the points at which steps keep forces or velocities; k = 0: none."""
+        abscissae = np.empty(MOST_POINTS)
+        return abscissae[: self.binding.function("call_abscissae")(self.binding.pointer(abscissae))]
 
     def _transport_by_differences(
         self,
@@ -390,13 +408,13 @@ class LinearisedMethod(StateFunctions):
 
         Args:
             starts: n steps and their (n + 1, m) states.
-            defects: those of a finer method.
+            defects: those of a finer method, along whose curves vectors are transported.
             vectors: (count, 2m) at the first state, replaced by those at the last one that is reached; the first one is
                 the error, to which the defect of each state is added.
             results: two (2m, n) arrays, views of rows of contiguous numbers, which receive the errors and the root mean
                 squares of the other vectors after each step.
             parameters: as of :meth:`_propagate`.
-            left: relative change of the step and of vectors that the iterations of a step leave.
+            left: relative change of vectors that the iterations of a step leave.
             rounding: rounding errors relative to the states, which further vectors receive with random signs.
             seed: of the signs.
 
@@ -409,7 +427,9 @@ class LinearisedMethod(StateFunctions):
         status = binding.function("transport_errors")(
             len(starts.h),
             *map(binding.pointer, (starts.t, starts.h, starts.q, starts.p, parameters)),
-            binding.options(SolverOptions(tolerance=left)),
+            binding.null,
+            len(defects.abscissae),
+            *map(binding.pointer, (defects.abscissae, defects.curves)),
             len(vectors),
             left,
             rounding,

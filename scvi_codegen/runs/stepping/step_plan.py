@@ -9,10 +9,10 @@ from typing import Any, NamedTuple, Self, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.codegen.native.arguments import checked_number
+from scvi_codegen.codegen.options import OPTION, check_agreement, checked_step, in_words
 from scvi_codegen.codegen.rendering.source import Interface
 from scvi_codegen.common.errors import AccuracyWarning, StateError, closest, warn
-from scvi_codegen.common.validation import check_tolerance, checked_count
 from scvi_codegen.runs.states.times import steps_to, steps_within, times_after
 from scvi_codegen.runs.states.validation import coordinate_shapes
 from scvi_codegen.runs.states.words import check_doubles
@@ -180,19 +180,13 @@ class ErrorControl(NamedTuple):
     def checked(self) -> dict[str, Any]:
         """Return the fields of :class:`Adaptive` without its target time."""
         fields = self.named
-        if "tolerance" in fields:
-            check_tolerance(number := checked_number(self.tolerance, "the tolerance"))
-            fields["tolerance"] = number
-        if "absolute_tolerance" in fields:
-            fields["absolute_tolerance"] = checked_absolute_tolerance(fields["absolute_tolerance"])
-        for name in fields.keys() & {"max_step", "first_step"}:
-            if name == "max_step" and fields[name] == math.inf:
-                continue
-            fields[name] = number = checked_number(fields[name], name)
-            if not number > 0.0:
-                raise StateError(
-                    f"{name} = {number:g} must be positive: give a size, or omit it (t_end determines the direction)"
-                )
+        for name, value in fields.items():
+            if name != "max_step" or value != math.inf:
+                fields[name] = OPTION[name].checked(value)
+        if isinstance(absolute := fields.get("absolute_tolerance", 0.0), Mapping):
+            fields["absolute_tolerance"] = tuple((name, size) for name, size in absolute.items() if size)
+        elif "absolute_tolerance" in fields:
+            fields["absolute_tolerance"] = absolute or ()
         return fields
 
 
@@ -217,23 +211,6 @@ def plan_from_record(*, h: Any = None, tau: Any = None, **control: Any) -> Fixed
             raise StateError(f"steps of tau = {tau:g} must be positive and have no tolerance")
         return InTau(checked_number(t_end, "t_end"), tau)
     return ErrorControl(**control).to(t_end)
-
-
-def checked_absolute_tolerance(value: Any) -> AbsoluteTolerance:
-    """Return an absolute tolerance of users; raise ``StateError`` for NaN, infinite and negative numbers."""
-    if isinstance(value, Mapping):
-        sizes = {str(name): _not_negative(size, f"absolute_tolerance of {name}") for name, size in value.items()}
-        return tuple((name, size) for name, size in sizes.items() if size)
-    return _not_negative(value, "absolute_tolerance") or ()
-
-
-def _not_negative(value: Any, name: str) -> float:
-    number = checked_number(value, name)
-    if number < 0.0:
-        raise StateError(
-            f"{name} = {number:g} must not be negative: give the size below which errors do not matter, or omit it"
-        )
-    return number
 
 
 def absolute_tolerances(interface: Interface, dimension: int, absolute: AbsoluteTolerance) -> NDArray[np.float64]:
@@ -325,8 +302,8 @@ def checked_plan(kind: KindOfSteps, h: float | None, t_end: float | None, contro
     """Return the step plan of arguments of users; StateError if they are invalid or do not determine the steps."""
     if kind.time_transformation is not None:
         if h is None or t_end is None or control.named:
-            remedy = FEATURES["adaptive", "with a time transformation"]
-            remedy += f"; omit {', '.join(control.named)}" if control.named else ""
+            remedy = in_words(FEATURES["adaptive", "with a time transformation"])
+            remedy += f"; omit {', '.join(str(OPTION[name]) for name in control.named)}" if control.named else ""
             raise StateError(f"the time transformation {kind.time_transformation} determines the step size: {remedy}")
         tau = checked_step(h)
         if tau < 0.0:
@@ -340,10 +317,9 @@ def checked_plan(kind: KindOfSteps, h: float | None, t_end: float | None, contro
         if kind.has_unseen_growth:
             warn(UNSEEN_GROWTH, AccuracyWarning)
         return control.to(t_end)
+    check_agreement({"h": h, **control.named})
     if t_end is not None:
         raise StateError("give either h (fixed step size) or t_end (adaptive step size); got both")
-    for name in control.named:
-        raise StateError(f"{name} requires adaptive steps: give t_end without h and steps")
     return Fixed(checked_step(h))
 
 
@@ -366,23 +342,23 @@ def planned_steps(
     """
     fixed = h is not None and kind.time_transformation is None
     control = ErrorControl(tolerance, absolute_tolerance, max_step, first_step)
+    given = {"steps": steps, "t_end": t_end}
+    if kind.time_transformation is None:
+        given |= {"h": h, **control.named}
+    check_agreement(given, partly="h" not in given)
     plan = checked_plan(kind, h, None if fixed else t_end, control)
     if kind.words > 1:
         check_doubles(t_end=t_end)
     if not isinstance(plan, FixedSteps):
-        if steps is not None:
-            raise StateError(f"adaptive steps end at t_end={plan.t_end:g}: omit steps={steps}, or give h and steps")
         return plan, None
-    if t_end is None:  # Steps
+    if t_end is None:
         if steps is None:
             raise StateError("h requires steps or t_end (fixed step size); give t_end without h for adaptive steps")
-        return plan, checked_count(steps, "steps", least=0)
-    count = None if kind.in_tau or steps is not None else steps_to(t, t_end, plan.h, exactly=kind.words > 1)
-    if count is not None and count % checked_count(save_every, "save_every", least=1) == 0:
+        return plan, OPTION["steps"].checked(steps)
+    count = None if kind.in_tau else steps_to(t, t_end, plan.h, exactly=kind.words > 1)
+    if count is not None and count % OPTION["save_every"].checked(save_every) == 0:
         return plan, count
-    end = checked_number(t_end, "the time t_end")
-    if steps is not None:
-        raise StateError(f"give either steps={steps} or t_end={end:g} with h, not both")
+    end = checked_number(t_end, "t_end")
     if (end - checked_number(t, "the time t")) * plan.h < 0.0:
         raise StateError(f"h = {plan.h:g} has the wrong sign for a run from t = {t:g} to t_end = {end:g}")
     return Until(plan.h, end), None

@@ -1,6 +1,8 @@
 """Systems of arrays read from text or from SymPy expressions."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,6 +38,11 @@ DEFINING = (
     *("forces", "torques", "torques_space", "point_forces"),
 )
 """Arguments that define a system, in the order of model files."""
+FUNCTIONS = "lagrangian", "hamiltonian"
+MAPPINGS = "parameters", "rotations", "forces", "torques", "torques_space", "neighbours", "functions"
+ABSENT: dict[str, Any] = dict.fromkeys((*LISTED, "contacts"), ()) | {key: {} for key in MAPPINGS}
+"""Values of arguments that are left out."""
+_pairs = partial(zip, strict=False)
 
 
 class Names(NamedTuple):
@@ -60,44 +67,39 @@ def arrays_from_text(arguments: Mapping[str, Any], bath_of: Callable[..., Any] |
     ...     "lagrangian": "sum(i in N, q_dot[i]**2/2) - k*sum(i in N periodic, (q[i+1] - q[i])**2/2)"}))
     chain: L(q[N]) = sum(i in N, q_dot[i]**2/2) + sum(i in N periodic, -k*(q[i+1] - q[i])**2/2)
     """
-    lagrangian, hamiltonian = arguments.get("lagrangian"), arguments.get("hamiltonian")
-    inputs, parameters, tables = (arguments.get(key) or () for key in ("inputs", "parameters", "tables"))
-    coordinates = tuple(map(parse_coordinate, arguments["coordinates"]))
+    given = ABSENT | {key: value for key, value in arguments.items() if value is not None}
+    inputs, tables, lagrangian, hamiltonian = given["inputs"], given["tables"], *map(arguments.get, FUNCTIONS)
+    coordinates = tuple(map(parse_coordinate, given["coordinates"]))
     momenta = momenta_of(coordinates, arguments.get("momenta"), lagrangian, hamiltonian)
     velocities = () if momenta else tuple(Array(array.name + DOT, array.axes) for array in coordinates)
-    shapes = (arguments.get(key) for key in ("rotations", "directions", "spins"))
-    rotations = member_arrays(*shapes, momentum=hamiltonian is not None)
-    data, numbers = _values(dict(parameters))
+    members = (given[key] for key in ("rotations", "directions", "spins"))
+    rotations = member_arrays(*members, momentum=hamiltonian is not None)
+    data, numbers = _values(dict(given["parameters"]))
     data |= tables if isinstance(tables, Mapping) else {}
     values = with_inputs(numbers, inputs)
     fields = {key: parse_array(key) for key in values if "[" in key}
     scalars = {key: value for key, value in values.items() if key not in fields}
-    functions = functions_of(arguments.get("functions"))
+    functions = functions_of(given["functions"])
+    of_rotations = chain.from_iterable(rotation.formulas for rotation in rotations)
     names = Names(
-        arrays=(
-            *(*coordinates, *momenta, *velocities, *fields.values()),
-            *(array for rotation in rotations for array in rotation.formulas),
-        ),
+        arrays=(*coordinates, *momenta, *velocities, *fields.values(), *of_rotations),
         symbols={key: symbol(key) for key in (*scalars, *inputs, TIME)}
         | named_tables(functions, {*values, *(array.name for array in coordinates)}),
         tables=tuple(map(table_of, tables)),
     )
     lengths = {key: names.symbols[key] for key in scalars}
-    neighbours = parse_neighbours(arguments.get("neighbours") or {}, coordinates, lengths)
-    forces = [*_forces(arguments, coordinates, rotations, names)]
-    damping, dissipation = arguments.get("damping"), arguments.get("dissipation")
-    in_bath = bath_of is not None and arguments.get("temperature") is not None
-    if dissipation is not None and not in_bath:
-        rates = dict(zip(velocities, coordinates, strict=False))
-        for rotation in rotations:
-            rates |= zip(rotation.rates, rotation.torques(), strict=False)
-        forces += friction(parse_sums(dissipation, *names, neighbours), rates)
+    neighbours = parse_neighbours(given["neighbours"], coordinates, lengths)
+    heated = bath_of is not None and arguments.get("temperature") is not None
+    damping, dissipation = (arguments.get(key) for key in ("damping", "dissipation"))
+    dissipated = () if dissipation is None else parse_sums(dissipation, *names, neighbours)
+    rates = chain(_pairs(velocities, coordinates), *(_pairs(of.rates, of.torques()) for of in rotations))
+    forces = (*_forces(given, coordinates, rotations, names), *friction(() if heated else dissipated, dict(rates)))
     terms = parse_sums(str(lagrangian if hamiltonian is None else hamiltonian), *names, neighbours)
     of_inputs = input_formulas(inputs, names.symbols[TIME])
-    constant_or_moving = dict.fromkeys(fields.values()) | dict(zip(coordinates, velocities, strict=False))
+    constant_or_moving = dict.fromkeys(fields.values()) | dict(_pairs(coordinates, velocities))
     constraints = [
         parse_constraint(constraint, *names, split=constraint_sides, velocities=constant_or_moving)
-        for constraint in arguments.get("constraints") or ()
+        for constraint in given["constraints"]
     ]
     kind = ArrayLagrangian if hamiltonian is None else ArrayHamiltonian
 
@@ -120,14 +122,14 @@ def arrays_from_text(arguments: Mapping[str, Any], bath_of: Callable[..., Any] |
         functions=functions,
         inputs=tuple(inputs),
         constraints=tuple(constraints),
-        damping=damping_rate(None if in_bath else damping, read),
-        bath=bath_of({**arguments, "dissipation": None}, read, read, ()) if bath_of and in_bath else None,
-        friction=parse_sums(dissipation, *names, neighbours) if in_bath and dissipation is not None else (),
+        damping=damping_rate(None if heated else damping, read),
+        bath=bath_of({**arguments, "dissipation": None}, read, read, ()) if bath_of and heated else None,
+        friction=dissipated if heated else (),
         rotations=rotations,
         definition=definition_of(arguments),
         data={parse_array(key).name: value for key, value in data.items()},
     )
-    system.warn_of_mistakes(map(symbol, names_in(arguments.get("contacts", ()))))
+    system.warn_of_mistakes(map(symbol, names_in(given["contacts"])))
     return system
 
 
@@ -141,11 +143,10 @@ def _forces(
     arguments: Mapping[str, Any], coordinates: tuple[Array, ...], rotations: Sequence[MemberArray], names: Names
 ) -> Iterator[ArrayForce]:
     """Yield generalised forces on coordinates, and torques on rotations with the forces that are vectors."""
-    forces = arguments.get("forces") or {}
+    forces = arguments["forces"]
     components = [(target, force, coordinates) for target, force in forces.items() if isinstance(force, str)]
     vectors = {target: force for target, force in forces.items() if not isinstance(force, str)}
-    torques, torques_in_space = (arguments.get(key) or {} for key in ("torques", "torques_space"))
-    for torque_of, in_space in (({**vectors, **torques}, False), (torques_in_space, True)):
+    for torque_of, in_space in (({**vectors, **arguments["torques"]}, False), (arguments["torques_space"], True)):
         for target, torque in torque_of.items():
             components += torque_components(rotations, target, torque, in_space=in_space)
     for target, force, arrays in components:

@@ -88,17 +88,17 @@ def parse_constraint(
         message = "a formula with 'for', and a constraint, must not contain a sum over a whole array"
         raise ExpressionError(message, text, text.find("sum"))
     accesses = dict(chain(*(parser.accesses.items() for parser in parsers)))
-    moving = {slot: (velocities or {}).get(access.array) for slot, access in accesses.items()}
+    velocities = velocities or {}
+    moving = {slot: velocities.get(access.array) for slot, access in accesses.items()}
     pairs = {slot: replace(accesses[slot], array=array) for slot, array in moving.items() if array}
     rates = {symbol("t"): S.One, **{slot: symbol(str(access)) for slot, access in pairs.items()}}
 
     def rate(formula: Expr) -> Expr:
-        occurring = [accesses[slot] for slot in formula.free_symbols & set(accesses)]
-        others = [access for access in occurring if access.array not in (velocities or {})]
-        if others:
-            raise ExpressionError(
-                f"the time derivative of {others[0]} is not available in constraints of arrays", text, 0
-            )
+        for slot in formula.free_symbols & accesses.keys():
+            if accesses[slot].array not in velocities:
+                raise ExpressionError(
+                    f"the time derivative of {accesses[slot]} is not available in constraints of arrays", text, 0
+                )
         return derivative_along(formula, tuple(rates), tuple(rates.values()))
 
     accesses_of_rates = {symbol(str(access)): access for access in pairs.values()}

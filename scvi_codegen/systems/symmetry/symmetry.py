@@ -42,7 +42,6 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.common.display.cards import Html, card
-from scvi_codegen.common.display.mathml import Typeset
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import checks_arguments, several
@@ -117,6 +116,8 @@ class Symmetry:
         return " + ".join(texts).replace("+ -", "- ")
 
     def _repr_html_(self) -> str:
+        from scvi_codegen.common.display.mathml import Typeset
+
         moved = [*zip(self.coordinates, self.direction, strict=True)]
         occurring = self.gauge.free_symbols.union(*(xi.free_symbols for xi in self.direction))
         if not occurring.isdisjoint(self.momenta):

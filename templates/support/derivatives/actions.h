@@ -10,7 +10,7 @@ static int actions_by_iteration(propagation *over, long long first, long long en
 {
   const real nothing[M] = {0};
   over->guess = first == 0 ? 0 : over->guess;
-  if (!solve_steps(over, first, end))
+  if (!store_steps(over, first, end))
     return 0;
   for (long long k = first; k < end; k++) {
     const step_data step = step_of(over, k, nothing);

@@ -5,6 +5,8 @@
 
 #define LEFT_TO_COME (DBL_EPSILON * DBL_EPSILON / 16.0) /* squared: relative change still to come that is accepted */
 
+typedef struct stored_curves stored_curves;
+
 /* Steps and the vectors propagated over them, of shape (steps + 1, count, STEP_INPUTS); of global errors only those at
  * both ends of the present step, (2, count, STEP_INPUTS). */
 typedef struct {
@@ -12,6 +14,7 @@ typedef struct {
   const solver_options *options;
   int back, count;
   error_vectors *errors; /* of a run; NULL: others */
+  const stored_curves *curves; /* of the steps, which are solved otherwise */
   real *vectors, *q1, *p1, *workspace;
   solver_report *report;
   real accepted; /* squared: relative change of vectors still to come that is accepted */
@@ -73,23 +76,77 @@ static int solve_by_iteration(propagation *over, const step_data *step, const it
   return 0;
 }
 
-/* Solves steps first <= k < end; returns 0 if the iteration fails for one of them. */
-static int solve_steps(propagation *over, long long first, long long end)
+/* Solves step k and stores it; returns 0 if the iteration fails. */
+static int solve_and_store(propagation *over, long long k, double *kept)
 {
   const double nothing[M] = {0.0};
-  for (long long k = first; k < end; k++) {
-    const step_data step = step_of(over, k, nothing);
-    double dq[2 * M] = {0.0}, dp[2 * M] = {0.0}; /* increments, then their low words */
-    iteration_data data;
-    prepare_iteration(&step, &data);
-    over->report->t = step.t;
-    if (!solve_by_iteration(over, &step, &data, dq, dp))
-      return 0;
-    for (int i = 0; over->q1 && i < M; i++) {
-      over->q1[k * M + i] = step.q0[i] + (dq[i] + dq[M + i]);
-      over->p1[k * M + i] = step.p0[i] + (dp[i] + dp[M + i]);
+  const step_data step = step_of(over, k, nothing);
+  double dq[2 * M] = {0.0}, dp[2 * M] = {0.0}; /* increments, then their low words */
+  iteration_data data;
+  prepare_iteration(&step, &data);
+  over->report->t = step.t;
+  if (!solve_by_iteration(over, &step, &data, dq, dp))
+    return 0;
+  for (int i = 0; over->q1 && i < M; i++) {
+    over->q1[k * M + i] = step.q0[i] + (dq[i] + dq[M + i]);
+    over->p1[k * M + i] = step.p0[i] + (dp[i] + dp[M + i]);
+  }
+  store_step(&step, &data, over->workspace + SCRATCH, dq, dp, kept);
+  return 1;
+}
+
+/* Values that another method keeps at `count` abscissae in each step, for each coordinate, those of this method: forces
+ * or velocities; and the table from them to the points. */
+struct stored_curves {
+  int count;
+  const double *values;
+  const lanes *table;
+};
+
+/* Table from values at abscissae to the points, by Lagrange's formula. */
+static void tabulate_points(int count, const double *abscissae, lanes *table)
+{
+  for (int j = 0; j < count; j++)
+    for (int n = 0; n < GROUPS; n++) {
+      lanes product = lanes_of(1.0);
+      for (int k = 0; k < count; k++)
+        if (k != j)
+          product *= (ABSCISSA[n] - abscissae[k]) / (abscissae[j] - abscissae[k]);
+      TABLE_ENTRY(table, n, j) = product;
     }
-    store_step(&step, &data, over->workspace + SCRATCH, dq, dp, stored_of(over, k - first));
+}
+
+/* Stores step k as that which its curve solves; returns 0 if that is unknown. */
+static int store_curve(const propagation *over, long long k, double *kept)
+{
+  const stored_curves *curves = over->curves;
+  const double nothing[M] = {0.0}, *values = curves->values + k * M * curves->count;
+  const step_data step = step_of(over, k, nothing);
+  double memory[M * POINTS];
+  iteration_data data;
+  if (curves->count == 0 || !all_finite(values, M * curves->count))
+    return 0;
+  for (int i = 0; i < M; i++, values += curves->count)
+    for (int n = 0; n < GROUPS; n++) {
+      lanes value = lanes_of(0.0);
+      for (int j = 0; j < curves->count; j++)
+        value += TABLE_ENTRY(curves->table, n, j) * values[j];
+      memcpy(memory + i * POINTS + n * LANES, &value, sizeof value);
+    }
+  prepare_iteration(&step, &data);
+  store_step(&step, &data, memory, nothing, nothing, kept);
+  return 1;
+}
+
+/* Stores steps first <= k < end, by their curves or solved; returns 0 if the iteration fails for one of them. */
+static int store_steps(propagation *over, long long first, long long end)
+{
+  for (long long k = first; k < end; k++) {
+    double *kept = stored_of(over, k - first);
+    if (over->curves && store_curve(over, k, kept))
+      over->guess = 0;
+    else if (!solve_and_store(over, k, kept))
+      return 0;
   }
   return 1;
 }
@@ -132,7 +189,7 @@ static int propagate_by_iteration(propagation *over, long long k, const double *
 /* Tangent and adjoint vectors over steps that are each solved by Newton's method. */
 enum { STEPS_AT_ONCE = 1 };
 
-#define solve_steps(over, first, end) 0
+#define store_steps(over, first, end) 0
 #define propagate_by_iteration(over, k, kept) 0
 #endif
 
@@ -141,7 +198,7 @@ static int propagate_steps(propagation *over, long long first, long long end)
 {
   int iterated, status = OK;
   over->guess = over->back ? 0 : over->guess;
-  iterated = solve_steps(over, first, end);
+  iterated = store_steps(over, first, end);
   for (long long done = 0; status == OK && done < end - first; done++) {
     const long long k = over->back ? end - 1 - done : first + done;
     if (over->errors)
@@ -185,15 +242,19 @@ int NAME(linearise)(long long steps, const real *t, const real *h, const real *q
 #ifdef VECTORS_BY_ITERATION
 /* Global errors delta[k + 1] = D psi(x[k]) delta[k] + defect[k] of a run by the step psi from its saved states, and
  * samples of rounding errors, until an iteration fails. The vectors after the last of k steps are those of row k % 2.
- * What is `left` of the change of a vector compounds over the steps. */
+ * What is `left` of the change of a vector compounds over the steps. D psi is that along the curves of another method,
+ * with values at `points` abscissae in each step. */
 int NAME(transport_errors)(long long steps, const real *t, const real *h, const real *q, const real *p,
-    const real *parameters, const solver_options *options, int count, double left, double rounding,
-    unsigned long long seed, const real *defects, real *vectors, long long stride, real *errors, real *deviations,
-    solver_report *report, real *workspace)
+    const real *parameters, const solver_options *options, int points, const real *abscissae, const real *curves,
+    int count, double left, double rounding, unsigned long long seed, const real *defects, real *vectors,
+    long long stride, real *errors, real *deviations, solver_report *report, real *workspace)
 {
+  lanes table[(points + 1) * GROUPS];
+  const stored_curves stored = {points, curves, table};
   error_vectors all = {count, STEP_INPUTS, rounding, seed, defects, stride, errors, deviations};
   propagation over = {PROPAGATION_OF_ARGUMENTS, .accepted = left * left, .count = count, .errors = &all,
-      .vectors = vectors};
+      .curves = &stored, .vectors = vectors};
+  tabulate_points(points, abscissae, table);
   return propagate_blocks(&over, steps);
 }
 #endif

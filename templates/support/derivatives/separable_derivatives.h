@@ -86,8 +86,35 @@ static inline lanes next_change(const iterated_step *at, const lanes *table, lan
   return x0[n][i] + at->scale[i] * apply(table, n, f, i);
 }
 
-/* Solves for some x, which start as x0, and f = K x, together; back: the transpose. Changes are measured in the metric
- * of the masses, independent of the units of the coordinates. */
+#ifdef LINEAR_FORCES
+#define CORRECTS_LINEAR_PART(at, back) (!(back) && (at)->data->linear.is_used) /* as the iteration of the step */
+#define correct_linear_part(at, residual) solve_linear_part(&(at)->data->linear, (residual)[0])
+#else
+#define CORRECTS_LINEAR_PART(at, back) 0
+#define correct_linear_part(at, residual) (void)0
+#endif
+
+/* Moves x by the residual of its equation, or by the correction for it; adds squares of moves and sizes in the metric of
+ * the masses, independent of the units of the coordinates. */
+static inline __attribute__((always_inline)) void improve_vector(const iterated_step *at, int back, lanes (*x0)[M],
+    lanes (*f)[M], lanes (*x)[M], double *largest)
+{
+  lanes moved[GROUPS] = {{0.0}}, size[GROUPS] = {{0.0}}, change[GROUPS][M];
+  for (int i = 0; i < M; i++)
+    for (int n = 0; n < GROUPS; n++)
+      change[n][i] = next_change(at, back ? PRODUCT_BACK : PRODUCT, x0, f, n, i) - x[n][i];
+  if (CORRECTS_LINEAR_PART(at, back))
+    correct_linear_part(at, change);
+  for (int i = 0; i < M; i++)
+    for (int n = 0; n < GROUPS; n++) {
+      x[n][i] += change[n][i];
+      moved[n] += at->mass[i] * (change[n][i] * change[n][i]);
+      size[n] += at->mass[i] * (x[n][i] * x[n][i]);
+    }
+  keep_largest(points_total(moved), points_total(size), largest);
+}
+
+/* Solves for some x, which start as x0, and f = K x, together; back: the transpose. */
 static inline __attribute__((always_inline)) int solve_vectors(iterated_step *at, int back, int count,
     lanes (*x)[GROUPS][M], lanes (*f)[GROUPS][M], int *look)
 {
@@ -98,24 +125,15 @@ static inline __attribute__((always_inline)) int solve_vectors(iterated_step *at
   memcpy(x0, x, sizeof *x * (size_t)count);
   apply_derivatives(at, back, count, x, f);
   for (int k = 0; status == 0; k++) {
-    if (k < *look) {
+    double largest[2] = {0.0, 0.0};
+    if (k < *look && !CORRECTS_LINEAR_PART(at, back)) {
       for (int j = 0; j < count; j++)
         for (int i = 0; i < M; i++)
           for (int n = 0; n < GROUPS; n++)
             x[j][n][i] = next_change(at, table, x0[j], f[j], n, i);
     } else {
-      double largest[2] = {0.0, 0.0};
-      for (int j = 0; j < count; j++) {
-        lanes moved[GROUPS] = {{0.0}}, size[GROUPS] = {{0.0}};
-        for (int i = 0; i < M; i++)
-          for (int n = 0; n < GROUPS; n++) {
-            const lanes next = next_change(at, table, x0[j], f[j], n, i), change = next - x[j][n][i];
-            moved[n] += at->mass[i] * (change * change);
-            size[n] += at->mass[i] * (next * next);
-            x[j][n][i] = next;
-          }
-        keep_largest(points_total(moved), points_total(size), largest);
-      }
+      for (int j = 0; j < count; j++)
+        improve_vector(at, back, x0[j], f[j], x[j], largest);
       status = vectors_status(largest[0], largest[1], &past, k, look);
     }
     apply_derivatives(at, back, count, x, f);

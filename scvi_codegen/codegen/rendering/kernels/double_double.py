@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 from scvi_codegen.codegen.ir.kernel import Constant, Expression, Kernel, Load, Number, Operation
-from scvi_codegen.codegen.rendering.kernels.printer import scalar_functions
 from scvi_codegen.codegen.rendering.kernels.simd import Lanes
 from scvi_codegen.codegen.rendering.text import table, wrapped, wrapped_comment, wrapped_prototype
 from scvi_codegen.common.cache import template_folder
@@ -20,18 +19,9 @@ OPERATORS = {"+": "sum", "-": "difference", "/": "divide", "neg": "negative"}
 SUMS = ("+", "-", "neg")
 PRODUCTS, SETTLED_PRODUCTS = ("squared", "multiple", "product"), ("square", "scale", "multiply")
 """Functions of ``templates/support/double_double/pairs.h``: square, product with one word, and of pairs."""
-FUNCTIONS = frozenset(
-    "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp log pow".split()  # noqa: SIM905
-)
-"""Elementary functions of ``templates/support/double_double/functions.h``."""
 
 PER_TURN, PER_BINADE, NEAR = 128, 64, 64
 """Rows of the tables of sines and cosines, of powers of 2, and of powers less 1."""
-
-
-def uses_functions(kernels: tuple[Kernel, ...]) -> bool:
-    """Return whether elementary functions other than roots occur."""
-    return bool(set().union(*map(scalar_functions, kernels)) & FUNCTIONS)
 
 
 @dataclass(frozen=True, slots=True)

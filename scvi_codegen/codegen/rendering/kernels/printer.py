@@ -117,6 +117,10 @@ ARRAYS = ("u", "t", "parameters", "kept", "value", "derivative")
 
 INVERSE_ROOT, TIMES = "inverse_root_", "_times"
 """Beginning of the names of inverse roots, and end of those that have a factor as a second operand."""
+IN_PAIRS = frozenset(
+    "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp log pow".split()  # noqa: SIM905
+)
+"""Elementary functions of ``templates/support/double_double/functions.h``."""
 OWN_FUNCTIONS = (INVERSE_ROOT, "lanes_")
 
 PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2, "neg": 3}
@@ -164,6 +168,11 @@ def lane_functions(kernel: Kernel, sources: Sources) -> set[str]:
 def scalar_functions(kernel: Kernel) -> set[str]:
     """Return all functions that occur in a kernel."""
     return set().union(*(_functions(part, lambda expression: True) for part in _every_part(kernel)))
+
+
+def uses_functions(kernels: Iterable[Kernel]) -> bool:
+    """Return whether elementary functions other than roots occur."""
+    return bool(set().union(*map(scalar_functions, kernels)) & IN_PAIRS)
 
 
 def inverse_roots(kernels: Iterable[Kernel]) -> list[int]:

@@ -146,8 +146,8 @@ def column_of(table: Any, number: int) -> Column:
         return Column("constant", points, factor)
     if len(indices) == 1:
         return Column("single", points, factor, index=indices[0] + 1)
-    leading = indices == list(range(len(indices)))
-    return Column("leading" if leading else "other", points, factor, "" if leading else "G", len(indices))
+    kind, of = ("leading", "") if indices == [*range(len(indices))] else ("other", "G")
+    return Column(kind, points, factor, of, len(indices))
 
 
 h, n, j = Symbol("h"), Symbol("n", integer=True), Symbol("j", integer=True)

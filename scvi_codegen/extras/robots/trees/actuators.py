@@ -164,6 +164,46 @@ def inherited_by(tag: str, defaults: Mapping[str, str]) -> dict[str, str]:
     return {key: value for key, value in defaults.items() if kept or key not in OF_LAWS}
 
 
+def _motor(_: Element, gain: Vector, bias: Vector) -> None:
+    gain[0] = 1
+
+
+def _servo(element: Element, gain: Vector, bias: Vector) -> None:
+    gain[0] = element.number("kp", gain[0])
+    ratio = element.number("dampratio", least=0) if element.has("dampratio") else bias[2]
+    bias[:] = 0, -gain[0], -element.number("kv", least=0) if element.has("kv") else ratio
+
+
+def _velocity(element: Element, gain: Vector, bias: Vector) -> None:
+    gain[0] = element.number("kv", gain[0])
+    bias[:] = 0, 0, -gain[0]
+
+
+def _damper(element: Element, gain: Vector, bias: Vector) -> None:
+    slope = gain[2] if element.text("gaintype", "fixed") == "affine" else 0.0
+    gain[:] = 0, 0, -element.number("kv", -slope, 0)
+    element.node.attrib["ctrllimited"] = "true"
+    if element.vector("ctrlrange", (0, 0), (2,)).min() < 0:
+        element.refuse(f"has ctrlrange='{element.text('ctrlrange')}', which must not be < 0")
+
+
+def _cylinder(element: Element, gain: Vector, bias: Vector) -> None:
+    area = element.number("area", gain[0])
+    gain[0] = np.pi / 4 * element.number("diameter") ** 2 if element.has("diameter") else area
+    bias[:] = element.vector("bias", bias.tolist())
+
+
+WRITTEN = {
+    "motor": _motor,
+    "position": _servo,
+    "intvelocity": _servo,
+    "velocity": _velocity,
+    "damper": _damper,
+    "cylinder": _cylinder,
+}
+"""Functions that write the attributes of an actuator into gain and bias, by its tag."""
+
+
 def as_general(element: Element) -> None:
     """Write gain, bias and activation of an actuator, over inherited ones, as those of ``<general>``.
 
@@ -173,25 +213,8 @@ def as_general(element: Element) -> None:
     law = element.text("dyntype", "none") if attributes.get("kind") == "position" else "none"
     if element.has("kv") and element.has("dampratio"):
         element.refuse("has kv and dampratio: one is needed")
-    if element.tag == "motor":
-        gain[0] = 1
-    elif element.tag in ("position", "intvelocity"):
-        gain[0] = element.number("kp", gain[0])
-        ratio = element.number("dampratio", least=0) if element.has("dampratio") else bias[2]
-        bias[:] = 0, -gain[0], -element.number("kv", least=0) if element.has("kv") else ratio
-    elif element.tag == "velocity":
-        gain[0] = element.number("kv", gain[0])
-        bias[:] = 0, 0, -gain[0]
-    elif element.tag == "damper":
-        slope = gain[2] if element.text("gaintype", "fixed") == "affine" else 0.0
-        gain[:] = 0, 0, -element.number("kv", -slope, 0)
-        attributes["ctrllimited"] = "true"
-        if element.vector("ctrlrange", (0, 0), (2,)).min() < 0:
-            element.refuse(f"has ctrlrange='{element.text('ctrlrange')}', which must not be < 0")
-    elif element.tag == "cylinder":
-        area = element.number("area", gain[0])
-        gain[0] = np.pi / 4 * element.number("diameter") ** 2 if element.has("diameter") else area
-        bias = element.vector("bias", bias.tolist())
+    if element.tag in WRITTEN:
+        WRITTEN[element.tag](element, gain, bias)
     attributes |= zip(("gaintype", "biastype", "dyntype"), TYPES.get(element.tag, (element.tag,)), strict=False)
     if element.tag == "position":
         filtered = element.number("timeconst", law == "filterexact", 0)

@@ -131,8 +131,8 @@ class _MujocoModel:
             limits, friction = self.read_limits(tendon, "tendons", tendon.name)
             stiffness, damping = (self.coefficients(tendon, key) for key in ("stiffness", "damping"))
             armature = tendon.number("armature", 0, 0)
-            forces = any(stiffness) or any(damping) or armature or limits or friction
-            if not (forces or tendon.node.get("name") in acted):
+            forces = *stiffness, *damping, armature, limits, friction, tendon.node.get("name") in acted
+            if not any(forces):
                 continue
             for part in tendon.children("geom", "pulley"):
                 part.refuse(f"is on the tendon '{tendon.name}', which is read through sites only, without wrapping")

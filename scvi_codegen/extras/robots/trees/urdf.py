@@ -52,13 +52,13 @@ def links_of_urdf(path: str | PathLike[str], *, floating: bool, parts: Collectio
         outgoing[_linked(joint, "parent")].append(child)
     base = Joint(name=roots[0], kind="free" if floating else "fixed", pose=Pose())
     tree = [Link(roots[0], -1, base, _inertia(links[roots[0]]))]
-    places, rotors, resting = {roots[0]: 0}, _rotors(robot), set() if floating else {roots[0]}
+    places, rotors, resting = {roots[0]: 0}, _rotors(robot), {roots[0]: not floating}
     for parent in (order := [roots[0]]):
         for child in outgoing[parent]:
             place, kind = places[parent], joints[child].text("type")
-            if kind == "floating" and parent not in resting:
+            if kind == "floating" and not resting[parent]:
                 joints[child].refuse("is free, but its parent moves: remove the joint, or omit floating=True")
-            resting |= {child} if kind == "fixed" and parent in resting else set()
+            resting[child] = resting[parent] and kind == "fixed"
             for moved in _joints(joints[child], parts, rotors.get(joints[child].name, 0.0)):
                 tree.append(Link(child, place, moved, Inertia()))
                 place = len(tree) - 1

@@ -6,6 +6,7 @@ from typing import Any
 
 import click
 
+from scvi_codegen.codegen.options import STEP_SIZE, check_available
 from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE
 from scvi_codegen.common.errors import ScviCodegenError
 from scvi_codegen.common.registry import part
@@ -19,7 +20,7 @@ from scvi_codegen.interfaces.cli.command_group import (
 )
 from scvi_codegen.interfaces.cli.ensembles import energy_balance, ensemble_summary, integrate_states
 from scvi_codegen.interfaces.cli.json_documents import ensemble_numbers, outcome_numbers, run_numbers
-from scvi_codegen.interfaces.cli.model_options import check_flag, model_arguments, read_model
+from scvi_codegen.interfaces.cli.model_options import check_exclusive, model_arguments, read_model
 from scvi_codegen.interfaces.cli.recording import (
     SUFFIX,
     RecordedOutcome,
@@ -42,9 +43,9 @@ from scvi_codegen.interfaces.models.options import (
     IN_ENSEMBLE,
     OF_ADAPTIVE_STEPS,
     OPTIONS,
-    STEP_SIZE,
+    ROWS,
+    RUN_FIELDS,
     WITH_INPUTS,
-    check_available,
 )
 from scvi_codegen.runs.accuracy.global_error import GlobalError
 from scvi_codegen.runs.results.export import FORMATS
@@ -165,8 +166,8 @@ def run(
         (f"-o {output}", recorded),
     ):
         model = model.with_known_sizes(option) if needed else model
-    if model.system.inputs and requested["advise"] is not None:
-        check_flag(ERRORS["advise"], WITH_INPUTS)
+    if model.system.inputs:
+        check_available({"advise": requested["advise"]}, WITH_INPUTS, rows=ROWS)
     if model.system.inputs and recorded:
         raise click.UsageError("a run with inputs cannot be recorded in a folder: write it to a file (-o NAME.npz)")
     states = None if ensemble is None else load_ensemble(ensemble, model)
@@ -194,7 +195,7 @@ def _check_ensemble(model: Model) -> None:
         raise click.UsageError(
             "--ensemble is not available with a time transformation: each trajectory has its own times"
         )
-    check_available(model, IN_ENSEMBLE)
+    check_available({row.field: getattr(model, row.field) for row in RUN_FIELDS}, IN_ENSEMBLE, rows=ROWS)
 
 
 def _check_output_of_words(model: Model, output: str | None) -> None:
@@ -257,16 +258,9 @@ def _check_combination(
 ) -> None:
     if folder is not None and plot is not None:
         raise click.UsageError("--plot is not available for a run recorded in a folder: it needs the states in memory")
-    arguments = [name for name, value in requested.items() if value is not None]
-    if len(arguments) > 1:
-        raise click.UsageError(
-            f"--{arguments[0]} and --{arguments[1]} exclude each other: each determines the step size; give one"
-        )
-    for name in ("step", "steps"):
-        if arguments and choices[name] is not None:
-            raise click.UsageError(f"--{arguments[0]} determines the step size: omit --{name} (--span is the duration)")
-    if ensemble is not None and arguments:
-        check_flag(ERRORS[arguments[0]], IN_ENSEMBLE)
+    check_exclusive(choices | requested)
+    if ensemble is not None:
+        check_available(requested, IN_ENSEMBLE, rows=ROWS)
 
 
 def _run_one(

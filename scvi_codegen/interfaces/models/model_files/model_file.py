@@ -17,7 +17,7 @@ from typing import Any
 
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE
 from scvi_codegen.common.atomic import naming_folders, write_text
-from scvi_codegen.common.errors import ModelFileError, SystemDefinitionWarning
+from scvi_codegen.common.errors import ModelFileError, SystemDefinitionWarning, speaking
 from scvi_codegen.common.registry import homes, part
 from scvi_codegen.common.toml_text import read_toml
 from scvi_codegen.common.validation import ExactNumber, checks_arguments, of
@@ -184,6 +184,7 @@ def _written(model: Model, stem: str | None) -> dict[str, str]:
     )
 
 
+@speaking("file")
 def _read_model(document: Document, changes: Document, folder: str | os.PathLike[str] = ".") -> Model:
     entry = read_entry({**document.get("system", {}), **changes.get("system", {})}, folder)
     for name in ARRAY_SECTIONS:
@@ -196,6 +197,7 @@ def _read_model(document: Document, changes: Document, folder: str | os.PathLike
     document = _without_inherited_step(document)
     is_named = any(_without_solver(layer).get("method") for layer in (document, changes))
     document, specification, solver = _merged(document, changes, entry)
+    run = read_run(document["run"])
     numbers = {name: document[name] for name in ("parameters", "initial") if name in document}
     document = {**document, **with_exact_numbers(numbers, exact=_precision(document) == DOUBLE_DOUBLE)}
     with warnings.catch_warnings():  # other formulas than that of the system may use its parameters
@@ -208,7 +210,7 @@ def _read_model(document: Document, changes: Document, folder: str | os.PathLike
     method = read_method(fitted(specification, system))
     values |= {"inputs": _read_inputs(document.get("inputs", {}), folder), "solver": solver}
     events = read_events(document.get("events", []))
-    values |= {name: document.get(name, {}) for name in FURTHER} | read_run(document["run"])
+    values |= {name: document.get(name, {}) for name in FURTHER} | run
     method = DEFAULT_METHOD if not is_named and method == DEFAULT_METHOD else method
     model = Model(system=system, method=method, events=events, **values)
     for name in homes("sections"):
@@ -225,7 +227,9 @@ def _merged(document: Document, changes: Document, entry: Entry | None) -> tuple
         document = merged_sections(entry.motion, document)
     declared = {key.partition("[")[0]: key for key in document.get("parameters", {})}
     parameters = {declared.get(name, name): value for name, value in changes.get("parameters", {}).items()}
-    merged = merged_sections(document, {**changes, "parameters": parameters} if parameters else changes)
+    merged: dict[str, Section] = merged_sections(
+        document, {**changes, "parameters": parameters} if parameters else changes
+    )
     if entry is None:
         check_complete(merged)
         check_used(merged, changes.get("parameters", {}))

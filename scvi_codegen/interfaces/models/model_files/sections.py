@@ -2,25 +2,18 @@
 
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextvars import ContextVar
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any, Final, TypeVar
 
+from scvi_codegen.codegen.options import check_agreement
 from scvi_codegen.common.atomic import read_text
 from scvi_codegen.common.errors import ModelFileError, ScviCodegenError, closest
 from scvi_codegen.common.validation import FORMULA, checked_count, likely_names, synonym_hint
 from scvi_codegen.interfaces.models.model import DEFAULT_METHOD
-from scvi_codegen.interfaces.models.options import (
-    ALTERNATIVE_KEYS,
-    FIELDS,
-    KEYED,
-    STEP_KEYS,
-    SWITCH,
-    alternatives,
-    options_of,
-    real,
-)
+from scvi_codegen.interfaces.models.options import ALTERNATIVE_KEYS, KEYED, ROWS, options_of, real
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification, sized, specification_of
 from scvi_codegen.systems.event import Event
 from scvi_codegen.systems.first_order import FirstOrderSystem
@@ -112,7 +105,7 @@ def _split_method_name(section: Section) -> Section:
     spelt = in_section("[method]", lambda: specification_of(name))
     for key, value in spelt.items():
         if key != "method" and section.get(key, value) != value:
-            raise ModelFileError(f"[method] method = {name!r} and {key} = {section[key]!r} contradict each other")
+            raise ModelFileError(f"[method] method = {name} and [method] {key} = {section[key]} contradict each other")
     return {**section, **spelt}
 
 
@@ -127,10 +120,6 @@ def _changed_method(base: Section, changes: Section) -> Section:
     if name != base_section.get("method"):
         accepted = ARGUMENTS.get(name, ())
         base_section = {key: value for key, value in base_section.items() if key in INHERITED and key in accepted}
-    for option in options_of("method"):  # a switch is named otherwise on the command line
-        if option.kind == SWITCH and option.key in changes and option.key not in ARGUMENTS.get(name, (option.key,)):
-            takers = " or ".join(other for other in ARGUMENTS if option.key in ARGUMENTS[other])
-            raise ModelFileError(f"{option.flag} is for the method {takers}, not for {name}: omit it")
     if {"abscissae", "space"} & changes.keys():
         base_section.pop("nodes", None)  # alternatives to nodes
     return sized({**base_section, **changes}) if "method" in changes else {**base_section, **changes}
@@ -152,10 +141,14 @@ def read_method(section: Section) -> Method:
     if "method" not in section:
         check_keys(section, dict.fromkeys(["method", *chain.from_iterable(ARGUMENTS.values())]), "key", "[method]")
     name = text_of(section, "method", "[method]")
-    if name in ARGUMENTS:
-        check_keys(section, ("method", *ARGUMENTS[name]), "key", f"[method] for {name}")
-    if not isinstance(section.get("variational", True), bool):
-        raise ModelFileError(f"[method] variational must be true or false, not {section['variational']!r}")
+    taken = ("method", *ARGUMENTS.get(name, section))
+    for option in options_of("method"):
+        if option.key in section:
+            option.checked(section[option.key], ModelFileError)
+            if option.key not in taken:
+                takes = ", ".join(row.word for row in options_of("method") if row.key in taken[1:]) or "no options"
+                raise ModelFileError(f"{option} is not for the method {name}, which takes {takes}: omit it")
+    check_keys(section, taken, "key", f"[method] for {name}")
     if not isinstance(section.get("abscissae", []), list | str):
         raise ModelFileError(f"[method] abscissae must be a list of numbers or a name, not {section['abscissae']!r}")
     return in_section("[method]", lambda: method_from_specification(section))
@@ -239,14 +232,10 @@ class ModelSection:
 
 def read_run(section: Section) -> dict[str, Any]:
     """Return the fields of a model in ``[run]``; adaptive steps without a step size."""
-    section = {key: value for key, value in section.items() if value is not None}
-    for option, alternative in alternatives("run"):
-        check_one(section, "run", option.key, alternative.key)
-    if not STEP_KEYS & section.keys() and "steps" in section:
-        raise ModelFileError("[run] has steps but no step: give the step size")
-    fields = [option for option in options_of("run") if option in FIELDS and option.key in section]
-    numbers = {option.field: option.read(section[option.key], f"[run] {option.key}") for option in fields}
-    return {**numbers, **{name: section.get(name) for name in ("precision", "sums", "observe")}}
+    given = {option: section[option.key] for option in options_of("run") if section.get(option.key) is not None}
+    check_agreement({option.field: value for option, value in given.items()}, ModelFileError, rows=ROWS)
+    numbers = {option.field: option.checked(value, ModelFileError) for option, value in given.items()}
+    return {name: value for name, value in numbers.items() if name != "controller"}
 
 
 FORMULAS = ("lagrangian", "hamiltonian", "dissipation", "damping", "constraints")
@@ -275,14 +264,27 @@ def is_number(value: Any) -> bool:
     return not isinstance(value, str | list | dict)
 
 
-def check_complete(document: Document) -> None:
-    """Raise an error that lists all missing keys; arrays whose sizes are names are at rest by default."""
-    missing = []
+Unused = Callable[[Document], Collection[str]]
+UNUSED: ContextVar[Unused] = ContextVar("unused", default=lambda document: ())
+"""Function of a document that returns the required keys that a command does not use."""
+
+
+def check_complete(document: dict[str, Section]) -> None:
+    """Raise an error that lists all missing keys; arrays whose sizes are names are at rest by default.
+
+    Keys that the command does not use get a value: a duration of 1, coordinates and velocities of 0.
+    """
+    missing, unused = [], UNUSED.get()(document)
     replaced = "system" if "field" in document else "field"
     for name, keys in REQUIRED.items():
         for key in () if name == replaced else keys:
             choice = next((choice for choice in ALTERNATIVES if key in choice), {key})
-            if choice.isdisjoint(document.get(name, {})) and not _is_optional(document, key):
+            if not choice.isdisjoint(section := document.get(name, {})) or _is_optional(document, key):
+                continue
+            if key in unused:
+                zeros = [0.0] * len(document.get("system", {}).get("coordinates", ()))
+                document[name] = {**section, key: 1.0 if key == "span" else zeros}
+            else:
                 missing.append(f"{' or '.join(sorted(choice))} in [{name}]")
     if missing == ["p or q_dot in [initial]"] and isinstance(read_system(document), FirstOrderSystem):
         return

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from sympy import Expr
 
 from scvi_codegen.codegen.native.arguments import real_array
+from scvi_codegen.codegen.options import OPTION, check_agreement
 from scvi_codegen.common.atomic import inside, read_text
 from scvi_codegen.common.errors import ExpressionError, ModelFileError
 from scvi_codegen.common.registry import part
@@ -25,7 +26,6 @@ from scvi_codegen.interfaces.models.model_files.sections import (
     Document,
     Section,
     check_keys,
-    check_one,
     in_section,
     is_number,
     required,
@@ -65,8 +65,8 @@ def read_values(
 ) -> tuple[MechanicalSystem, dict[str, Any]]:
     """Return the system with the values of its parameters, and the fields of a model for state, arrays and tables."""
     section = document["initial"]
-    check_one(section, "initial", "p", "q_dot")
-    time = {"t": float(real(section.get("t", 0.0), "[initial] t"))}
+    check_agreement({field: section.get(key) for key, field in STATE.items()}, ModelFileError)
+    time = {"t": OPTION["t"].checked(section.get("t", 0.0), ModelFileError)}
     entries = _parameter_entries(document.get("parameters", {}), system)
     if isinstance(system, ArraySystem):
         return system, _values_of_arrays(document, system, entries, folder) | time

@@ -25,14 +25,21 @@ from scvi_codegen.systems.system import MechanicalSystem
 
 
 def readme_text(
-    interface: Interface, events: tuple[Event, ...], *, with_model: bool, embedded: Embedded | None, controlled: bool
+    interface: Interface,
+    package: str,
+    events: tuple[Event, ...],
+    *,
+    with_model: bool,
+    embedded: Embedded | None,
+    controlled: bool,
 ) -> str:
-    """Return the text of ``README.md``."""
+    """Return the text of ``README.md`` in the folder ``package``."""
     template = template_environment().get_template(f"package/README{'_embedded' if embedded else ''}.md.jinja")
     searched = interface.searched(events)
     of_model = {"contacts": interface.contacts, "kinks": interface.modes, "events": events}
     text = template.render(
         interface=interface,
+        package=package,
         searched=searched,
         acting=any(event.changes_state for event in searched),
         what=" and ".join(name for name, parts in of_model.items() if parts),

@@ -32,8 +32,9 @@ from scvi_codegen.codegen.variants import WithEvents
 from scvi_codegen.common.atomic import read_text, write_text
 from scvi_codegen.common.errors import PackageError
 from scvi_codegen.common.validation import ArgumentType, checks_arguments
+from scvi_codegen.runs.array_stepper import StepperOfRunTimeSizes
 from scvi_codegen.runs.states.layout import layout_of
-from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
+from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.systems.event import Event
 
@@ -183,7 +184,10 @@ def damaged(folder: Path, error: Exception) -> PackageError:
 
 
 def prefix_of(folder: Path, kind: str = "folder", suffix: str = "") -> str:
-    """Return the name of a folder, or of another kind of target, validated as a prefix of C names and of a module."""
+    """Return the name of a folder, or of another kind of target, validated as a prefix of C names and of a module.
+
+    A folder of one letter has the prefix of ``c_identifier``, since ``X_OK`` and ``t_low`` mean something in C.
+    """
     from scvi_codegen.codegen.pipeline import LONGEST_PREFIX, c_identifier  # imported here: it imports SymPy
 
     try:
@@ -192,10 +196,10 @@ def prefix_of(folder: Path, kind: str = "folder", suffix: str = "") -> str:
     except ValueError as error:
         raise PackageError(f"{str(folder)!r} cannot be the name of a {kind}: {error}") from error
     cleaned = c_identifier(name)
-    if name != cleaned:
+    if name != cleaned and (kind, cleaned) != ("folder", f"{name}_integrator"):
         raise PackageError(
             f"the name of the {kind} must be a prefix of C names and a name of a Python package; "
-            f"'{name}' is not (2 to {LONGEST_PREFIX} lower-case letters, digits and underscores, no header of C): "
+            f"'{name}' is not (1 to {LONGEST_PREFIX} lower-case letters, digits and underscores): "
             f"use '{cleaned}{suffix}'{', or give --fmu' if name.endswith('.fmu') else ''}"
         )
     if keyword.iskeyword(name) or name in sys.stdlib_module_names or name in OTHER_NAMES:
@@ -233,7 +237,8 @@ def generate_package(
     Args:
         model: system, method, and the initial state and step size of the example. The code for arrays of run-time
             sizes is for run-time sizes, unless steps are adaptive.
-        folder: target; its name becomes the prefix of the C names and the name of the Python package.
+        folder: target; its name becomes the prefix of the C names (of one letter with ``_integrator``) and the name of
+            the Python package.
         force: overwrite files of the same names that were edited or not generated.
         embedded: the precision, ``"double"`` or ``"single"``, of C for a microcontroller, without a Python package;
             arrays have the sizes of the model.
@@ -285,10 +290,10 @@ def load_package(folder: str | os.PathLike[str]) -> Stepper:
 
 def _stepper_of_arrays(folder: Path) -> Stepper:
     """Return the stepper of a folder with arrays whose sizes are known at run time; its model has their layout."""
-    from scvi_codegen.codegen.pipeline import ArraySources
+    from scvi_codegen.codegen.pipeline import ArraySources, c_identifier
     from scvi_codegen.interfaces.models.model_files.model_file import load_model
 
-    model, prefix = load_model(folder / MODEL_FILE), prefix_of(folder)
+    model, prefix = load_model(folder / MODEL_FILE), c_identifier(prefix_of(folder))
     if model.array_system is None:
         raise damaged(folder, KeyError("interface"))
     interface = ArraySources(model.array_system, model.method, model.solver, prefix).interface
@@ -309,7 +314,7 @@ def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file:
     texts |= render_example(interface, example_of(model, interface, controlled=controlled), embedded or "double")
     texts |= written
     texts["README.md"] = readme_text(
-        interface, model.events, with_model=bool(written), embedded=embedded, controlled=controlled
+        interface, prefix, model.events, with_model=bool(written), embedded=embedded, controlled=controlled
     )
     if not embedded:
         texts["__init__.py"] = package_template("__init__.py")
@@ -322,8 +327,9 @@ def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file:
 
 def integrator_of(model: Model, prefix: str, *, embedded: Embedded | None = None) -> tuple[Source, Interface]:
     """Return the C code of a model and its interface; of arrays whose sizes are known at run time for all sizes."""
-    from scvi_codegen.codegen.pipeline import ArraySources, generate_source
+    from scvi_codegen.codegen.pipeline import ArraySources, c_identifier, generate_source
 
+    prefix = c_identifier(prefix)
     if model.array_system is not None:
         sources = ArraySources(model.array_system, model.method, model.solver, prefix)
         sources.sums = "plain" if model.sums == "plain" else "compensated"
