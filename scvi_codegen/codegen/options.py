@@ -319,13 +319,13 @@ def check_agreement(
         raise error(lacking(required))
 
 
-def check_available(
-    values: Mapping[str, Any], situation: str, error: type[ScviCodegenError] = StateError, rows: Any = OPTION
-) -> None:
-    """Raise an error for a value, by field, whose option is not available in a situation."""
+def check_available(values: Mapping[str, Any], situation: str, rows: Mapping[str, Option]) -> None:
+    """Raise :class:`StateError` for a value, by field, whose option is not available in a situation."""
     for name, value in values.items():
         if value is not None and situation in rows[name].unavailable:
-            raise error(f"{rows[name]} is not available {situation}: {in_words(rows[name].unavailable[situation])}")
+            raise StateError(
+                f"{rows[name]} is not available {situation}: {in_words(rows[name].unavailable[situation])}"
+            )
 
 
 def checked_step(h: Any) -> float:
