@@ -106,8 +106,9 @@ class Option:
     @property
     def word(self) -> str:
         """The option as a remedy names it, which need not be set."""
-        model = "span" if self.field == "t_end" else self.field
-        return {"python": self.field, "model": model, "file": self.key, "command": self.flag}[FACE.get()]
+        end = self.determines == DURATION and self.kind == NUMBER
+        python, model = ("t_end", "span") if end else (self.field, self.field)
+        return {"python": python, "model": model, "file": self.key, "command": self.flag}[FACE.get()]
 
     @property
     def is_section(self) -> bool:
@@ -274,22 +275,39 @@ def in_words(text: str) -> str:
     return re.sub(r"{(\w+)(=?)}", lambda match: OPTION[match[1]].word + (match[2] and sign), text)
 
 
+def excluding(first: Option, second: Option) -> str:
+    """Return the message on two options that determine the same."""
+    return f"{first} and {second} exclude each other: each determines {first.determines}; omit one"
+
+
+def lacking(determined: str) -> str:
+    """Return the message on a quantity that no option determines."""
+    words = dict.fromkeys(row.word for row in OPTION.values() if row.determines == determined)
+    return f"give either {' or '.join(words)}, which determines {determined}; got neither"
+
+
 def check_agreement(
     values: Mapping[str, Any],
     error: type[ScviCodegenError] = StateError,
     *,
+    required: str = "",
     rows: Mapping[str, Option] = OPTION,
     partly: bool = False,
 ) -> None:
     """Raise an error for two values, by field, that exclude each other; ``None``: not given.
 
-    ``partly``: others may be given elsewhere, by a file that flags supplement, so that an absent step size says
-    nothing about the kind of the steps.
+    Args:
+        values: by field.
+        error: type of the error.
+        required: what one of them must determine.
+        rows: options by field.
+        partly: others may be given elsewhere, by a file that flags supplement, so that an absent step size says
+            nothing about the kind of the steps.
     """
     given = [row for name, row in rows.items() if values.get(name) is not None]
     for first, second in combinations(given, 2):
         if first.determines and first.determines == second.determines:
-            raise error(f"{first} and {second} exclude each other: each determines {first.determines}; omit one")
+            raise error(excluding(first, second))
     size = next((row for row in given if row.determines == STEP_SIZE), None)
     fixed = size is not None and size.field == "h"
     for row in given:
@@ -297,22 +315,17 @@ def check_agreement(
             raise error(in_words(f"{row} requires {ADAPTIVE}: give {{t_end}} without {{h}} and {{steps}}, or omit it"))
         if row.requires == FIXED and not fixed and not (partly and size is None):
             raise error(in_words(f"{row} requires {FIXED}: give {{h}}, or omit it and give {{t_end}}"))
+    if required and required not in {row.determines for row in given}:
+        raise error(lacking(required))
 
 
-def check_given(values: Any, determined: str, error: type[ScviCodegenError] = StateError) -> None:
-    """Raise an error if no attribute, of the alternatives that determine something, has a value."""
-    rows = [row for name, row in OPTION.items() if row.determines == determined and name == row.field != "t_end"]
-    if all(getattr(values, row.field) is None for row in rows):
-        raise error(f"give either {' or '.join(row.word for row in rows)}, which determines {determined}; got neither")
-
-
-def check_available(
-    values: Mapping[str, Any], situation: str, error: type[ScviCodegenError] = StateError, rows: Any = OPTION
-) -> None:
-    """Raise an error for a value, by field, whose option is not available in a situation."""
+def check_available(values: Mapping[str, Any], situation: str, rows: Mapping[str, Option]) -> None:
+    """Raise :class:`StateError` for a value, by field, whose option is not available in a situation."""
     for name, value in values.items():
         if value is not None and situation in rows[name].unavailable:
-            raise error(f"{rows[name]} is not available {situation}: {in_words(rows[name].unavailable[situation])}")
+            raise StateError(
+                f"{rows[name]} is not available {situation}: {in_words(rows[name].unavailable[situation])}"
+            )
 
 
 def checked_step(h: Any) -> float:

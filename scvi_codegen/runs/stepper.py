@@ -247,7 +247,7 @@ class Stepper(OfSteppers, Integrator):
                 stepper=stepper,
                 error=checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance}, self),
                 initial=InitialData(q, p, velocity, t, parameters, options),
-                end=checked_number(t_end, "the time t_end"),
+                end=checked_number(t_end, "t_end"),
                 control=ErrorControl(None, absolute_tolerance, max_step, first_step),
                 inputs=inputs,
                 output={"save_every": save_every, "t_eval": t_eval},

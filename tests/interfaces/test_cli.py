@@ -190,7 +190,7 @@ class TestChoices:
             ("kepler --q 1", "q must have 2 numbers for (q1, q2), not 1"),
             ("kepler --q nan,0", "--q, q1, is nan"),
             ("kepler --parameter mu", "'mu' is not of the form NAME=VALUE"),
-            ("kepler --parameter mu=nan", "'mu=nan' must have a finite number as VALUE, as in g=9.81"),
+            ("kepler --parameter mu=nan", "--parameter mu is nan: it must be finite"),
             ("kepler --parameter nu=1", "has no parameter 'nu'"),
             ("kepler --steps -1", "steps must be at least 0"),
             ("kepler --save-every 0", "--save-every must be at least 1"),

@@ -62,7 +62,7 @@ class ChaosIndicatorsEnsemble:
             raise StateError(
                 f"steps={steps} must be a multiple of save_every={self.save_every}, so that the last value is saved"
             )
-        start = checked_number(t, "the time t")
+        start = checked_number(t, "t")
         self.t = Fixed(self.h).times(start, np.arange(steps + 1))
         self.q, self.p, self.parameters = stepper.products.ensemble_start(
             q, p, velocity, t=start, parameters=parameters

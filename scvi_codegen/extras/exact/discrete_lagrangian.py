@@ -171,7 +171,7 @@ class _Problem:
         Discretisation.check_continuity(system)
         self.names = [coordinate.name for coordinate in system.coordinates]
         self.arrays = [array.name for array in system.arrays] or self.names
-        self.digits, self.t, self.h = digits, _number(t, "the time t"), _number(h, "the step h")
+        self.digits, self.t, self.h = digits, _number(t, "t"), _number(h, "the step h")
         if self.h == 0:
             raise StateError("the step size h is 0: it must be positive or negative")
         if system.constraints or system.has_contacts:

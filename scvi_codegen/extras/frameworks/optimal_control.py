@@ -375,7 +375,7 @@ def optimal_control(
         end_cost=end_cost,
         bounds=bounds or {},
         degree=degree,
-        t=checked_number(t, "the time t"),
+        t=checked_number(t, "t"),
         parameters=_parameter_values(system, parameters or {}),
     )
     program = task.program()

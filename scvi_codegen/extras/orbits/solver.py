@@ -402,7 +402,7 @@ def periodic_orbit(
         raise StateError(f"max_step={max_step:g} requires adaptive steps: omit it, or steps and h")
     if sequence is None:
         stepper.products.require("adaptive")
-    t = checked_number(t, "the time t")
+    t = checked_number(t, "t")
     start, values = stepper.products.start(q, p, velocity, t, parameters)
     search = OrbitSearch.at(
         stepper,

@@ -184,7 +184,7 @@ def path_of(
     """Return the path of :meth:`scvi_codegen.Stepper.path`."""
     stepper.products.require("path")
     count = checked_count(steps, "steps", least=2)
-    duration, begin = _checked_duration(T), checked_number(t, "the time t")
+    duration, begin = _checked_duration(T), checked_number(t, "t")
     states = stepper.products.states
     kind = _kind_of_intervals(stepper, closed=closed is not None, energy=energy is not None)
     h = np.full(count, duration / count)

@@ -99,7 +99,7 @@ def verify(
     if isinstance(system, ArraySystem) and system.mesh is not None and q is None and p is None:
         q, p, h = state_of_fields(system.mesh, method, h)
     _check_arguments(system, stepper, q, h, of_run)
-    t, h = checked_number(t, "the time t"), None if h is None else Fixed.checked(h).h
+    t, h = checked_number(t, "t"), None if h is None else Fixed.checked(h).h
     began, method = time.perf_counter(), as_method(method, system)
     if isinstance(system, ArraySystem):
         stepper = stepper or compile_stepper(system, method, solver=solver)

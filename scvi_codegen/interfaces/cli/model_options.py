@@ -1,6 +1,5 @@
 """The argument MODEL and the options that override it, converted to a :class:`Model`."""
 
-import math
 import os
 import re
 import sys
@@ -87,29 +86,23 @@ def _assignments(
 ) -> tuple[tuple[str, float], ...]:
     result = []
     for text in values:
-        name, equals, number = (part.strip() for part in text.partition("="))
+        name, _, number = (part.strip() for part in text.partition("="))
         try:
-            value: float = ExactNumber(number)
+            result.append((name, ExactNumber(number)))
         except ValueError:
-            value = math.nan
-        if not name or not equals or not math.isfinite(value):
-            form = "must have a finite number as VALUE" if name and equals else "is not of the form NAME=VALUE"
-            raise click.BadParameter(f"'{text}' {form}, as in g=9.81")
-        result.append((name, value))
+            name = ""
+        if not name:
+            raise click.BadParameter(f"'{text}' is not of the form NAME=VALUE with a number, as in g=9.81")
     return tuple(result)
 
 
-def _number_or_named(
-    context: click.Context, parameter: click.Parameter, values: tuple[str, ...]
-) -> float | dict[str, float] | None:
+def _number_or_named(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> Any:
     """Return VALUE as a number, and NAME=VALUE, NAME=VALUE as numbers by name; ``None`` without any."""
     if not values:
         return None
     if len(values) == 1 and "=" not in values[0]:
-        try:
-            return float(ExactNumber(values[0]))
-        except ValueError as error:
-            raise click.BadParameter(f"'{values[0]}' is neither VALUE nor NAME=VALUE, as in 1e-9 and x=1e-9") from error
+        numbers = _numbers(context, parameter, values[0]) or ()
+        return numbers[0] if len(numbers) == 1 else numbers
     return dict(_assignments(context, parameter, values))
 
 

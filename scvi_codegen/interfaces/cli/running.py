@@ -89,16 +89,12 @@ def integrate_model(model: Model) -> RunOutcome:
             stopped = bool(caught)
             return stopped
 
-        recorded, segments = partial(run._recorded, stop=stop), model.segments(run)
+        segments, in_segments = model.segments(run), bool(model.system.inputs)
         try:
-            if model.system.inputs:
-                recorded = partial(
-                    recorded, output=Output(model.save_every, model.output_times(run, None), progress=look)
-                )
-                trajectory = record_segments(run, segments, recorded, lambda: stopped)
-            else:
-                steps = next(segments)
-                trajectory = recorded(steps, Output(model.save_every, model.output_times(run, steps), progress=look))
+            steps = None if in_segments else next(segments)
+            output = Output(model.save_every, model.output_times(run, steps), progress=look)
+            record = partial(run._recorded, output=output, stop=stop)
+            trajectory = record_segments(run, segments, record, lambda: stopped) if in_segments else record(steps)
         except StepFailedError as error:
             failure, trajectory = error, Trajectory.before(error)
     missed = None

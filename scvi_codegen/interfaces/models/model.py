@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scvi_codegen.codegen.lowering.arrays import check_solver
-from scvi_codegen.codegen.options import VELOCITY, check_agreement, check_given
+from scvi_codegen.codegen.options import VELOCITY, check_agreement
 from scvi_codegen.codegen.variants import SUMS
 from scvi_codegen.common.display.cards import Html, card, listed, plain
 from scvi_codegen.common.errors import ArgumentError, ModelFileError, StateError, speaking
@@ -156,8 +156,8 @@ class Model(TimeSpan):
     def _take_vectors(self) -> None:
         """Check the fields of a model of named coordinates, whose state becomes numbers in order."""
         self._take_attitudes()
-        check_agreement({name: getattr(self, name) for name in STATE.values()}, ModelFileError)
-        check_given(self, VELOCITY, ModelFileError)
+        state = {name: getattr(self, name) for name in STATE.values()}
+        check_agreement(state, ModelFileError, required=VELOCITY)
         if self.threads is not None:
             raise ModelFileError(
                 f"{ROWS['threads']} requires arrays whose sizes are names, coordinates = ['q[N]']: omit it"

@@ -148,11 +148,11 @@ _TABLE |= {name: Option("family", *option, common=False) for name, option in _OF
 OPTIONS = tuple(option.named(name) for name, option in _TABLE.items())
 KEYED = tuple(option for option in OPTIONS if option.section and not option.is_section)
 """Options with a key of their own in a section of model files."""
-STEP_KEYS, *OTHERS = (
+ALTERNATIVE_KEYS = [
     {option.key for option in KEYED if option.determines == group} for group in (STEP_SIZE, DURATION, VELOCITY)
-)
-ALTERNATIVE_KEYS = (STEP_KEYS, *OTHERS)
+]
 """Groups of keys of which at most one is given, first those of the step size."""
+STEP_KEYS = ALTERNATIVE_KEYS[0]
 ROWS = {option.field: option for option in OPTIONS}
 """Options by field."""
 

@@ -7,7 +7,7 @@ from fractions import Fraction
 from typing import Any, Self
 
 from scvi_codegen.codegen.native.options import SolverOptions
-from scvi_codegen.codegen.options import DURATION, STEP_SIZE, check_agreement, check_given, in_words
+from scvi_codegen.codegen.options import DURATION, STEP_SIZE, check_agreement, in_words
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE
 from scvi_codegen.common.errors import MethodWarning, ModelFileError, warn
 from scvi_codegen.common.validation import LARGEST_COUNT
@@ -59,10 +59,9 @@ class TimeSpan(ModelOptions):
     def _check_time_span(self) -> None:
         """Raise :class:`ModelFileError`, naming the field, for invalid values, and convert the others."""
         given = {row.field: value for row in RUN_FIELDS if (value := getattr(self, row.field)) is not None}
-        check_agreement(given, ModelFileError, rows=ROWS)
+        check_agreement(given, ModelFileError, required=DURATION, rows=ROWS)
         for name, value in given.items():
             object.__setattr__(self, name, ROWS[name].checked(value, ModelFileError))
-        check_given(self, DURATION, ModelFileError)
         if None not in (self.h, self.span) and not 0.0 < self.span / abs(self.h) <= LARGEST_COUNT:  # type: ignore
             backward = f"a run backward in time has {{h}} = {-abs(self.h):g} and {{t_end}} = {abs(self.span):g}"  # type: ignore
             remedy = in_words(backward) if self.span < 0.0 else "give a positive one of less than 2^53 steps"  # type: ignore
@@ -97,17 +96,16 @@ class TimeSpan(ModelOptions):
 
     def _run_section(self) -> dict[str, Any]:
         defaults = {field.name: field.default for field in fields(self)}
-        values = {option: getattr(self, option.field) for option in options_of("run")}
-        section = {option.key: value for option, value in values.items() if value != defaults[option.field]}
+        rows = options_of("run")
+        section = {row.key: value for row in rows if (value := getattr(self, row.field)) != defaults[row.field]}
         if self.time_transformation is not None and self.controller is None:
             section["controller"] = default_controller(in_tau=True)
-        return {key: value for key, value in section.items() if value is not None}
+        return section
 
     @property
     def _control(self) -> dict[str, Any]:
-        """Arguments of adaptive steps besides the tolerance that are set, by name."""
-        values = {name: getattr(self, name) for name in OF_ADAPTIVE_STEPS}
-        return {name: value for name, value in values.items() if value is not None}
+        """Arguments of adaptive steps besides the tolerance, by name."""
+        return {name: getattr(self, name) for name in OF_ADAPTIVE_STEPS}
 
     def _with_step_size(self, *, steps: int | None = None, **settings: Any) -> Self:
         """Return the model whose step size another option determines, over the same time span or ``steps`` steps."""
@@ -119,9 +117,8 @@ class TimeSpan(ModelOptions):
     @property
     def solver_options(self) -> SolverOptions | None:
         """Convergence criterion of the solver; ``None`` for the default one."""
-        values = {option.solver_option: getattr(self, option.field) for option in RUN_FIELDS if option.solver_option}
-        values = {name: value for name, value in values.items() if value is not None}
-        return SolverOptions(**values) if values else None
+        rows = [row for row in RUN_FIELDS if row.solver_option and getattr(self, row.field) is not None]
+        return SolverOptions(**{row.solver_option: getattr(self, row.field) for row in rows}) if rows else None
 
     @property
     def ends_at_time(self) -> bool:

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.codegen.native.options import SolverOptions
+from scvi_codegen.codegen.options import OPTION
 from scvi_codegen.common.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runs.driver.run import Run
@@ -56,9 +56,7 @@ def largest_step(
         StateError: if a number is out of range, an input is not set, or no step is small enough.
         MethodError: if the method has no error estimate.
     """
-    length, bound = checked_number(span, "the span"), checked_number(tolerance, "the tolerance")
-    if length == 0.0 or not 0.0 <= bound < 1.0:
-        raise StateError(f"span = {length:g} must not be 0, and tolerance = {bound:g} must be in [0, 1)")
+    length, bound = OPTION["span"].checked(span), OPTION["tolerance"].checked(tolerance) if tolerance else 0.0
     check_inputs_given(stepper.interface, parameters)
     reversible, end = stepper.interface.time_transformation is not None, t + length
     start = partial(stepper.start, q, p, t=t, t_end=end if reversible else None, options=options)

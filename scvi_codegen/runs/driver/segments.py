@@ -410,7 +410,7 @@ def breakpoints_until(t: float, t_end: float, inputs: Mapping[str, Input]) -> li
 
 def final_time(t: float, h: float | None, steps: int | None, t_end: float | None) -> float:
     """Return the final time of a run, given by t_end or by h and steps."""
-    t = checked_number(t, "the time t")
+    t = checked_number(t, "t")
     if t_end is not None:
         return checked_number(t_end, "t_end")
     return float(times_after(t, checked_step(cast(float, h)), checked_count(steps, "steps", least=0))[0])

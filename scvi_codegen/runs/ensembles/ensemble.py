@@ -158,10 +158,9 @@ class EnsembleSettings:
                 "precision='double-double' for more digits"
             )
         require(stepper, "single")
-        further = {"adaptive": True if self.h is None else None, "error": self.error, "t_eval": self.t_eval}
+        further = {"precision='single'": True, "adaptive": True if self.h is None else None, "error": self.error}
         further |= {"events": self.records_events(stepper) or None, "action": stepper.sums_action or None}
-        further["observe_ensemble"] = self.observe
-        check_together(**{"precision='single'": True}, **further)
+        check_together(**further, t_eval=self.t_eval, observe_ensemble=self.observe)
         if self.inputs is not None and stepper.interface.constraints:
             raise StateError("precision='single' is not available with inputs and constraints: omit precision")
         if stepper._variants[Lanes("single")] is None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.codegen.native.compilers import check_flags
+from scvi_codegen.codegen.options import check_agreement
 from scvi_codegen.common.atomic import sync_folder
 from scvi_codegen.common.errors import EventError, RecordingError, RecordingWarning, StateError, StepFailedError, warn
 from scvi_codegen.common.validation import REAL, checked_count, checks_arguments, of
@@ -362,8 +363,7 @@ def _checked_steps(run: Run, steps: int | None) -> int | None:
     """Return the number of fixed steps; ``None`` for adaptive steps."""
     if isinstance(run.plan, FixedSteps):
         return checked_count(steps, "steps", least=0)
-    if steps is not None:
-        raise StateError(f"adaptive steps end at t_end={run.plan.t_end:g}: omit steps={steps}")
+    check_agreement({"steps": steps})
     return None
 
 

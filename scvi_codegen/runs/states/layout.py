@@ -129,7 +129,7 @@ class StateLayout:
                 f"states must have shape (n, {self.dimension}), not q {positions.shape} and {name} {moving.shape}"
             )
         count = positions.size // self.dimension
-        times = real_array(t, "the time t")
+        times = real_array(t, "t")
         if not np.isfinite(times).all():
             raise StateError("the time t must be finite")
         if times.shape not in ((), (count,)):
@@ -188,7 +188,7 @@ class StateLayout:
 
     def time(self, t: Any) -> float:
         """Return a finite time."""
-        return checked_number(t, "the time t")
+        return checked_number(t, "t")
 
     def number(self, value: Any, name: str) -> tuple[float, float]:
         """Return the high and the low word of a finite number."""
@@ -348,7 +348,7 @@ class TwoWordLayout(StateLayout):
 
     def rows(self, q: States, other: States, t: ArrayLike, name: str = "p") -> tuple[Array, Array, Array]:
         """Return times and states of two words."""
-        words = [split(values, label) for values, label in ((q, "q"), (other, name), (t, "the time t"))]
+        words = [split(values, label) for values, label in ((q, "q"), (other, name), (t, "t"))]
         high, low = (self.of_doubles.rows(part[0], part[1], part[2], name) for part in zip(*words, strict=True))
         times, positions, moving = map(with_low, high, low)
         return times, positions, moving
@@ -384,7 +384,7 @@ class TwoWordLayout(StateLayout):
 
     def time(self, t: Any) -> float:
         """Return both words of a finite time."""
-        return super().time(t) if type(t) is float else word(*two_words(t, "the time t"))
+        return super().time(t) if type(t) is float else word(*two_words(t, "t"))
 
     def number(self, value: Any, name: str) -> tuple[float, float]:
         """Return both words of a finite number."""

@@ -43,7 +43,7 @@ def steps_to(t: float | Fraction, t_end: float, h: float, *, exactly: bool = Fal
 
     ``exactly``: without an allowance for the rounding of h.
     """
-    span = (checked_number(t_end, "t_end") - checked_number(t, "the time t")) / checked_step(h)
+    span = (checked_number(t_end, "t_end") - checked_number(t, "t")) / checked_step(h)
     if span < 0.0:
         raise StateError(f"h = {h:g} has the wrong sign for a run from t = {t:g} to t_end = {t_end:g}: use h = {-h:g}")
     if not span <= MOST_STEPS:

@@ -150,7 +150,7 @@ class Integrator(LinearisedMethod):
         state = *self._states.pair(q, p), self._parameters(parameters)
         q1, p1, values = *np.empty((2, self.dimension)), np.empty(len(self.interface.exchange_names) + 1)
         name = "work_and_impulses"
-        t = checked_number(t, "the time t")
+        t = checked_number(t, "t")
         self._solve(self.binding.with_function(name), name, t, h, state, options, (q1, p1, values))
         return q1, p1, values[:-1]
 
@@ -182,6 +182,6 @@ class Integrator(LinearisedMethod):
         ends = self._states.vector(q0, "q0"), self._states.vector(q1, "q1"), self._parameters(parameters)
         p0, p1, action = *np.empty((2, self.dimension)), np.empty(1)
         binding = self.binding.with_function("discrete_legendre")
-        t = checked_number(t, "the time t")
+        t = checked_number(t, "t")
         self._solve(binding, "discrete_legendre", t, h, ends, options, (p0, p1, action))
         return p0, p1, float(action[0])

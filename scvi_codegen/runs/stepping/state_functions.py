@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.codegen.native.options import REASONS
+from scvi_codegen.codegen.options import OPTION, VELOCITY, excluding, lacking
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.runs.states.validation import Array, Parameters, States, coordinate_shapes
 from scvi_codegen.runs.states.words import by_name, low_words, product_of, quotient_of, scalar, sum_of, unnamed
@@ -34,7 +35,7 @@ def undefined_energy(q: Array, p: Array) -> StateError:
 
 def neither_or_both(p: States | None) -> StateError:
     """Return the error for a state with neither momenta nor velocities, or with both."""
-    return StateError(f"give either p or velocity with q; got {'neither' if p is None else 'both'}")
+    return StateError(lacking(VELOCITY) if p is None else excluding(OPTION["p"], OPTION["velocity"]))
 
 
 class StateFunctions(CompiledMethod):

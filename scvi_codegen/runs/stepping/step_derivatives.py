@@ -263,7 +263,7 @@ class LinearisedMethod(StateFunctions):
         initial state.
         """
         q0, p0 = self._states.pair(q, p)
-        starts = Starts.chain(q0, p0, np.array([checked_number(t, "the time t")]), np.array([checked_step(h)]))
+        starts = Starts.chain(q0, p0, np.array([checked_number(t, "t")]), np.array([checked_step(h)]))
         check_step_given(self.interface, parameters)
         values = self._parameters_at(q0, p0, parameters)
         vectors, size = np.zeros((2, len(seeds), self._input_size)), seeds.shape[1]

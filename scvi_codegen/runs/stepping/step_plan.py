@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.codegen.native.arguments import checked_number
-from scvi_codegen.codegen.options import OPTION, check_agreement, checked_step, in_words
+from scvi_codegen.codegen.options import DURATION, OPTION, check_agreement, checked_step, in_words, lacking
 from scvi_codegen.codegen.rendering.source import Interface
 from scvi_codegen.common.errors import AccuracyWarning, StateError, closest, warn
 from scvi_codegen.runs.states.times import steps_to, steps_within, times_after
@@ -354,12 +354,12 @@ def planned_steps(
         return plan, None
     if t_end is None:
         if steps is None:
-            raise StateError("h requires steps or t_end (fixed step size); give t_end without h for adaptive steps")
+            raise StateError(lacking(DURATION))
         return plan, OPTION["steps"].checked(steps)
     count = None if kind.in_tau else steps_to(t, t_end, plan.h, exactly=kind.words > 1)
     if count is not None and count % OPTION["save_every"].checked(save_every) == 0:
         return plan, count
     end = checked_number(t_end, "t_end")
-    if (end - checked_number(t, "the time t")) * plan.h < 0.0:
+    if (end - checked_number(t, "t")) * plan.h < 0.0:
         raise StateError(f"h = {plan.h:g} has the wrong sign for a run from t = {t:g} to t_end = {end:g}")
     return Until(plan.h, end), None

@@ -188,7 +188,7 @@ def _check_kind(model: Model, requested: dict[str, float | None], *, in_ensemble
         name: value for name, value in requested.items() if value is not None
     }
     if model.system.inputs:
-        check_available(values, WITH_INPUTS, rows=ROWS)
+        check_available(values, WITH_INPUTS, ROWS)
     if not in_ensemble:
         model._check_alone()
     elif model.has_time_transformation:
@@ -196,9 +196,9 @@ def _check_kind(model: Model, requested: dict[str, float | None], *, in_ensemble
             "--ensemble is not available with a time transformation: each trajectory has its own times"
         )
     else:
-        check_available(values, IN_ENSEMBLE, rows=ROWS)
+        check_available(values, IN_ENSEMBLE, ROWS)
     if recorded:
-        check_available(values, "for a run recorded in a folder", rows=ROWS)
+        check_available(values, "for a run recorded in a folder", ROWS)
         if model.system.inputs:
             raise click.UsageError("a run with inputs cannot be recorded in a folder: write it to a file (-o NAME.npz)")
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sympy import Expr
 
 from scvi_codegen.codegen.native.arguments import real_array
-from scvi_codegen.codegen.options import OPTION, check_agreement
+from scvi_codegen.codegen.options import OPTION
 from scvi_codegen.common.atomic import inside, read_text
 from scvi_codegen.common.errors import ExpressionError, ModelFileError
 from scvi_codegen.common.registry import part
@@ -65,7 +65,6 @@ def read_values(
 ) -> tuple[MechanicalSystem, dict[str, Any]]:
     """Return the system with the values of its parameters, and the fields of a model for state, arrays and tables."""
     section = document["initial"]
-    check_agreement({field: section.get(key) for key, field in STATE.items()}, ModelFileError)
     time = {"t": OPTION["t"].checked(section.get("t", 0.0), ModelFileError)}
     entries = _parameter_entries(document.get("parameters", {}), system)
     if isinstance(system, ArraySystem):
