@@ -229,11 +229,12 @@ int NAME(call_pieces)(NAME(call) *c, long long count, const double *t, const dou
 #define HAS_CURVES
 #endif
 
-/* Abscissae of the points at which a run keeps forces or velocities of the last step; returns their number, 0: none. */
+/* Abscissae of the points at which a run keeps forces or velocities of the last step, unless NULL; returns their number,
+ * 0: none. */
 int NAME(call_abscissae)(double *abscissae)
 {
 #ifdef HAS_CURVES
-  for (int j = 0; j < KEPT; j++)
+  for (int j = 0; abscissae && j < KEPT; j++)
     abscissae[j] = VECTOR_ENTRY(ABSCISSA, j);
   return KEPT;
 #else

@@ -10,6 +10,7 @@ from notation import lagrange
 import scvi_codegen as sc
 from scvi_codegen.codegen.lowering.program import lower
 from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.runs.stepping.step_derivatives import LinearisedMethod
 
 COUNT = 9
 
@@ -58,6 +59,21 @@ def test_linear_chain(degree, h):
         expected = exact_step(system, stepper, h, degree) @ np.concatenate([q, p])
     assert np.hstack([run.q[-1], run.p[-1]]) == pytest.approx(expected, abs=2e-13)
     assert run.iterations.max() <= 3
+
+
+@pytest.mark.rotated
+def test_errors_of_fast_vibrations_are_transported_by_iterations(monkeypatch):
+    """Steps of up to 7 rad: as large as the differences from the exact motion, without differences of steps."""
+    monkeypatch.setattr(LinearisedMethod, "_transport_by_differences", None)
+    system, h, steps = ring(), 3.0, 12
+    stepper, state = sc.compile_stepper(system, "svi:8"), np.concatenate(start())
+    run = stepper.integrate(*start(), h=h, steps=steps)
+    with mp.workdps(40):
+        step = exact_step(system, stepper, h / 64, 8)
+        flow = np.array((mp.matrix(step.tolist()) ** (64 * steps)).tolist(), dtype=float)
+    true = np.hstack([run.q[-1], run.p[-1]]) - flow @ state
+    assert np.hstack([run.error.q[-1], run.error.p[-1]]) == pytest.approx(true, abs=1e-2 * np.abs(true).max())
+    assert np.abs(true).max() > 1e-9
 
 
 @pytest.mark.parametrize(

@@ -17,14 +17,7 @@ from numpy.typing import NDArray
 from scvi_codegen.codegen.options import OPTION, check_agreement
 from scvi_codegen.common.errors import AccuracyWarning, ScviCodegenError, StateError, StepFailedError, warn
 from scvi_codegen.runs.accuracy.narrow_forces import differences_in_pieces, longest_piece
-from scvi_codegen.runs.accuracy.run_error import (
-    DEVIATIONS,
-    LOST,
-    ROUNDINGS,
-    RunError,
-    leave_out_rounding,
-    relative_until,
-)
+from scvi_codegen.runs.accuracy.run_error import DEVIATIONS, LOST, ROUNDINGS, RunError, leave_out_rounding
 from scvi_codegen.runs.accuracy.size import relative, roundoff
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
 
@@ -315,7 +308,7 @@ class Runs:
             if met.all():
                 break
             rows = int(np.argmin(met))
-            relative = relative_until(error, rows)[1] if rows else relative
+            relative = error.relative_until(rows)[1] if rows else relative
         return float(error.t[max(rows - 1, 0)])
 
     def _passes_over_forces(self, run: Any) -> bool:

@@ -111,7 +111,8 @@ class RunError:
 
     def relative_until(self, rows: int) -> tuple[Array, Array]:
         """Return (2, m) sizes of the first ``rows`` states and (rows,) running maxima of relative errors."""
-        return relative_until(self, rows)
+        bounds = np.array([part[:rows].T for part in self.bounds])
+        return _relative(self._run, bounds, self.reason, self.proportional)
 
     def roundings(self, sizes: Array) -> Array:
         """Return the (n,) largest bounds of rounding errors relative to (2, m) sizes, 0 where they are unknown."""
@@ -177,7 +178,7 @@ class WithErrors:
     def error(self: Any) -> RunError:
         """Global errors of states since :attr:`initial`, with their signs (:class:`RunError`), made at first access.
 
-        One step of a finer method and products with the Jacobian of the step for each step, about six times the cost
+        One step of a finer method and products with the Jacobian of the step for each step, about five times the cost
         of the run and 0.3 ms, more with constraints; a finer method is compiled once.
         docs/steps.md lists which runs have signs, which are compared with a finer run, and which are refused.
 
@@ -273,14 +274,8 @@ def _described(run: Any, errors: Array, rounding: Array, **others: Any) -> RunEr
     )
 
 
-def relative_until(error: RunError, rows: int) -> tuple[Array, Array]:
-    """Return (2, m) sizes of the motion in the first ``rows`` states and (rows,) running maxima of relative errors."""
-    bounds = np.array([part[:rows].T for part in error.bounds])
-    return _relative(error._run, bounds, error.reason, error.proportional)
-
-
 def _relative(run: Any, bounds: Array, reason: str, proportional: int) -> tuple[Array, Array]:
-    """Return the same for (2, m, n) bounds of the errors of the first n states, NaN where they are unknown."""
+    """Return sizes and running maxima for (2, m, n) bounds of the errors of n states, NaN where they are unknown."""
     largest, last = bounds.max(axis=2), bounds.shape[2]
     if np.isnan(largest).any():
         is_known = ~np.isnan(bounds).any(axis=(0, 1))

@@ -23,9 +23,6 @@ from scvi_codegen.common.representation import summary
 from scvi_codegen.runs.states.validation import Array, Parameters, check_step_given
 from scvi_codegen.runs.stepping.state_functions import StateFunctions
 
-MOST_POINTS = 64
-"""Number of points of a step, at most."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sensitivity:
@@ -345,8 +342,10 @@ class LinearisedMethod(StateFunctions):
     @cached_property
     def _abscissae(self) -> Array:
         """(k,) abscissae of the points at which steps keep forces or velocities; k = 0: none."""
-        abscissae = np.empty(MOST_POINTS)
-        return abscissae[: self.binding.function("call_abscissae")(self.binding.pointer(abscissae))]
+        store = self.binding.function("call_abscissae")
+        abscissae = np.empty(store(self.binding.null))
+        store(self.binding.pointer(abscissae))
+        return abscissae
 
     def _transport_by_differences(
         self,
