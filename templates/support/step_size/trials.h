@@ -117,6 +117,11 @@ static inline real estimate(const run_memory *run, const trial *now, real least)
 #define HOT static
 #define AMPLIFIED 1e-14 /* last update beyond which unknowns do not resolve errors in two words */
 #define SHORT_STEPS_FAIL 0
+
+/* Returns 1 if the error grows as expected from that of a step shorter by `up` levels: that of fast vibrations, which
+ * longer steps leave unresolved, does not. */
+#define RISES(error, shorter, up) \
+  ((error) > error_at(shorter, (up) / 2) && (error) < error_at(shorter, (up) + (up) / 2 + 1))
 #define LEVELS_INSIDE 0 /* no predictor from a rejected step */
 
 /* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
@@ -147,6 +152,7 @@ static real attempt(run_memory *run, trial *now, real least, const solver_option
 #define LEVELS_INSIDE INSIDE
 #endif
 #define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */
+#define RISES(error, shorter, up) ((error) > (shorter)) /* rounding errors do not */
 
 #ifdef COSTLY_POINTS
 /* Table by Lagrange's formula, from the curve of a step to the points of another one, which begins at `begin` and takes
@@ -450,10 +456,10 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
   }
   while (!now->last && up > 0) {
     const int failed = !(now->error < INFINITY), small = now->error <= now->limits.most;
-    const int rises = failed ? !SHORT_STEPS_FAIL : now->error > shorter;
+    const int rises = failed ? !SHORT_STEPS_FAIL : RISES(now->error, shorter, up);
     found = found || small;
     up = small ? levels_up(run, now) : 0;
-    if (up > 0 && up < LEVELS_PER_BINADE) /* a further trial takes as long as a step */
+    if (SHORT_STEPS_FAIL && up > 0 && up < LEVELS_PER_BINADE) /* a further trial takes as long as a step */
       return;
     if (up == 0)
       up = found && rises ? 0 : levels_within(run, now, MOST_UP);
