@@ -304,7 +304,8 @@ def check_agreement(
         partly: others may be given elsewhere, by a file that flags supplement, so that an absent step size says
             nothing about the kind of the steps.
     """
-    given = [row for name, row in rows.items() if values.get(name) is not None]
+    named = {name for name, value in values.items() if value is not None}
+    given = [row for name, row in rows.items() if name in named]
     for first, second in combinations(given, 2):
         if first.determines and first.determines == second.determines:
             raise error(excluding(first, second))

@@ -148,9 +148,8 @@ def time_rescaling_function(system: MechanicalSystem, g: str | Expr, *, in_time:
         )
     if isinstance(g, str) and g in TIME_RESCALINGS:
         return TIME_RESCALINGS[g](system)
-    driven = input_formulas(system.inputs, system.time) if in_time else {}
-    time = (system.time, *driven) if in_time else ()
-    symbols = {symbol.name: symbol for symbol in (*system.coordinates, *system.auxiliaries, *system.parameters, *time)}
+    driven = {system.time: system.time, **input_formulas(system.inputs, system.time)} if in_time else {}
+    symbols = {free.name: free for free in (*system.coordinates, *system.auxiliaries, *system.parameters, *driven)}
     names = RotationNames(system.rotations)
     readable = symbols | names.symbols
     if isinstance(g, Expr):

@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -200,14 +201,14 @@ class Family:
         ``bifurcations`` are the numbers of the orbits before them, ``kinds`` their kinds. Further arrays are those that
         :meth:`load` needs.
         """
-        names, continuation = (*OF_ORBITS, "energy", "multipliers", "stable"), self._continuation
-        arrays: dict[str, Any] = {name: np.array([getattr(orbit, name) for orbit in self.orbits]) for name in names}
-        for name in ("signed", "bounds", "reason"):
-            arrays[f"{name}_errors"] = np.array([getattr(orbit.errors, name) for orbit in self.orbits])
+        columns = {name: name for name in (*OF_ORBITS, "energy", "multipliers", "stable")}
+        columns |= {f"{name}_errors": f"errors.{name}" for name in ("signed", "bounds", "reason")}
+        arrays: dict[str, Any] = {key: np.array([*map(attrgetter(x), self.orbits)]) for key, x in columns.items()}
+        continuation = self._continuation
         arrays["ends"] = np.concatenate([orbit.sequence.ends for orbit in self.orbits])
         arrays["tolerance"] = np.array([orbit.sequence.tolerance for orbit in self.orbits], dtype=float)
-        arrays["bifurcations"] = np.array([bifurcation.after for bifurcation in self.bifurcations], dtype=np.intp)
-        arrays["kinds"] = np.array([bifurcation.kind for bifurcation in self.bifurcations], dtype=np.str_)
+        arrays["bifurcations"] = np.array([*map(attrgetter("after"), self.bifurcations)], dtype=np.intp)
+        arrays["kinds"] = np.array([*map(attrgetter("kind"), self.bifurcations)], dtype=np.str_)
         points = [self._first, self._last, *(bifurcation._at for bifurcation in self.bifurcations)]
         arrays["points"] = np.array([[point.y, continuation.change_along(point)] for point in points])
         options, period, reversor = continuation.search.options, continuation.period_of, continuation.search.reversor

@@ -5,10 +5,10 @@ entries of ``q`` add up to 0 identically (Noether); so the cost of the proof doe
 coordinates.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from sympy import Expr, S
 
@@ -43,16 +43,17 @@ def _forces(system: ArraySystem) -> Iterator[ArrayForce]:
 def _maps(system: ArraySystem, array: Array) -> Iterator[ArrayMap]:
     last, forces = array.axes[-1] if array.axes else Size("", 0), list(_forces(system))
     components: Sequence[int | None] = range(last.number) if array.axes and not last.name else [None]
-    for component in components:
-        if all(sums_to_zero(_shift(force, array, component)) for force in forces):
-            yield ArrayMap(array.name, component)
-    if system.momenta and all(sums_to_zero(_phase(system, force, array)) for force in forces):
+
+    def vanishes(work: Callable[..., list[Expr]], **direction: Any) -> bool:
+        return all(sums_to_zero(work(force=force, array=array, **direction)) for force in forces)
+
+    yield from (ArrayMap(array.name, component) for component in components if vanishes(_shift, component=component))
+    if system.momenta and vanishes(_phase, system=system):
         yield ArrayMap(array.name, None, phase=True)
     if not last.name and last.number <= MAX_ROTATED_COMPONENTS:
-        for a, b in combinations(range(last.number), 2):
-            turned = all(sums_to_zero(_turn(system, force, array, (a, b))) for force in forces)
-            if turned and _same_masses(system, array, a, b):
-                yield ArrayMap(array.name, a, b)
+        for plane in combinations(range(last.number), 2):
+            if vanishes(_turn, system=system, plane=plane) and _same_masses(system, array, *plane):
+                yield ArrayMap(array.name, *plane)
 
 
 def _component(access: Access, array: Array, component: int | None) -> bool:

@@ -398,7 +398,7 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
                     "as an array of parameters"
                 )
             for array in self.coordinates:
-                if len(array.axes) > 1 and any(not axis.name for axis in array.axes[:-1]):
+                if not all(axis.name for axis in array.axes[:-1]):
                     raise SizesRequiredError(f"of the axes of {array} only the last may be a number: name the others")
         except SizesRequiredError as error:
             raise SizesRequiredError(f"{error}. This concerns '{self.name}': {SIZES_REQUIRED}") from error

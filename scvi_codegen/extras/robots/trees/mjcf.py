@@ -215,16 +215,16 @@ class _MujocoModel:
         """Yield the pairs of geoms of different bodies that may touch, in MuJoCo's rules."""
         if self.disabled & {"contact", "constraint"}:
             return
-        sections = self.root.children("contact")
+        stated = [element for section in self.root.children("contact") for element in section.children()]
         written = set[tuple[int, ...]]()
-        for pair in (pair for section in sections for pair in section.children("pair")):
+        for pair in (element for element in stated if element.tag == "pair"):
             first, second = sorted(self.place(pair, key)[0] for key in ("geom1", "geom2"))
             written.add((first, second))
             yield Pair.of_element(pair, self.geoms[first], self.geoms[second])
         excluded = {
-            frozenset(self.place(exclusion, key)[0] for key in ("body1", "body2"))
-            for section in sections
-            for exclusion in section.children("exclude")
+            frozenset(self.place(element, key)[0] for key in ("body1", "body2"))
+            for element in stated
+            if element.tag == "exclude"
         }
         near = set() if "filterparent" in self.disabled else {*self.parents.items()}
         shapes = [(k, geom.link, self.carriers[geom.link], *geom.types) for k, geom in enumerate(self.geoms)]
