@@ -30,7 +30,7 @@ def stepper():
     [
         *(("integrate", {"h": 0.05, "steps": steps}, 40) for steps in (1, 900)),
         *(("integrate", {"t_end": t_end, "tolerance": 1e-10}, 62) for t_end in (0.05, 200.0)),
-        ("integrate_ensemble", FIXED, 360),
+        ("integrate_ensemble", FIXED, 370),
     ],
 )
 @pytest.mark.parametrize("moving", ["p", "velocity"])
