@@ -21,8 +21,8 @@ from benchmarks.contenders.arrays import by_hand
 from benchmarks.contenders.ours import momenta_of
 from benchmarks.report import ResultTable
 from benchmarks.settings import Plan, ReportActivity
+from scvi_codegen.codegen.ir.variants import SUMS
 from scvi_codegen.codegen.native.building import PORTABLE_FLAGS, TUNED_FLAGS
-from scvi_codegen.codegen.variants import SUMS
 from scvi_codegen.common.errors import StepFailedError
 from scvi_codegen.extras.fields.system import FieldSystem
 from scvi_codegen.runs.compiler import compile_stepper

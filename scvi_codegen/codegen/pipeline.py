@@ -32,6 +32,18 @@ from sympy import Expr
 from scvi_codegen.codegen.ir.derivatives import PointDerivatives
 from scvi_codegen.codegen.ir.equations import Control
 from scvi_codegen.codegen.ir.program import ArrayProgram, Program
+from scvi_codegen.codegen.ir.variants import (
+    Acting,
+    Crossings,
+    Derivatives,
+    Energies,
+    Lanes,
+    NewtonFallback,
+    Observing,
+    Sums,
+    TangentVectors,
+    Variant,
+)
 from scvi_codegen.codegen.lowering.arrays import check_solver
 from scvi_codegen.codegen.lowering.bath import heat_bath_of
 from scvi_codegen.codegen.lowering.control import control_of, error_growth_of
@@ -57,18 +69,6 @@ from scvi_codegen.codegen.rendering.program_source import (
     workspace_size,
 )
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE, ArrayLayout, Interface, Source
-from scvi_codegen.codegen.variants import (
-    Acting,
-    Crossings,
-    Derivatives,
-    Energies,
-    Lanes,
-    NewtonFallback,
-    Observing,
-    Sums,
-    TangentVectors,
-    Variant,
-)
 from scvi_codegen.common.collection import without_collection
 from scvi_codegen.common.errors import MethodError, SizesRequiredError, SystemDefinitionError
 from scvi_codegen.common.validation import checks_arguments

@@ -9,10 +9,10 @@ from typing import Any, Self, TypeVar, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from scvi_codegen.codegen.ir.variants import Variant
 from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.native.binding import Binding, with_calls
 from scvi_codegen.codegen.rendering.source import Source
-from scvi_codegen.codegen.variants import Variant
 from scvi_codegen.common.errors import MethodError
 from scvi_codegen.common.once import Once
 from scvi_codegen.runs.forwarding import Forwarded

@@ -23,11 +23,11 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
 
+from scvi_codegen.codegen.ir.variants import Derivatives, Sums, Variant
 from scvi_codegen.codegen.native.building import TUNED_FLAGS
 from scvi_codegen.codegen.native.compilers import REORDERING_FLAGS
-from scvi_codegen.codegen.options import OPTION
+from scvi_codegen.codegen.native.option_table import OPTION
 from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE, Interface, Source
-from scvi_codegen.codegen.variants import Derivatives, Sums, Variant
 from scvi_codegen.common.cache import cached_source, key_of
 from scvi_codegen.common.errors import MethodError, MethodWarning, SizesRequiredError
 from scvi_codegen.common.once import Once

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from scvi_codegen.codegen.ir.variants import TangentVectors
 from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.native.announcements import tell
 from scvi_codegen.codegen.native.binding import Binding
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import Source
-from scvi_codegen.codegen.variants import TangentVectors
 from scvi_codegen.common.representation import with_uncertainty
 from scvi_codegen.common.thread_pool import run_jobs
 from scvi_codegen.runs.accuracy.global_error import warn_of_unconfirmed

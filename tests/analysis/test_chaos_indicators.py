@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 
 import scvi_codegen as sc
-from scvi_codegen.codegen.variants import TangentVectors
+from scvi_codegen.codegen.ir.variants import TangentVectors
 from scvi_codegen.extras.chaos.indicators import SERIES, InitialTangents
 
 pytestmark = pytest.mark.rotated

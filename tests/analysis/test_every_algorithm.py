@@ -12,10 +12,10 @@ from certified_cases import CASES
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
+from scvi_codegen.codegen.ir.variants import Derivatives, Lanes
 from scvi_codegen.codegen.lowering.arrays import one_coordinate
 from scvi_codegen.codegen.pipeline import ArraySources, Sources
 from scvi_codegen.codegen.rendering.preprocessor import preprocessed
-from scvi_codegen.codegen.variants import Derivatives, Lanes
 from scvi_codegen.common.cache import template_folder
 from scvi_codegen.extras.verification import Outcome
 from scvi_codegen.systems.arrays.system import ArraySystem

@@ -15,9 +15,9 @@ from notation import lagrange
 from programs import needs
 
 import scvi_codegen as sc
+from scvi_codegen.codegen.ir.variants import Acting, Derivatives, Energies, Lanes, NewtonFallback, TangentVectors
 from scvi_codegen.codegen.pipeline import Sources
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE, Source
-from scvi_codegen.codegen.variants import Acting, Derivatives, Energies, Lanes, NewtonFallback, TangentVectors
 from scvi_codegen.common.errors import ScviCodegenError
 from scvi_codegen.methods import sliding
 from scvi_codegen.systems.contacts.modes import bound_contacts

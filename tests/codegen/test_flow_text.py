@@ -5,8 +5,8 @@ from samples import linkage, pumped_cart_pole, two_rods
 from strict_c import check_strict
 
 from scvi_codegen import SCVI, SVI, Gauss, SpectralCollocation, StoermerVerlet, problem
+from scvi_codegen.codegen.ir.variants import Derivatives
 from scvi_codegen.codegen.pipeline import Sources
-from scvi_codegen.codegen.variants import Derivatives
 from scvi_codegen.extras.frameworks.sources import with_casadi_flow, with_flow_of_rows, with_xla_flow
 
 CASES = {

@@ -11,7 +11,7 @@ from features import FEATURES, KINDS, SUPPORTS, Kind, refusals
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.codegen.options import in_words
+from scvi_codegen.codegen.native.option_table import in_words
 from scvi_codegen.common.errors import MissingLibraryError, ScviCodegenError
 from scvi_codegen.runs.stepping import features
 

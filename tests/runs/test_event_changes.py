@@ -15,8 +15,8 @@ from commands import error_of, invoke
 from notation import lagrange
 
 import scvi_codegen as sc
+from scvi_codegen.codegen.ir.variants import WithEvents
 from scvi_codegen.codegen.rendering.events import with_events
-from scvi_codegen.codegen.variants import WithEvents
 from scvi_codegen.extras.derivation.page.document import derivation_html
 from scvi_codegen.extras.verification.certificate import Outcome
 from scvi_codegen.extras.verification.impacts import impact_checks

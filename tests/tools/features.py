@@ -13,7 +13,7 @@ import numpy as np
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.codegen.options import in_words
+from scvi_codegen.codegen.native.option_table import in_words
 from scvi_codegen.runs.stepping import features
 
 ENDS = {"named coordinates": ("x", "y", "z"), "known sizes": ("x", "q[2]"), "run-time sizes": ("x", "q[N]")}

@@ -19,10 +19,10 @@ from golden_scenes import SCENES
 from notation import hamilton, lagrange
 
 from scvi_codegen import HamiltonianSystem, LagrangianSystem, as_method, problem, reparametrise
+from scvi_codegen.codegen.ir.variants import Derivatives, Lanes, NewtonFallback
 from scvi_codegen.codegen.native.compilers import find_compiler
 from scvi_codegen.codegen.pipeline import ArraySources, Sources, generate_source
 from scvi_codegen.codegen.rendering.source import Source
-from scvi_codegen.codegen.variants import Derivatives, Lanes, NewtonFallback
 from scvi_codegen.systems.arrays.system import ArraySystem
 from scvi_codegen.systems.system import MechanicalSystem
 

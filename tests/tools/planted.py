@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from scvi_codegen import Stepper
-from scvi_codegen.codegen.variants import WithEvents
+from scvi_codegen.codegen.ir.variants import WithEvents
 from scvi_codegen.runs.stepping.compiled_method import Variants
 
 

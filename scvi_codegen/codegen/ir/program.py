@@ -20,7 +20,7 @@ from scvi_codegen.codegen.ir.equations import (
     Splitting,
 )
 from scvi_codegen.codegen.ir.kernel import Kernel, Number, NumberTable, RolledKernel, is_divided
-from scvi_codegen.codegen.variants import Sums
+from scvi_codegen.codegen.ir.variants import Sums
 from scvi_codegen.systems.formulas.indices import Array, ArrayDeclarations, ArrayMap, Convolution
 
 LEAST_REUSED_UNKNOWNS = 32

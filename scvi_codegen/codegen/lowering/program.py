@@ -26,6 +26,7 @@ from scvi_codegen.codegen.ir.program import (
     StageCurve,
     StageEquations,
 )
+from scvi_codegen.codegen.ir.variants import Sums
 from scvi_codegen.codegen.lowering.arrays import UNSUPPORTED, check_solver_of_arrays, one_coordinate
 from scvi_codegen.codegen.lowering.constraints import constrained_steps, lowered_constraints, rattle_of
 from scvi_codegen.codegen.lowering.loops import rolled_terms
@@ -49,7 +50,6 @@ from scvi_codegen.codegen.lowering.stage_groups import (
     lowered_stage_group,
     system_kernel,
 )
-from scvi_codegen.codegen.variants import Sums
 from scvi_codegen.common.errors import MethodError, SizesRequiredError
 from scvi_codegen.common.precision import Matrix, Vector, mp
 from scvi_codegen.methods.constraints import END_VELOCITY

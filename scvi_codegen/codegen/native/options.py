@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from scvi_codegen.codegen.native.capacity import TOO_MANY_STATES
-from scvi_codegen.codegen.options import OPTION, POSITIVE
+from scvi_codegen.codegen.native.option_table import OPTION, POSITIVE
 from scvi_codegen.codegen.rendering.text import MAX_ITERATIONS, TOLERANCE
 from scvi_codegen.common.errors import StateError, StepFailedError
 

@@ -133,7 +133,7 @@ def _in_flags(message: str, arguments: Sequence[str]) -> str:
     flags = {word.partition("=")[0] for word in arguments if word.startswith("--")}
     if not flags:
         return message
-    from scvi_codegen.codegen.options import METHOD
+    from scvi_codegen.codegen.native.option_table import METHOD
     from scvi_codegen.interfaces.models.options import OPTIONS
 
     for option in reversed(OPTIONS):  # the name of a method last, whose section has other options

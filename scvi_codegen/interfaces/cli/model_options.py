@@ -10,7 +10,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
-from scvi_codegen.codegen.options import (
+from scvi_codegen.codegen.native.option_table import (
     ASSIGNMENTS,
     COUNT,
     EVENTS,

@@ -14,7 +14,7 @@ from typing import Any
 import click
 import numpy as np
 
-from scvi_codegen.codegen.options import DURATION
+from scvi_codegen.codegen.native.option_table import DURATION
 from scvi_codegen.common.errors import ModelFileError, StepFailedError
 from scvi_codegen.common.representation import counted
 from scvi_codegen.interfaces.cli.command_group import check_writable

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from scvi_codegen.codegen.options import OPTION
+from scvi_codegen.codegen.native.option_table import OPTION
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.common.errors import AccuracyWarning, StateError
 from scvi_codegen.common.registry import part

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from scvi_codegen.codegen.ir.variants import SUMS
 from scvi_codegen.codegen.lowering.arrays import check_solver
-from scvi_codegen.codegen.options import VELOCITY, check_agreement
-from scvi_codegen.codegen.variants import SUMS
+from scvi_codegen.codegen.native.option_table import VELOCITY, check_agreement
 from scvi_codegen.common.display.cards import Html, card, listed, plain
 from scvi_codegen.common.errors import ArgumentError, ModelFileError, StateError, speaking
 from scvi_codegen.common.representation import summary

@@ -1,6 +1,6 @@
 """Options of model files and commands: those of runs, and the rows of methods, systems, paths and families beside them.
 
-The table of runs, and what follows from a row, is :mod:`scvi_codegen.codegen.options`.
+The table of runs, and what follows from a row, is :mod:`scvi_codegen.codegen.native.option_table`.
 """
 
 from dataclasses import dataclass, fields
@@ -8,7 +8,7 @@ from fractions import Fraction
 from math import isfinite
 from typing import Any
 
-from scvi_codegen.codegen.options import (
+from scvi_codegen.codegen.native.option_table import (
     ADAPTIVE,
     ASSIGNMENTS,
     CHOICE,

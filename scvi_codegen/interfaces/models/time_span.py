@@ -6,8 +6,8 @@ from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from typing import Any, Self
 
+from scvi_codegen.codegen.native.option_table import DURATION, STEP_SIZE, check_agreement, in_words
 from scvi_codegen.codegen.native.options import SolverOptions
-from scvi_codegen.codegen.options import DURATION, STEP_SIZE, check_agreement, in_words
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE
 from scvi_codegen.common.errors import MethodWarning, ModelFileError, warn
 from scvi_codegen.common.validation import LARGEST_COUNT

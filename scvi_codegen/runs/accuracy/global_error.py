@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.codegen.options import OPTION, check_agreement
+from scvi_codegen.codegen.native.option_table import OPTION, check_agreement
 from scvi_codegen.common.errors import AccuracyWarning, ScviCodegenError, StateError, StepFailedError, warn
 from scvi_codegen.runs.accuracy.narrow_forces import differences_in_pieces, longest_piece
 from scvi_codegen.runs.accuracy.run_error import DEVIATIONS, LOST, ROUNDINGS, RunError, leave_out_rounding

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.codegen.variants import Derivatives
+from scvi_codegen.codegen.ir.variants import Derivatives
 from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError
 from scvi_codegen.common.representation import with_uncertainty
 from scvi_codegen.common.thread_pool import run_jobs

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from scvi_codegen.codegen.native.option_table import OPTION
 from scvi_codegen.codegen.native.options import SolverOptions
-from scvi_codegen.codegen.options import OPTION
 from scvi_codegen.common.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runs.driver.run import Run

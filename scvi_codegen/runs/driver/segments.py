@@ -15,7 +15,7 @@ import numpy as np
 
 from scvi_codegen.codegen.native.arguments import checked_number, real_array
 from scvi_codegen.codegen.native.capacity import room_for_states, too_many_states
-from scvi_codegen.codegen.options import checked_step
+from scvi_codegen.codegen.native.option_table import checked_step
 from scvi_codegen.codegen.rendering.source import Interface
 from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.common.validation import checked_count

@@ -11,10 +11,10 @@ from typing import Any, Self, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from scvi_codegen.codegen.ir.variants import Lanes
 from scvi_codegen.codegen.native.arguments import real_array
+from scvi_codegen.codegen.native.option_table import in_words
 from scvi_codegen.codegen.native.options import SolverOptions, checked_options
-from scvi_codegen.codegen.options import in_words
-from scvi_codegen.codegen.variants import Lanes
 from scvi_codegen.common.errors import MethodError, StateError, of_trajectory
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.driver.segments import (

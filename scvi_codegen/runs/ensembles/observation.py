@@ -12,9 +12,9 @@ from typing import cast
 
 import numpy as np
 
+from scvi_codegen.codegen.ir.variants import Crossings, Energies, Extremes, Observing
 from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.native.binding import Binding
-from scvi_codegen.codegen.variants import Crossings, Energies, Extremes, Observing
 from scvi_codegen.common.errors import EventError, MethodError, StateError, closest
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.integrator import Integrator

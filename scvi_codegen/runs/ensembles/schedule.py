@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native.arguments import empty_array
-from scvi_codegen.codegen.options import checked_step
+from scvi_codegen.codegen.native.option_table import checked_step
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.driver.segments import Input, Segment, planned_segments, time_after_steps
 from scvi_codegen.runs.states.times import times_after

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.codegen.ir.variants import NewtonFallback
 from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.codegen.native.compilers import check_flags, compiler_title, fingerprint
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import Interface, Source, check_interface
-from scvi_codegen.codegen.variants import NewtonFallback
 from scvi_codegen.common.atomic import read_text, regular, sync_folder, write_atomically, write_text
 from scvi_codegen.common.errors import RecordingError
 from scvi_codegen.common.once import constantly

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.codegen.native.compilers import check_flags
-from scvi_codegen.codegen.options import check_agreement
+from scvi_codegen.codegen.native.option_table import check_agreement
 from scvi_codegen.common.atomic import sync_folder
 from scvi_codegen.common.errors import EventError, RecordingError, RecordingWarning, StateError, StepFailedError, warn
 from scvi_codegen.common.validation import REAL, checked_count, checks_arguments, of

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.codegen.native.arguments import checked_number
-from scvi_codegen.codegen.options import checked_step
+from scvi_codegen.codegen.native.option_table import checked_step
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.states.words import exact_product, exact_sum

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, Self, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from scvi_codegen.codegen.ir.variants import Acting, Derivatives, Lanes, NewtonFallback, Variant, WithEvents
 from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.native.binding import Binding, with_calls
 from scvi_codegen.codegen.rendering.source import Interface, Source
-from scvi_codegen.codegen.variants import Acting, Derivatives, Lanes, NewtonFallback, Variant, WithEvents
 from scvi_codegen.common.cache import cached_source
 from scvi_codegen.common.display.cards import card, listed, plain
 from scvi_codegen.common.errors import MethodError

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
 
-from scvi_codegen.codegen.options import OPTION, in_words
-from scvi_codegen.codegen.variants import Derivatives
+from scvi_codegen.codegen.ir.variants import Derivatives
+from scvi_codegen.codegen.native.option_table import OPTION, in_words
 from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError, closest
 from scvi_codegen.systems.event import warn_of_formulas
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED

@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.codegen.native.binding import Binding
+from scvi_codegen.codegen.native.option_table import checked_step
 from scvi_codegen.codegen.native.options import SolverOptions, step_failure
-from scvi_codegen.codegen.options import checked_step
 from scvi_codegen.runs.states.validation import Array, Parameters, States, check_step_given
 from scvi_codegen.runs.stepping.features import require
 from scvi_codegen.runs.stepping.step_derivatives import LinearisedMethod

@@ -13,8 +13,8 @@ from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 
+from scvi_codegen.codegen.native.option_table import checked_step
 from scvi_codegen.codegen.native.options import SolverOptions, checked_options, step_failure
-from scvi_codegen.codegen.options import checked_step
 from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.common.validation import LARGEST_COUNT, checked_count
 from scvi_codegen.runs.states.layout import InitialData

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.codegen.options import OPTION, in_words
+from scvi_codegen.codegen.native.option_table import OPTION, in_words
 from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.runs.states.times import steps_within, times_after
 from scvi_codegen.runs.states.validation import Array, evaluation

@@ -9,8 +9,8 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from scvi_codegen.codegen.native.option_table import OPTION, VELOCITY, excluding, lacking
 from scvi_codegen.codegen.native.options import REASONS
-from scvi_codegen.codegen.options import OPTION, VELOCITY, excluding, lacking
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.runs.states.validation import Array, Parameters, States, coordinate_shapes
 from scvi_codegen.runs.states.words import by_name, low_words, product_of, quotient_of, scalar, sum_of, unnamed

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.codegen.native.arguments import checked_number, real_array
+from scvi_codegen.codegen.native.option_table import checked_step
 from scvi_codegen.codegen.native.options import NOT_CONVERGED, REASONS, STATUS, SolverOptions, step_failure
-from scvi_codegen.codegen.options import checked_step
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.runs.states.validation import Array, Parameters, check_step_given

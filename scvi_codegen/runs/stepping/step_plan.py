@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.codegen.native.arguments import checked_number
-from scvi_codegen.codegen.options import DURATION, OPTION, check_agreement, checked_step, in_words, lacking
+from scvi_codegen.codegen.native.option_table import DURATION, OPTION, check_agreement, checked_step, in_words, lacking
 from scvi_codegen.codegen.rendering.source import Interface
 from scvi_codegen.common.errors import AccuracyWarning, StateError, closest, warn
 from scvi_codegen.runs.states.times import steps_to, steps_within, times_after

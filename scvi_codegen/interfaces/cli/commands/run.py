@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from scvi_codegen.codegen.options import STEP_SIZE, check_available
+from scvi_codegen.codegen.native.option_table import STEP_SIZE, check_available
 from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE
 from scvi_codegen.common.errors import ScviCodegenError
 from scvi_codegen.common.registry import part

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import Any, Final, TypeVar
 
-from scvi_codegen.codegen.options import check_agreement
+from scvi_codegen.codegen.native.option_table import check_agreement
 from scvi_codegen.common.atomic import read_text
 from scvi_codegen.common.errors import ModelFileError, ScviCodegenError, closest
 from scvi_codegen.common.validation import FORMULA, checked_count, likely_names, synonym_hint

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sympy import Expr
 
 from scvi_codegen.codegen.native.arguments import real_array
-from scvi_codegen.codegen.options import OPTION
+from scvi_codegen.codegen.native.option_table import OPTION
 from scvi_codegen.common.atomic import inside, read_text
 from scvi_codegen.common.errors import ExpressionError, ModelFileError
 from scvi_codegen.common.registry import part

@@ -27,8 +27,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from scvi_codegen.codegen.ir.variants import WithEvents
 from scvi_codegen.codegen.rendering.source import PREFIX, SUPPORT, Contents, Interface, Source, check_interface
-from scvi_codegen.codegen.variants import WithEvents
 from scvi_codegen.common.atomic import read_text, write_text
 from scvi_codegen.common.errors import PackageError
 from scvi_codegen.common.validation import ArgumentType, checks_arguments

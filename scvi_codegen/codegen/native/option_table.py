@@ -13,9 +13,9 @@ from itertools import combinations
 from math import isfinite
 from typing import Any, NamedTuple
 
+from scvi_codegen.codegen.ir.variants import SUMS
 from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE, PRECISIONS
-from scvi_codegen.codegen.variants import SUMS
 from scvi_codegen.common.errors import FACE, ScviCodegenError, StateError
 from scvi_codegen.common.validation import LARGEST_COUNT, checked_count
 
