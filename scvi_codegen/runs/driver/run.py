@@ -240,15 +240,21 @@ def integrated(
         trajectory = run._integrated(initial, begins_by, growth, steps, output)
     else:
         run._start_from(initial, begins_by, growth)
+        run._remarks = True
         trajectory = segments.record(run, output.save_every, output.progress)
-    if segments is not None or run._remarks:
-        try:
-            if segments is None:
-                warn_of_inaccuracy(trajectory, run)
-            if growth:
-                warn_of_error_growth(run, float(trajectory.t[-1]), requested=check_growth is True)
-        except Exception as failure:  # noqa: BLE001  (the run is complete)
-            warn_of_failed_check(failure)
+    if run._remarks:
+        _warn(trajectory, run, segments, growth, check_growth is True)
     if run._rows is not None:  # large memory is freed instead
         stepper._released_runs.append(run)
     return trajectory
+
+
+def _warn(trajectory: Trajectory, run: Run, segments: Any, growth: bool, requested: bool) -> None:
+    """Issue the warnings of a run; those of inaccurate segments are issued one by one."""
+    try:
+        if segments is None:
+            warn_of_inaccuracy(trajectory, run)
+        if growth:
+            warn_of_error_growth(run, float(trajectory.t[-1]), requested=requested)
+    except Exception as failure:  # noqa: BLE001  (the run is complete)
+        warn_of_failed_check(failure)
