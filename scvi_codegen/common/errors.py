@@ -34,9 +34,9 @@ def closest(name: str, candidates: Iterable[str]) -> str:
 
 
 def warn(message: str, category: type[Warning]) -> None:
-    """Issue a warning attributed to the line that called this package, at any depth inside it."""
+    """Issue a warning attributed to the line that called this package, at any depth inside it and its decorators."""
     level, frame = 1, sys._getframe()
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == PACKAGE:
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in (PACKAGE, "contextlib"):
         level, frame = level + 1, frame.f_back
     warnings.warn(message, category, stacklevel=level)
 

@@ -35,9 +35,8 @@ ACCUMULATED = (
 )
 
 THROUGH = (
-    "the state passes the wall {function} in the step from t = {t:.17g} without an impact: it started on the "
-    "wall or was at rest there, or two impacts are closer than rounding. Start before the wall, end the run before "
-    "that time, or continue with a constraint"
+    "the state passes the wall {function} in the step from t = {t:.17g} without an impact: it was at rest there, or "
+    "two impacts are closer than rounding. End the run before that time, or let it rest by contacts=[sc.contact(..)]"
 )
 BEHIND = (
     "the run starts behind the wall {function}, which is {g:.6g} at t = {t:.17g} and must not be negative. Start in "

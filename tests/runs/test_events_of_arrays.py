@@ -1,8 +1,11 @@
 """Events of arrays of run-time sizes: a function for each element of loops, without a limit of size."""
 
+import warnings
+
 import numpy as np
 import pytest
 from notation import lagrange
+from rows_of_bodies import positions_after
 
 import scvi_codegen as sc
 from scvi_codegen.runs.events import detection
@@ -82,6 +85,29 @@ def test_impacts_pass_through_discs_that_touch(gas):
     assert np.abs(run.p["r"][-1] - v[::-1]).max() < 1e-15
     assert sorted(run.events[0].element) == [0, 1, 2]
     assert np.ptp(run.events[0].t) == 0.0
+
+
+@pytest.mark.second
+def test_random_rows_of_bodies_that_touch_approach_and_stick():
+    """Bodies that touch and approach at the start collide then; those that stick without restitution move together."""
+    text = "sum(i in 5, m[i]*x_dot[i]**2)/2"
+    system = sc.LagrangianSystem.from_text("row", ["x[5]"], text, parameters={"m[5]": [1.0] * 5, "e": 1.0})
+    stepper = sc.compile_stepper(system, "svi:2", flags=FLAGS, events=[sc.impact("x[i+1]-x[i]-1 for i in 4", "e")])
+    judged = 0
+    for case in range(120):
+        random = np.random.default_rng([94, case])
+        m, e = 10.0 ** random.uniform(-1.0, 1.0, 5), (1.0, 0.0, random.uniform(0.3, 1.0))[case % 3]
+        gaps = random.uniform(0.01, 0.5, 4) * (random.random(4) < random.choice([0.5, 1.0]))
+        x, v = np.concatenate([[0.0], np.cumsum(1.0 + gaps)]), random.normal(size=5)
+        plan = {"h": 10.0 ** random.uniform(-1.5, -0.5)} if case % 2 else {"tolerance": 1e-8}
+        right, beside = (positions_after(x + nudge * np.arange(5), v, m, e, 2.0) for nudge in (0.0, 1e-12))
+        if np.abs(right - beside).max() > 1e-9:
+            continue  # where the order of impacts counts
+        with warnings.catch_warnings(action="ignore", category=sc.EventWarning):
+            run = stepper.integrate({"x": x}, velocity={"x": v}, parameters={"m": m, "e": e}, t_end=2.0, **plan)
+        judged += run.t[-1] == 2.0  # impacts accumulate in some
+        assert run.t[-1] < 2.0 or np.abs(run.q["x"][-1] - right).max() < 1e-9
+    assert judged > 100
 
 
 @pytest.mark.second

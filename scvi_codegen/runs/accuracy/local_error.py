@@ -24,7 +24,7 @@ SUMMED: Final = 10.0
 ADAPTIVE_REMEDY: Final = ", or use adaptive steps (t_end= without h)"
 
 GROSS_ERROR: Final = 0.5
-"""Relative energy change that triggers a warning in fixed-step runs without an error estimate."""
+"""Relative energy change that triggers a warning in any run, of fixed steps without an error estimate, too."""
 
 MOST_CHECKED: Final = 1000
 """Largest number of trajectories of an ensemble whose energy is checked."""
@@ -41,7 +41,7 @@ FIXED_STEP_REMEDY: Final = (
 
 def tolerable_change(plan: Any) -> float:
     """Return the largest relative change of the energy of a run, or error of its fixed steps, without a warning."""
-    return max(TOLERABLE_ERROR, SUMMED * (getattr(plan, "tolerance", None) or 0.0))
+    return min(GROSS_ERROR, max(TOLERABLE_ERROR, SUMMED * (getattr(plan, "tolerance", None) or 0.0)))
 
 
 def warn_of_inaccuracy(trajectory: SavedStates, run: Memory, *, before: float = 0.0) -> None:

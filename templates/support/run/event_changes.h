@@ -11,13 +11,13 @@
  * continued from there: fixed steps to the end of the step, adaptive ones by a new step. Requires: impacts.h,
  * IS_CONDITIONAL, EVENTS_CONTROLLED. */
 enum {
-  CHANGE_ROUNDS = 20, /* largest number of passes over the walls of a corner */
-  CHANGES_IN_STEP = 100000, /* largest number of changes of the state in a step */
+  CHANGES_IN_STEP = 100000, /* largest number of changes of the state in a step, and of impacts in a corner */
   CHANGE_CREEPS = 64, /* largest number of successive adaptive steps in which time hardly advances */
   CHANGES_IN_WINDOW = 1000, /* number of changes whose time is compared with the mean time between changes */
   CHANGE_GAPS = 8 /* intervals between hits from which their accumulation is estimated */
 };
 
+#define CHANGE_APPROACH 8.0 /* roundings of a rate that is no approach: gaps stay within CHANGE_SAFETY for 8 impacts */
 #define CHANGE_WHOLE 1e-9 /* relative to a step: a difference of its end from t_end that is rounding */
 #define CHANGE_RATIO 1e-3 /* relative spread of the ratios of intervals that accumulate */
 #define CHANGE_PACE 1e-3 /* least time of so many changes, relative to that mean */
@@ -180,11 +180,32 @@ static int ends_mode(int event)
   return is_transition(event) || is_kink(event);
 }
 
+/* Adds a wall that a state touches and approaches where those from `first` on are crossed, or at a start. */
+static int add_met(const event_step *step, int e, long long first, const event_sample *at)
+{
+  event_crossing *crossing = step->found + *step->filled;
+  const event_crossing *const others = *step->filled > first ? step->found + first : NULL;
+  if (*step->filled == step->room || !place_crossing(step->watch, crossing, step->room))
+    return EVENT_NO_ROOM;
+  crossing->t = at->t;
+  crossing->fraction = others ? others->fraction : 0.0;
+  crossing->function = EVENT_OF(e);
+  crossing->element = e - EVENT_FIRST[EVENT_OF(e)];
+  crossing->direction = -1;
+  copy_state(crossing->q, crossing->p, others ? others->q : at->q, others ? others->p : at->p);
+#ifdef EVENT_MODES
+  memcpy(crossing->mode, step->watch->mode, BYTES(EVENT_MODES));
+#endif
+  ends_search(step->watch, crossing);
+  ++*step->filled;
+  return OK;
+}
+
 /* Changes the state at the crossings from `first` on, which have one state, then at all walls that it touches within
  * rounding and approaches, in their order, until there is none; walls that are met there are crossings, too. */
 static int change_at_crossings(const event_step *step, long long first, event_sample *at)
 {
-  int met = 1;
+  int met = 1, impacts = 0;
   const long long last = *step->filled;
   const real *const value = values_at(step, EVENT_DEGREE + 1);
   real rate, *const v = step->memory + 3 * M;
@@ -199,7 +220,7 @@ static int change_at_crossings(const event_step *step, long long first, event_sa
       TRY(status);
       TRY(check_pace(step, event));
     }
-  for (int round = 0; met; round++) {
+  while (met > 0) {
     met = 0;
     TRY(evaluate_functions(step, at, values_at(step, EVENT_DEGREE + 1)));
     if (ANY_IMPACTS)
@@ -208,33 +229,26 @@ static int change_at_crossings(const event_step *step, long long first, event_sa
       const int event = EVENT_OF(e);
       event_entries wall;
       int open = 0, known = 0;
-      if (!IS_IMPACT[event] || !step->watch->acts[event] || !may_be_touched(step, e))
+      if (!IS_IMPACT[event] || !step->watch->acts[event] || (first < last && !may_be_touched(step, e)))
         continue;
       TRY(evaluate_changes(step, e, at, v, &wall));
-      if (fabs(value[e]) <= wall.slack && wall.rate < -CHANGE_SAFETY * DBL_EPSILON * wall.size)
+      if (fabs(value[e]) <= wall.slack && wall.rate < -CHANGE_APPROACH * DBL_EPSILON * wall.size)
         TRY(conditions(e, at->t, at->q, at->p, step->parameters, &open, step->workspace));
       if (!open)
         continue;
       met = 1;
-      if (round == CHANGE_ROUNDS) {
+      if (impacts++ == CHANGES_IN_STEP) {
         step->watch->jammed = event + 1;
         return NOT_CONVERGED;
       }
-      TRY(change_state(step, e, at));
-      TRY(approach(step, at, NULL, 0.0, v, &rate));
       for (long long i = first; i < *step->filled; i++)
         known |= FUNCTION_OF(step->found + i) == e;
-      if (known)
-        continue;
-      if (*step->filled == step->room)
-        return EVENT_NO_ROOM;
-      step->found[*step->filled] = step->found[first];
-      step->found[*step->filled].function = event;
-      step->found[*step->filled].direction = -1;
-      step->found[*step->filled].element = e - EVENT_FIRST[event];
-      step->found[*step->filled].acted = 0;
-      ends_search(step->watch, step->found + *step->filled);
-      ++*step->filled;
+      if (!known)
+        TRY(add_met(step, e, first, at));
+      TRY(change_state(step, e, at));
+      if (!known)
+        note_hit(step, step->found + *step->filled - 1, at->t);
+      TRY(approach(step, at, NULL, 0.0, v, &rate));
     }
   }
   return OK;
@@ -266,6 +280,21 @@ static int check_walls(const event_step *step, const event_sample *left, const e
       return NOT_CONVERGED;
     }
   }
+  return OK;
+}
+
+/* Impacts at the start of a run, with walls that its state touches and approaches; *changes: whether there are any. */
+static int change_at_start(const event_step *step, event_sample *at, int *changes)
+{
+  const long long first = *step->filled;
+  *changes = 0;
+  TRY(check_walls(step, NULL, at));
+  TRY(change_at_crossings(step, first, at));
+  *changes = *step->filled > first;
+#ifdef EVENT_CONTACTS
+  if (*changes)
+    TRY(change_contacts(step, first, at));
+#endif
   return OK;
 }
 
@@ -411,6 +440,23 @@ static int confirm_part(const event_step *step, const event_sample *left, const 
 }
 #endif
 
+/* Sets the state of a run after a change: of an adaptive step, or of the last part of a fixed one. */
+static void end_at_change(event_run *run, const event_run *before, const event_sample *at, int ends, int adaptive)
+{
+  if (!ends) {
+    copy_run(run, before);
+    run->step += adaptive;
+    run->t_low = 0.0;
+  }
+  set_run(run, at->t, at);
+#if defined(EVENT_MODES) && EVENTS_CONTROLLED
+  if (adaptive) { /* the next step is found and compared as the first one */
+    run->error_before = 0.0;
+    run->steps_to_compare = 1;
+  }
+#endif
+}
+
 /* Searches a step of a run that was at `before`, changes the state at crossings and continues the step: one of an
  * adaptive run with `control`. */
 static int change_in_step(const event_run *before, event_run *run, event_step *step, const step_control *control,
@@ -418,6 +464,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
 {
   const int adaptive = control != NULL;
   const long long within = adaptive ? before->step + 1 : -1;
+  int starts = 0;
   real *const states = step->memory + 9 * M;
   event_sample left = {.t = before->t, .q = states, .p = states + M};
   event_sample right = {.fraction = 1.0, .t = run->t, .q = states + 2 * M, .p = states + 3 * M};
@@ -431,9 +478,18 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
   copy_state(left.q, left.p, before->q, before->p);
   copy_state(right.q, right.p, run->q, run->p);
   TRY(evaluate_functions(step, &left, values_at(step, 0)));
-  if (before->step == 0)
-    TRY(check_walls(step, NULL, &left));
-  for (int changes = 0;; changes++) {
+  if (before->step == 0 && ANY_IMPACTS)
+    TRY(change_at_start(step, &left, &starts));
+  if (starts) {
+    TRY(store_state(to, &left, 0.0, 0, within, step->report));
+    if (adaptive || step->watch->ended) {
+      end_at_change(run, before, &left, 0, adaptive);
+      return OK;
+    }
+    TRY(evaluate_functions(step, &left, values_at(step, 0)));
+    TRY(step_from_left(step, &left, length, &right));
+  }
+  for (int changes = starts;; changes++) {
     event_sample at = {.q = states + 4 * M, .p = states + 5 * M};
     real part = length;
     int acts = 0, far = 0, ends, cut = 0, status = OK;
@@ -489,9 +545,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       status = settle_crossings(step, first);
     if (status == NOT_CONVERGED && step->watch->accumulated) {
       step->watch->ended = 1; /* the start of this part is where crossings accumulate */
-      copy_run(run, before);
-      run->t_low = 0.0;
-      set_run(run, left.t, &left);
+      end_at_change(run, before, &left, 0, 0);
       return OK;
     }
     TRY(status);
@@ -551,18 +605,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     }
     step->watch->started = cut;
     if (ends || adaptive || step->watch->ended) {
-      if (!ends) {
-        copy_run(run, before);
-        run->step += adaptive;
-        run->t_low = 0.0;
-      }
-      set_run(run, at.t, &at);
-#if defined(EVENT_MODES) && EVENTS_CONTROLLED
-      if (adaptive) { /* the next step is found and compared as the first one */
-        run->error_before = 0.0;
-        run->steps_to_compare = 1;
-      }
-#endif
+      end_at_change(run, before, &at, ends, adaptive);
       return OK;
     }
     left.t = at.t;

@@ -519,6 +519,10 @@ static int search_function(const event_step *step, int e, const event_sample *le
     largest = fmax(largest, fabs(values_at(step, j)[e]));
   if (fabs(middle) > EVENT_FAR * range)
     return OK; /* far from zero */
+#ifdef EVENT_CHANGES
+  if (IS_IMPACT[EVENT_OF(e)] && step->watch->history[e].hits > 0 && largest <= step->watch->history[e].slack)
+    return OK; /* at zero since an impact without restitution */
+#endif
 #ifdef EVENT_CONTACTS
   if (is_transition(EVENT_OF(e))) {
     real *const noise = values_at(step, EVENT_DEGREE + 2) + e, rounding;

@@ -63,12 +63,14 @@ static int evaluate_changes(const event_step *step, int e, const event_sample *a
     return OK;
   wall->rate = wall->by_time;
   wall->size = fabs(wall->by_time);
+  const NAME(event_history) *const history = step->watch->history + e;
+  const real since = history->hits > 0 ? fabs(step->watch->time - history->last) : 0.0;
   wall->slack = fabs(wall->by_time * at->t);
   for (int i = 0; i < wall->count; i++) {
     const int k = wall->place[i];
     wall->rate += wall->value[i] * v[k];
     wall->size += fabs(wall->value[i] * v[k]);
-    wall->slack += fabs(wall->value[i]) * (fabs(at->q[k]) + fabs(v[k] * step->whole));
+    wall->slack += fabs(wall->value[i]) * (fabs(at->q[k]) + fabs(v[k]) * (fabs(step->whole) + since));
   }
   wall->slack *= CHANGE_SAFETY * DBL_EPSILON;
   wall->rate *= step->h < 0.0 ? -1.0 : 1.0;
