@@ -229,18 +229,18 @@ int NAME(call_pieces)(NAME(call) *c, long long count, const double *t, const dou
 #define HAS_CURVES
 #endif
 
-/* Abscissae of the points at which a run keeps forces or velocities of the last step, unless NULL; returns their number,
- * 0: none. */
-int NAME(call_abscissae)(double *abscissae)
+/* Number of the points at which a run keeps forces or velocities of the last step, and their abscissae unless NULL. */
+int NAME(call_abscissae)(double *abscissae, int *count)
 {
 #ifdef HAS_CURVES
+  *count = KEPT;
   for (int j = 0; abscissae && j < KEPT; j++)
     abscissae[j] = VECTOR_ENTRY(ABSCISSA, j);
-  return KEPT;
 #else
   (void)abscissae;
-  return 0;
+  *count = 0;
 #endif
+  return OK;
 }
 
 /* Copies these values, M of each point, of a step that the iteration solved; NaN: there are none. Returns the next. */

@@ -318,3 +318,9 @@ def test_kinds_of_runs(kind):
     assert 0.0 < error.relative[-1] < 1e-2
     assert error.lost is None
     assert not error.reason
+
+
+def test_runs_by_six_points_know_their_error():
+    """The number of points of a step is no status of C, of which 6 requires Newton's method."""
+    run = sc.compile_stepper(sc.problem("harmonic-oscillator").system, "svi:6").integrate([1.0], [0.0], h=1.0, steps=9)
+    assert run.error.q[-1, 0] == pytest.approx(run.q[-1, 0] - np.cos(run.t[-1]), rel=0.05)

@@ -45,7 +45,7 @@ CONSISTENT = (
 DEFECTS = (
     "int NAME(call_defects)(NAME(call) *call, long long count, const double *t, const double *h, const double *q, "
     "const double *p, const double *size, const double *limits, double *curves, double *defects, int *parts);\n"
-    "int NAME(call_abscissae)(double *abscissae);\n"
+    "int NAME(call_abscissae)(double *abscissae, int *count);\n"
     "int NAME(call_differences)(NAME(call) *call, long long count, const double *t, const double *h, const double *q, "
     "const double *p, const double *size, const double *defects, const int *parts, int vectors, "
     "double rounding, unsigned long long seed, const double *before, double *now, long long stride, double *errors, "

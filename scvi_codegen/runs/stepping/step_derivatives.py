@@ -342,9 +342,10 @@ class LinearisedMethod(StateFunctions):
     @cached_property
     def _abscissae(self) -> Array:
         """(k,) abscissae of the points at which steps keep forces or velocities; k = 0: none."""
-        store = self.binding.function("call_abscissae")
-        abscissae = np.empty(store(self.binding.null))
-        store(self.binding.pointer(abscissae))
+        store, count = self.binding.function("call_abscissae"), self.binding.numbers("int *")
+        store(self.binding.null, count)
+        abscissae = np.empty(count[0])
+        store(self.binding.pointer(abscissae), count)
         return abscissae
 
     def _transport_by_differences(
