@@ -2,6 +2,8 @@
  * HAS_PROJECT, HAS_SET_FALLBACK, and HAS_ and the optional fields of a run where the source has these; HAS_CONSTRAINTS
  * of named coordinates, with DEPENDENT, INPUT_PRECISION and ROUNDING_OF_INPUT (projection.py). Functions are
  * called by volatile pointers: not inlined, so that the bits of steps do not depend on these callers. */
+#include <float.h>
+#include <math.h>
 
 enum { IN_DOUBT = -1, /* status of a call; how a run begins: */
   BY_VELOCITY = 1,
@@ -134,7 +136,9 @@ static int NAME(call_remarks)(const NAME(call) *c)
   if (c->measures_growth && !(c->run->tangent_steps && c->run->growth <= c->run->growth_limit))
     return 1;
 #endif
-  return !(is_accurate && (!c->has_energies || !c->control || change <= 0.5 * c->tolerable * fmax(fabs(e[0]), fabs(e[1]))));
+  const int keeps = !c->has_energies || !c->control ||
+      change <= 0.5 * c->tolerable * fmax(fabs(e[0]), fabs(e[1]));
+  return !(is_accurate && keeps);
 }
 
 /* Starts a run, takes steps and stores states, the initial one first; returns IN_DOUBT where call_begin is. */

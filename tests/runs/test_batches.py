@@ -137,6 +137,6 @@ def test_initial_states_of_two_kinds_equal_those_of_single_runs() -> None:
 @pytest.mark.second
 def test_energies_that_change_are_reported_for_the_worst_trajectory() -> None:
     one, (q, p) = stepper("kepler"), states("kepler")
-    q[3], p[3] = (1e-3, 0.0), (0.0, 44.5)  # eccentricity .98: a loose tolerance loses the energy
+    q[3], p[3] = (1e-3, 0.0), (0.0, 44.5)  # eccentricity .98: hundreds of encounters lose the energy
     with pytest.warns(sc.AccuracyWarning, match="trajectory 3"):
-        one.integrate_ensemble(q, p, t_end=6.0, tolerance=3e-3)
+        one.integrate_ensemble(q, p, t_end=300.0, tolerance=1e-4)

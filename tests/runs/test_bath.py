@@ -405,9 +405,9 @@ def test_what_a_heat_bath_excludes_is_refused_by_name(tmp_path):
     with pytest.raises(sc.SystemDefinitionError, match="whose noise is that of one trajectory"):
         sc.variational_system(sc.LagrangianSystem.from_text("well", **WELL), 1)
     forced = compiled("svi:2", "forced", **WELL, forces={"x": "cos(t)"})
-    with pytest.raises(sc.MethodError, match="metropolis=True is not available"):
+    with pytest.raises(sc.MethodError, match="metropolis is not available"):
         forced.integrate(*state, h=0.1, steps=3, metropolis=True)
-    with pytest.raises(sc.StateError, match="seed= requires a heat bath"):
+    with pytest.raises(sc.StateError, match="seed requires a heat bath"):
         compiled("svi:2", "plain", coordinates=["x"], lagrangian="x_dot**2 - x**2").integrate(
             *state, h=0.1, steps=3, seed=1
         )
@@ -418,7 +418,7 @@ def test_what_a_heat_bath_excludes_is_refused_by_name(tmp_path):
         with pytest.raises(sc.StateError, match=r"of 'well' acts forward in time: h = -0\.1; give h > 0"):
             start(*state, h=-0.1, **{"steps": 3} if start == well.integrate else {})
     atoms = {"coordinates": ["x[N]"], "lagrangian": "sum(i in N, x_dot[i]**2/2)", "damping": 1.0, "temperature": 1.0}
-    with pytest.raises(sc.MethodError, match="metropolis=True is not available with arrays of run-time sizes"):
+    with pytest.raises(sc.MethodError, match="metropolis is not available with arrays of run-time sizes"):
         compiled("stoermer-verlet", "atoms", **atoms).integrate([1.0], [0.0], h=0.1, steps=3, metropolis=True)
     with pytest.raises(sc.MethodError, match=r"adaptive step size .* in a heat bath"):
         sc.solve_ivp(well, (0.0, 1.0), [1.0, 0.0])

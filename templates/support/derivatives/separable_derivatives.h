@@ -94,8 +94,8 @@ static inline lanes next_change(const iterated_step *at, const lanes *table, lan
 #define correct_linear_part(at, residual) (void)0
 #endif
 
-/* Moves x by the residual of its equation, or by the correction for it; adds squares of moves and sizes in the metric of
- * the masses, independent of the units of the coordinates. */
+/* Moves x by the residual of its equation, or by the correction for it; adds squares of moves and sizes in the metric
+ * of the masses, independent of the units of the coordinates. */
 static inline __attribute__((always_inline)) void improve_vector(const iterated_step *at, int back, lanes (*x0)[M],
     lanes (*f)[M], lanes (*x)[M], double *largest)
 {
