@@ -21,8 +21,7 @@ from scvi_codegen.common.thread_pool import run_jobs
 from scvi_codegen.runs.accuracy.global_error import warn_of_unconfirmed
 from scvi_codegen.runs.accuracy.local_error import warn_of_energy_errors
 from scvi_codegen.runs.accuracy.resolution import warn_of_unresolved_members
-from scvi_codegen.runs.accuracy.run_error import LOST
-from scvi_codegen.runs.accuracy.size import RESOLVED
+from scvi_codegen.runs.accuracy.size import LOST, RESOLVED
 from scvi_codegen.runs.accuracy.warning_switch import warn_of_failed_check, warnings_wanted
 from scvi_codegen.runs.derivatives.actions import actions_of_steps
 from scvi_codegen.runs.driver.segments import Input, checked_inputs, parameters_of

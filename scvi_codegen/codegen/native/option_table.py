@@ -305,18 +305,18 @@ def check_agreement(
             nothing about the kind of the steps.
     """
     named = {name for name, value in values.items() if value is not None}
-    given = [row for name, row in rows.items() if name in named]
-    for first, second in combinations(given, 2):
+    stated = [row for name, row in rows.items() if name in named]
+    for first, second in combinations(stated, 2):
         if first.determines and first.determines == second.determines:
             raise error(excluding(first, second))
-    size = next((row for row in given if row.determines == STEP_SIZE), None)
+    size = next((row for row in stated if row.determines == STEP_SIZE), None)
     fixed = size is not None and size.field == "h"
-    for row in given:
+    for row in stated:
         if row.requires == ADAPTIVE and fixed:
             raise error(in_words(f"{row} requires {ADAPTIVE}: give {{t_end}} without {{h}} and {{steps}}, or omit it"))
         if row.requires == FIXED and not fixed and not (partly and size is None):
             raise error(in_words(f"{row} requires {FIXED}: give {{h}}, or omit it and give {{t_end}}"))
-    if required and required not in {row.determines for row in given}:
+    if required and required not in {row.determines for row in stated}:
         raise error(lacking(required))
 
 

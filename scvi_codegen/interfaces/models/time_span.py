@@ -58,9 +58,9 @@ class TimeSpan(ModelOptions):
 
     def _check_time_span(self) -> None:
         """Raise :class:`ModelFileError`, naming the field, for invalid values, and convert the others."""
-        given = {row.field: value for row in RUN_FIELDS if (value := getattr(self, row.field)) is not None}
-        check_agreement(given, ModelFileError, required=DURATION, rows=ROWS)
-        for name, value in given.items():
+        stated = {row.field: value for row in RUN_FIELDS if (value := getattr(self, row.field)) is not None}
+        check_agreement(stated, ModelFileError, required=DURATION, rows=ROWS)
+        for name, value in stated.items():
             object.__setattr__(self, name, ROWS[name].checked(value, ModelFileError))
         if None not in (self.h, self.span) and not 0.0 < self.span / abs(self.h) <= LARGEST_COUNT:  # type: ignore
             backward = f"a run backward in time has {{h}} = {-abs(self.h):g} and {{t_end}} = {abs(self.span):g}"  # type: ignore

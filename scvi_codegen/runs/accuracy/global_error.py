@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scvi_codegen.codegen.native.option_table import OPTION, check_agreement
 from scvi_codegen.common.errors import AccuracyWarning, ScviCodegenError, StateError, StepFailedError, warn
 from scvi_codegen.runs.accuracy.narrow_forces import differences_in_pieces, longest_piece
-from scvi_codegen.runs.accuracy.run_error import DEVIATIONS, LOST, ROUNDINGS, RunError, leave_out_rounding
-from scvi_codegen.runs.accuracy.size import relative, roundoff
+from scvi_codegen.runs.accuracy.run_error import DEVIATIONS, ROUNDINGS, RunError, leave_out_rounding
+from scvi_codegen.runs.accuracy.size import LOST, relative, roundoff
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
 
 Array = NDArray[np.float64]

@@ -7,7 +7,7 @@ import numpy as np
 
 from scvi_codegen.common.errors import AccuracyWarning, StateError, warn
 from scvi_codegen.runs.accuracy.resolution import warn_of_unresolved_fields
-from scvi_codegen.runs.accuracy.size import RESOLVED, roundoff
+from scvi_codegen.runs.accuracy.size import LOST, RESOLVED, roundoff
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runs.results.energy import energy_reason
 from scvi_codegen.runs.results.saved_states import SavedStates
@@ -19,12 +19,12 @@ TOLERABLE_ERROR: Final = 1e-3
 """Largest relative error of a step, and largest relative change of the energy of a run, without a warning."""
 
 SUMMED: Final = 10.0
-"""Tolerances of an adaptive run by which its energy may change without a warning: errors of some steps that add up."""
+"""Tolerances of an adaptive run by which its energy may change without a warning, by judgement; at most ``LOST``."""
 
 ADAPTIVE_REMEDY: Final = ", or use adaptive steps (t_end= without h)"
 
 GROSS_ERROR: Final = 0.5
-"""Relative energy change that triggers a warning in any run, of fixed steps without an error estimate, too."""
+"""Relative energy change that triggers a warning in fixed-step runs without an error estimate."""
 
 MOST_CHECKED: Final = 1000
 """Largest number of trajectories of an ensemble whose energy is checked."""
@@ -41,7 +41,7 @@ FIXED_STEP_REMEDY: Final = (
 
 def tolerable_change(plan: Any) -> float:
     """Return the largest relative change of the energy of a run, or error of its fixed steps, without a warning."""
-    return min(GROSS_ERROR, max(TOLERABLE_ERROR, SUMMED * (getattr(plan, "tolerance", None) or 0.0)))
+    return min(LOST, max(TOLERABLE_ERROR, SUMMED * (getattr(plan, "tolerance", None) or 0.0)))
 
 
 def warn_of_inaccuracy(trajectory: SavedStates, run: Memory, *, before: float = 0.0) -> None:

@@ -30,6 +30,7 @@ from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError
 from scvi_codegen.common.representation import with_uncertainty
 from scvi_codegen.common.thread_pool import run_jobs
 from scvi_codegen.runs.accuracy.size import (
+    LOST,
     RESOLVED,
     first_of_groups,
     momenta_of_velocities,
@@ -51,8 +52,6 @@ from scvi_codegen.runs.stepping.projection import determined_coordinates, projec
 from scvi_codegen.runs.stepping.step_derivatives import Defects, Starts
 from scvi_codegen.runs.stepping.step_plan import Adaptive, absolute_tolerances, ending_at
 
-LOST = 0.1
-"""Relative error from which on a state has no meaningful digits, as terms of the order of delta^2 count."""
 SAMPLES, DEVIATIONS = 3, 6.0
 """Samples of transported rounding errors, and how many times their root mean square a bound contains.
 

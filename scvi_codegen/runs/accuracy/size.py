@@ -15,6 +15,8 @@ from scvi_codegen.common.errors import StateError
 from scvi_codegen.runs.states.rotations import members_of
 from scvi_codegen.runs.states.validation import Array, coordinate_shapes
 
+LOST = 0.1
+"""Relative error from which on a state has no meaningful digits, as squares of relative errors count."""
 RESOLVED = 64.0
 """Range in roundings of the largest value from which on a coordinate moves."""
 NOISE_OF_MOMENTA = 1e4

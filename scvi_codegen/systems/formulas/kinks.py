@@ -81,6 +81,7 @@ class Mode(sympy.Symbol):  # type: ignore[misc]
 
 
 ODD_INCREASING = (sympy.sinh, sympy.asinh, sympy.tanh, sympy.atan)
+"""Functions with the zero and the sign of their argument."""
 
 
 @lru_cache(maxsize=4096)

@@ -232,9 +232,9 @@ class ModelSection:
 
 def read_run(section: Section) -> dict[str, Any]:
     """Return the fields of a model in ``[run]``; adaptive steps without a step size."""
-    given = {option: section[option.key] for option in options_of("run") if section.get(option.key) is not None}
-    check_agreement({option.field: value for option, value in given.items()}, ModelFileError, rows=ROWS)
-    numbers = {option.field: option.checked(value, ModelFileError) for option, value in given.items()}
+    stated = {option: section[option.key] for option in options_of("run") if section.get(option.key) is not None}
+    check_agreement({option.field: value for option, value in stated.items()}, ModelFileError, rows=ROWS)
+    numbers = {option.field: option.checked(value, ModelFileError) for option, value in stated.items()}
     return {name: value for name, value in numbers.items() if name != "controller"}
 
 
