@@ -354,7 +354,7 @@ class Model(TimeSpan):
 
             require(stepper, "action")
             stepper = stepper.acting
-        return stepper.with_events(self.events) if self.events else stepper
+        return stepper.with_events(self.events)
 
     def momenta(self, stepper: Stepper) -> Array:
         """Return the (m,) initial momenta: ``p``, or the Legendre transform of the velocities."""
