@@ -221,7 +221,7 @@ class Stepper(OfSteppers, Integrator):
         if type(save_every) is not int or save_every != 1:
             save_every = checked_count(save_every, "save_every", least=1)
         stepper: Stepper = self if events is None and not action else self._for_run(events, action=action)
-        interface = self.interface
+        interface, inputs = self.interface, inputs or None
         noise = stepper._noise(seed, metropolis, inputs) if seed != 0 or metropolis else None
         if not (inputs is None and t_eval is None and observe is None and tables is None and threads is None):
             from scvi_codegen.runs.results.dense_output import check_has_end

@@ -330,14 +330,11 @@ def rank_deficiency(names: Sequence[str], q: Array, at: Jacobian, *, nearest: bo
 
     ``nearest``: first minimise the constraint residual by Gauss-Newton iteration.
     """
-    for _ in range(ITERATIONS if nearest else 0):
+    for left in range(ITERATIONS if nearest else 0, -1, -1):
         g, jacobian = at(q)
         if not (np.isfinite(g).all() and np.isfinite(jacobian).all()):
             return None
-        q = q - np.linalg.lstsq(jacobian, g, rcond=DEPENDENT)[0]
-    g, jacobian = at(q)
-    if not (np.isfinite(g).all() and np.isfinite(jacobian).all()):
-        return None
+        q = q - np.linalg.lstsq(jacobian, g, rcond=DEPENDENT)[0] if left else q
     free = tangent_space(jacobian)
     rows = np.flatnonzero(np.abs(free.conditions).max(axis=1, initial=0.0) > NAMED_SHARE).tolist()
     if not rows:
