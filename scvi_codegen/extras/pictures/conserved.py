@@ -55,8 +55,8 @@ LOWEST = 1e-16
 def plot_energy(trajectories: Motions, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
     """Draw the energy error ``|H - H_0| / |H_0|`` over time (absolute if H_0 = 0), a colour a trajectory.
 
-    Where forces, damping or contacts change the energy of the exact motion, the change E - E0 is drawn on a linear axis.
-    The title says which, and how well the balance with the work W closes if W is known.
+    Where forces, damping or contacts change the energy of the exact motion, the change E - E0 is drawn on a linear
+    axis. The title says which, and how well the balance with the work W closes if W is known.
 
     Args:
         trajectories: one or several trajectories, also of array systems.
