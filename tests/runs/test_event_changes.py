@@ -547,7 +547,9 @@ def test_derivatives_are_those_of_the_computed_run(event, method, e, tolerance):
         assert np.abs(matrix.T @ FORM @ matrix - FORM).max() < 1e-10 * size
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.rotated), pytest.param(2, marks=pytest.mark.full)])
+@pytest.mark.parametrize(
+    "seed", [0, pytest.param(1, marks=pytest.mark.rotated), pytest.param(2, marks=pytest.mark.full)]
+)
 def test_derivatives_of_maps_of_velocities_are_those_of_the_computed_run(seed):
     """Masses depend on positions; the event, too, contains a velocity."""
     c = np.random.default_rng(seed).uniform(0.1, 0.4, 4)
