@@ -34,7 +34,7 @@ def unrolled_fields(
         for array in system.fields
         for name, value in zip(names[array.name].flat, fields[array.name].flat, strict=True)
     }
-    numbers = {parameter.name: value for parameter, value in system.constants.items()}
+    numbers = system.constants_by_name
     for name, value in remaining.items():
         if name not in numbers:
             raise SystemDefinitionError(f"'{system.name}' has no parameter '{name}'{closest(name, numbers)}")
