@@ -23,7 +23,7 @@ from scvi_codegen.runs.events.refinement import search_of
 from scvi_codegen.runs.results.dense_output import states_and_steps_at, step_sizes_at, stepped_to
 from scvi_codegen.runs.results.output import Output
 from scvi_codegen.runs.results.time_transformation import part_of_step
-from scvi_codegen.runs.states.times import WHOLE
+from scvi_codegen.runs.states.times import WHOLE, number_until
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.states.words import Words, fraction_of, stacked
 from scvi_codegen.runs.stepping.chunks import drive
@@ -180,7 +180,7 @@ class AtTimes(Saver):
         after = forward * self.times >= left if chunk.is_first else forward * self.times > left
         times = self.times[after & (forward * self.times <= right)]
         q, p, stepped = states_and_steps_at(part, times)
-        before = np.searchsorted(forward * part.t, forward * times, side="right") - 1
+        before = number_until(part.t, times, forward) - 1
         unknown = np.full(len(times), np.nan)
         self.rows.append((times, q, p, step_sizes_at(part, times), stepped, chunk.iterations[before], unknown))
 
