@@ -444,7 +444,8 @@ def _description(shown: Page, interface: Interface, *, initial: bool) -> dict[st
         kind: [ranges.get(name, [-limit, limit]) for name in names_of_kind]
         for kind, names_of_kind, limit in zip("qv", (names, rates or names), limits, strict=True)
     }
-    conserved = not interface.contacts and all(e.restitution == 1.0 for e in model.events if e.changes_state)
+    changes = {event.restitution for event in model.events if event.changes_state}
+    conserved = interface.conserves_energy and not interface.contacts and changes <= {1.0}
     variables = _variables(interface, shape, len(q))
     plots = [[_variable(name, variables) for name in reversed(pair)] for pair in model.page.get("plots", ())]
     return {
@@ -452,7 +453,7 @@ def _description(shown: Page, interface: Interface, *, initial: bool) -> dict[st
         "coordinates": interface.coordinates, "rotations": _rotations(interface),
         "momenta": interface.momentum_names, "parameters": _parameter_sliders(model, interface),
         "quantities": interface.map_names,
-        "energy": {"label": "Energy", "conserved": bool(interface.conserves_energy) and conserved}, "plots": plots,
+        "energy": {"label": "Energy", "conserved": bool(conserved)}, "plots": plots,
         "causes": CAUSES, "events": [str(event.function) for event in interface.searched(model.events)],
         "from_momenta": starts_from_momenta(model), "values": len(interface.parameters),
         "initial": initial, "whole": WHOLE, "family": orbits,
