@@ -490,11 +490,7 @@ class Model(TimeSpan):
         self._check_alone()
         stepper, arguments = self.stepper(), self._run_arguments()
         if self.h is None and self.has_time_transformation and self.error is None:
-            from scvi_codegen.runs.stepping.step_plan import InTau  # not needed for reading a model
-
-            run = self.start(stepper)
-            plan = run.plan
-            arguments |= {"h": plan.tau if isinstance(plan, InTau) else run.h, "tolerance": None}
+            arguments |= {"h": self.start(stepper).plan.size, "tolerance": None}
         arguments |= {**self.initial_state(stepper), **self._common(None, threads), "parameters": self.parameters}
         trajectory: Trajectory = stepper.integrate(**arguments, progress=progress)
         return trajectory
