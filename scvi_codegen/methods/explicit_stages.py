@@ -167,8 +167,8 @@ def _rotating_group(split: KineticSplitting, durations: Vector) -> StageGroup:
     # Rows are drifts j. Columns of gathers are those of q0, V and P; columns of scatters the rows V, P and p1.
     zero_square, zero_column = Table.constant(len(drifts), len(drifts)), Table.constant(len(drifts), 1)
     earlier = Table.named("a", [[d if k < j else mp.zero for k, d in enumerate(durations)] for j in drifts])
-    own = Table.named("gamma", [[d if k == j else mp.zero for k in drifts] for j, d in enumerate(durations)])
-    minus_inverse = Table.named("r", [[-1 / d if k == j else mp.zero for k in drifts] for j, d in enumerate(durations)])
+    own = Table.named("gamma", _diagonal(durations))
+    minus_inverse = Table.named("r", _diagonal([-1 / d for d in durations]))
     to_later_and_p1 = Table.named(
         "s", [[1 / d if k > j else mp.zero for k in range(len(drifts) + 1)] for j, d in enumerate(durations)]
     )
@@ -191,6 +191,10 @@ def _rotating_group(split: KineticSplitting, durations: Vector) -> StageGroup:
         ),
         computes="Changes of q and u by the flow of the kinetic energy, less v, and u",
     )
+
+
+def _diagonal(entries: Sequence[Number]) -> list[list[Number]]:
+    return [[entry if k == j else mp.zero for k in range(len(entries))] for j, entry in enumerate(entries)]
 
 
 def _kick_group(split: KineticSplitting, step: _Step) -> StageGroup:

@@ -42,6 +42,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain
+from sys import float_info
 from typing import Any
 
 import numpy as np
@@ -340,7 +341,6 @@ def _nearly_equal(a: Matrix, b: Matrix) -> bool:
 
 EPSILON = 1e-14
 """Largest difference of tables that rounding explains."""
-FRACTION_BITS = 51
 MOST_LINEARISED, MOST_COUPLED = 8, 2
 """Largest numbers of coordinates with linearised forces; beyond, their derivatives cost more than they save: if masses
 depend on positions, and if momenta do with masses that do not."""
@@ -429,7 +429,7 @@ def weighted_tables(tables: VelocityTables) -> tuple[Matrix, Vector, Matrix, Vec
     if not tables.variational:
         ones = (mp.one,) * len(beta)
         return tables.position, ones, tables.momentum, ones
-    unit = mp.ldexp(1, FRACTION_BITS * words_of_tables())
+    unit = mp.ldexp(1, (float_info.mant_dig - 2) * words_of_tables())
     mu = tuple(tuple(mp.nint(x * unit) / unit for x in over(line, beta)) for line in tables.position)
     if tables.projection:
         return mu, beta, tuple(over(line, weights) for line in tables.momentum), weights
