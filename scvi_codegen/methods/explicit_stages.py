@@ -113,13 +113,11 @@ def _carried_out(method: Method, split: KineticSplitting) -> _Step:
             f"{method.name} computes velocities M^-1 X of sums X other than momenta, for which H = T(p) + V(q, t) of "
             f"'{split.system.name}' has no constant masses: use a method of kicks and drifts"
         )
-    for name, letter, what, remedy, exists in (
-        ("q", "V", "velocities", "q[i] += h * v[i] with v[i] = velocity(P, t)", True),
-        ("p", "F", "forces", "p[i] += h * F[i]", any(split.force)),
-    ):
-        if not {kind for kind, _ in run.values[name]} <= {letter}:
+    for name, letter, what in (("q", "V", "velocities"), ("p", "F", "forces")):
+        if {kind for kind, _ in run.values[name]} - {letter}:
             raise MethodError(f"the increment {name}[i] of {method.name} is not a sum of {what}")
-        if exists and not run.values[name]:
+    for name, remedy in {"q": "q[i] += h * v[i] with v[i] = velocity(P, t)", "p": "p[i] += h * F[i]"}.items():
+        if not run.values[name] and (name == "q" or any(split.force)):
             raise MethodError(f"the statements of {method.name} leave the increment {name}[i] 0: add {remedy}")
     return _needed(run, {Q: {0: mp.one}, **run.values["q"]}, {P: {0: mp.one}, **run.values["p"]})
 

@@ -81,7 +81,7 @@ from scvi_codegen.codegen.lowering.stage_groups import (
 from scvi_codegen.common.precision import Matrix, Vector, mp
 from scvi_codegen.methods.stage_system import Accelerations, Shape, Velocities, words_of_tables
 from scvi_codegen.methods.tables.basis import matrix_product, transpose
-from scvi_codegen.systems.derived_expressions import InverseMass, forms_of
+from scvi_codegen.systems.derived_expressions import InverseMass, dense, forms_of
 from scvi_codegen.systems.formulas.expressions import gradient_tuple, jacobian
 from scvi_codegen.systems.formulas.intermediates import inner_of
 from scvi_codegen.systems.formulas.symbols import symbol
@@ -198,10 +198,8 @@ def _is_stable(system: LagrangianSystem, entries: Mapping[tuple[int, int], Expr]
     values = dict(zip(system.parameters, system.defaults, strict=True))
     if any(entry.free_symbols - (values.keys() - inputs) for entry in entries.values()):
         return False
-    matrix = np.zeros((system.dimension, system.dimension))
-    for place, entry in entries.items():
-        matrix[place] = float(entry.xreplace(values))
-    rates = np.linalg.eigvalsh(matrix)
+    numbers = (entry.xreplace(values) for entry in entries.values())
+    rates = np.linalg.eigvalsh(dense(entries, numbers, (system.dimension, system.dimension)))
     return bool(rates[0] < 0 and rates[-1] <= ROUNDING * -rates[0])
 
 
