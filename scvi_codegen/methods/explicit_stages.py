@@ -113,13 +113,11 @@ def _carried_out(method: Method, split: KineticSplitting) -> _Step:
             f"{method.name} computes velocities M^-1 X of sums X other than momenta, for which H = T(p) + V(q, t) of "
             f"'{split.system.name}' has no constant masses: use a method of kicks and drifts"
         )
-    for name, letter, what, remedy, exists in (
-        ("q", "V", "velocities", "q[i] += h * v[i] with v[i] = velocity(P, t)", True),
-        ("p", "F", "forces", "p[i] += h * F[i]", any(split.force)),
-    ):
-        if not {kind for kind, _ in run.values[name]} <= {letter}:
+    for name, letter, what in (("q", "V", "velocities"), ("p", "F", "forces")):
+        if {kind for kind, _ in run.values[name]} - {letter}:
             raise MethodError(f"the increment {name}[i] of {method.name} is not a sum of {what}")
-        if exists and not run.values[name]:
+    for name, remedy in {"q": "q[i] += h * v[i] with v[i] = velocity(P, t)", "p": "p[i] += h * F[i]"}.items():
+        if not run.values[name] and (name == "q" or any(split.force)):
             raise MethodError(f"the statements of {method.name} leave the increment {name}[i] 0: add {remedy}")
     return _needed(run, {Q: {0: mp.one}, **run.values["q"]}, {P: {0: mp.one}, **run.values["p"]})
 
@@ -167,8 +165,8 @@ def _rotating_group(split: KineticSplitting, durations: Vector) -> StageGroup:
     # Rows are drifts j. Columns of gathers are those of q0, V and P; columns of scatters the rows V, P and p1.
     zero_square, zero_column = Table.constant(len(drifts), len(drifts)), Table.constant(len(drifts), 1)
     earlier = Table.named("a", [[d if k < j else mp.zero for k, d in enumerate(durations)] for j in drifts])
-    own = Table.named("gamma", [[d if k == j else mp.zero for k in drifts] for j, d in enumerate(durations)])
-    minus_inverse = Table.named("r", [[-1 / d if k == j else mp.zero for k in drifts] for j, d in enumerate(durations)])
+    own = Table.named("gamma", _diagonal(durations))
+    minus_inverse = Table.named("r", _diagonal([-1 / d for d in durations]))
     to_later_and_p1 = Table.named(
         "s", [[1 / d if k > j else mp.zero for k in range(len(drifts) + 1)] for j, d in enumerate(durations)]
     )
@@ -191,6 +189,10 @@ def _rotating_group(split: KineticSplitting, durations: Vector) -> StageGroup:
         ),
         computes="Changes of q and u by the flow of the kinetic energy, less v, and u",
     )
+
+
+def _diagonal(entries: Sequence[Number]) -> list[list[Number]]:
+    return [[entry if k == j else mp.zero for k in range(len(entries))] for j, entry in enumerate(entries)]
 
 
 def _kick_group(split: KineticSplitting, step: _Step) -> StageGroup:

@@ -29,9 +29,7 @@ def heat_bath_of(system: MechanicalSystem) -> HeatBath | None:
     bath, forms, v = system.bath, forms_of(system), system.velocities
     if bath is None:
         return None
-    masses = forms.legendre_jacobian or forms.mass
-    mass = {(i, j): entry for (i, j), entry in masses.items() if i >= j}
-    rayleigh = {(i, j): entry for (i, j), entry in hessian(bath.dissipation, v).items() if i >= j}
+    mass, rayleigh = map(_lower, (forms.legendre_jacobian or forms.mass, hessian(bath.dissipation, v)))
     friction = {place: bath.damping * entry for place, entry in mass.items() if bath.damping != 0}
     friction |= {place: friction.get(place, sympy.S.Zero) + entry for place, entry in rayleigh.items()}
     lengths = [Add(*(symbol(q) ** 2 for q in member.coordinates)) / 2 for member in system.rotations]
@@ -68,6 +66,11 @@ def heat_bath_of(system: MechanicalSystem) -> HeatBath | None:
         },
         entries={name: tuple(places) or ((0, 0, 0),) for name, places in entries.items()},
     )
+
+
+def _lower(matrix: Mapping[tuple[int, int], Expr]) -> dict[tuple[int, int], Expr]:
+    """Return the entries of the lower triangle."""
+    return {(i, j): entry for (i, j), entry in matrix.items() if i >= j}
 
 
 def _friction_of(

@@ -224,16 +224,15 @@ class EventFormulas:
             for name, value in event.changes
         }
         self._set_rates_of_rotations(new)
-        indices = [named.get(name, -1) for name in new]
-        for index, (name, value) in zip(indices, new.items(), strict=True):
-            if index < 0:
-                rotations = self._turning.rotations
-                names = [str(rate) for rotation in rotations for rate in (*rotation.rates, *rotation.momenta)]
-                names += [*named, *(name for name in self.interface.own_parameters if name not in named)]
-                raise EventError(
-                    f"then={{'{name}': '{value}'}} of the event '{event.function}': '{name}' is not a coordinate, a "
-                    f"momentum, a velocity or a parameter{closest(name, names)} An event can set: {', '.join(names)}"
-                )
+        if unknown := [name for name in new if name not in named]:
+            name, rotations = unknown[0], self._turning.rotations
+            rates = chain(*((*rotation.rates, *rotation.momenta) for rotation in rotations))
+            names = [*dict.fromkeys((*map(str, rates), *named, *self.interface.own_parameters))]
+            raise EventError(
+                f"then={{'{name}': '{new[name]}'}} of the event '{event.function}': '{name}' is not a coordinate, a "
+                f"momentum, a velocity or a parameter{closest(name, names)} An event can set: {', '.join(names)}"
+            )
+        indices = [*map(named.__getitem__, new)]
         if {min(index // len(self.q), 3) for index in indices} >= {1, 2}:
             raise EventError(f"the event '{event.function}' sets momenta and velocities: set one or the other")
         return indices, [*new.values()]

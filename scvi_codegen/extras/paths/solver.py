@@ -16,6 +16,8 @@ import numpy as np
 from scvi_codegen.api.runs import Products
 from scvi_codegen.api.states import Array
 from scvi_codegen.common.errors import PathError, StateError, StepFailedError
+from scvi_codegen.extras.exact.newton import MIN_FRACTION
+from scvi_codegen.extras.fits.multiple_shooting import ARMIJO
 from scvi_codegen.extras.paths.equations import Bordered, BorderedClosed, Closed, closed_residual, factors_of
 from scvi_codegen.extras.paths.intervals import Intervals, Linearised
 from scvi_codegen.extras.paths.size import ROUNDOFF, SAME, SizeOfMotion, largest_range, size_for_updates
@@ -27,7 +29,7 @@ ROUNDING = 1e-14
 Newton's method leaves is of the order of its square."""
 GAUGED = 1.2
 """Ratio of momenta to those of velocities from which on the latter are their size."""
-MOST_ITERATIONS, LEAST_STEP = 60, 1e-4
+MOST_ITERATIONS = 60
 FEW_ITERATIONS = 25
 """Largest number of iterations from one of several starts, and of a part of a continuation."""
 FIRST_PART, MOST_GROWTH, LEAST_GROWTH = 16, 2.0, 1.005
@@ -40,9 +42,6 @@ NEAR = 0.01
 """Newton correction, relative to the range of the path, below which Newton's method alone finds it: a descent ends."""
 FIRST_SHIFT, MOST_SHIFT = 1e-2, 1e3
 """Shifts of the Hessian relative to its largest entry."""
-LEAST_DECREASE = 1e-4
-"""Part of the predicted decrease of the action that is required (L. Armijo, Pac. J. Math. 16 (1966) 1; J. Nocedal,
-S. J. Wright, Numerical Optimization, 2006, 3.1)."""
 
 States = Callable[[Array, Array], tuple[Array, Array]]
 """Type of a function of (n, m) positions and momenta that returns (n,) energies and (n, m) velocities."""
@@ -125,7 +124,7 @@ def newton(
                 if simplified < (1.0 - damping / 4.0) * size:
                     break
             damping /= 2.0
-            if damping < LEAST_STEP:
+            if damping < MIN_FRACTION:
                 raise PathError("Newton's method made no progress")
         q = trial
     raise PathError(f"Newton's method did not converge in {most} iterations")
@@ -207,7 +206,7 @@ def descended(intervals: Intervals, q: Array) -> Solution:
                 raise PathError("no direction of descent")
             trial = intervals.moved(q, correction)
             there = intervals.linearised(trial)
-            if not there.actions.sum() <= at.actions.sum() + LEAST_DECREASE * decrease:
+            if not there.actions.sum() <= at.actions.sum() + ARMIJO * decrease:
                 raise PathError("no decrease of the action")
         except UNSOLVED:
             shift *= 4.0

@@ -70,7 +70,8 @@ def parse_neighbours(
         arrays: coordinates.
         symbols: parameters by name.
     """
-    positions = {array.name: array for array in arrays if [bool(axis.name) for axis in array.axes[1:]] in ([], [False])}
+    positions = {array.name: array for array in arrays if len(array.axes) == 1}
+    positions |= {array.name: array for array in arrays if [bool(axis.name) for axis in array.axes[1:]] == [False]}
     results = []
     for name, entry in argument.items():
         check_name(name)

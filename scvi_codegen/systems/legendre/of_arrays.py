@@ -7,7 +7,7 @@ magnetic field, pendulums in spherical angles, masses that depend on the positio
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 
@@ -48,15 +48,11 @@ def site_hamiltonian(system: ArraySystem) -> SiteHamiltonian | None:
         return None
     kinetic = [term for term in system.terms if _moving(term, moving)]
     still = [term for term in system.terms if not _moving(term, moving)]
-    groups: dict[tuple[object, ...], ArrayTerm] = {}
-    for term in kinetic:
-        if (site := _of_site(term, moving)) is None:
-            return None
-        former = groups.get(site.loops, replace(site, formula=S.Zero))
-        groups[site.loops] = term_of(site.loops, former.formula + site.formula, dict((*former.slots, *site.slots)))
-    of_groups = [_transformed(group, moving) for group in groups.values()]
-    accessed = chain.from_iterable(_moving(group, moving).values() for group in groups.values())
-    if None in of_groups or not _each_once([*accessed], system.coordinates):
+    sites = [_of_site(term, moving) for term in kinetic]
+    groups = _sums_by_sites(filter(None, sites))
+    of_groups = [_transformed(group, moving) for group in groups]
+    accessed = chain.from_iterable(_moving(group, moving).values() for group in groups)
+    if None in sites or None in of_groups or not _each_once([*accessed], system.coordinates):
         return None
     energies, momenta, velocities = zip(*filter(None, of_groups), strict=True) if of_groups else ((), (), ())
     hamiltonian = ArrayHamiltonian(
@@ -100,6 +96,15 @@ def _of_site(term: ArrayTerm, moving: dict[str, Array]) -> ArrayTerm | None:
         accesses[rule[slot]] = renamed
     sites = tuple(replace(loops[index], index=names[index]) for index in order)
     return term_of(sites, term.formula.xreplace(rule), accesses)
+
+
+def _sums_by_sites(terms: Iterable[ArrayTerm]) -> list[ArrayTerm]:
+    """Return the sum of all terms of the same sites."""
+    groups: dict[tuple[object, ...], ArrayTerm] = {}
+    for term in terms:
+        former = groups.get(term.loops, replace(term, formula=S.Zero))
+        groups[term.loops] = term_of(term.loops, former.formula + term.formula, dict((*former.slots, *term.slots)))
+    return [*groups.values()]
 
 
 def _each_once(accesses: Sequence[Access], coordinates: Sequence[Array]) -> bool:

@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import combinations, zip_longest
+from itertools import chain, combinations, zip_longest
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -216,16 +216,15 @@ class _MujocoModel:
         """Yield the pairs of geoms of different bodies that may touch, in MuJoCo's rules."""
         if self.disabled & {"contact", "constraint"}:
             return
-        stated = [element for section in self.root.children("contact") for element in section.children()]
+        stated = self.root.children("contact")
         written = set[tuple[int, ...]]()
-        for pair in (element for element in stated if element.tag == "pair"):
+        for pair in chain(*(section.children("pair") for section in stated)):
             first, second = sorted(self.place(pair, key)[0] for key in ("geom1", "geom2"))
             written.add((first, second))
             yield Pair.of_element(pair, self.geoms[first], self.geoms[second])
         excluded = {
             frozenset(self.place(element, key)[0] for key in ("body1", "body2"))
-            for element in stated
-            if element.tag == "exclude"
+            for element in chain(*(section.children("exclude") for section in stated))
         }
         near = set() if "filterparent" in self.disabled else {*self.parents.items()}
         shapes = [(k, geom.link, self.carriers[geom.link], *geom.types) for k, geom in enumerate(self.geoms)]
