@@ -298,11 +298,16 @@ class CallsApart(NamedTuple):
 
 def calls_apart(kernel: Kernel, functions: Collection[str]) -> CallsApart | None:
     """Return a kernel with the calls of functions apart whose arguments are sums and products of u; else ``None``."""
-    expressions, moving = (*kernel.temporaries, *kernel.results), set[Load]()
+    moving = set[Load]()
+
+    def moves(expression: Expression) -> bool:
+        return any(load.source == "u" or load in moving for load in loads(expression))
+
     for k, expression in enumerate(kernel.temporaries):
-        moving |= {Load("w", k)} if any(load.source == "u" or load in moving for load in loads(expression)) else set()
-    of_functions = (x for x in subexpressions(*expressions) if isinstance(x, Operation) and x.operator in functions)
-    calls = [x for x in dict.fromkeys(of_functions) if any(load.source == "u" or load in moving for load in loads(x))]
+        if moves(expression):
+            moving.add(Load("w", k))
+    operations = dict.fromkeys(subexpressions(*kernel.temporaries, *kernel.results))
+    calls = [x for x in operations if isinstance(x, Operation) and x.operator in functions and moves(x)]
     values = {call: Load("u", kernel.arguments + k) for k, call in enumerate(calls)}
     named = replace(kernel, name=f"{kernel.name}_arguments", purpose="Arguments of its functions.")
     arguments = _with_results(named, kernel.temporaries, [call.operands[0] for call in calls])

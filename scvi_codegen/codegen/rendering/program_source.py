@@ -579,7 +579,7 @@ def render_ensemble(
         precision: of the lanes.
     """
     fixed_point, split, headers = program.fixed_point, program.splitting, dict[str, str]()
-    bath, target = program.bath, TARGETS[precision]
+    bath, target, of_observer = program.bath, TARGETS[precision], (observed,) if observed else ()
     if program.quantities.integrals or (bath and bath.sizes["BATH_FACTORS"] > LARGEST_BATH_IN_LANES):
         return None
     if split is not None:
@@ -590,8 +590,7 @@ def render_ensemble(
         source = constrained_source(program.rattle, program.constraints)
     elif fixed_point is not None and fixed_point.serves_many:
         kernels, points = fixed_point.kernels, len(fixed_point.guess.abscissae)
-        of_steps = *kernels, *((observed,) if observed else ())
-        source = iteration_source(fixed_point, TRAJECTORIES, kernels=of_steps, number=target)
+        source = iteration_source(fixed_point, TRAJECTORIES, kernels=(*kernels, *of_observer), number=target)
     else:
         return None
     if precision == "single":
@@ -609,7 +608,7 @@ def render_ensemble(
         "observed": observed.values if observed else 0,
         "counts": counts,
         "tangents": tangents,
-        "cut": is_divided((*kernels, *((observed,) if observed else ()))),
+        "cut": is_divided((*kernels, *of_observer)),
         "diagonal_masses": _diagonal_masses(program),
         "metropolis": bool(bath and split and not any(bath.kernel.formulas[1 : 1 + program.dimension])),  # L is even
         "needs_velocities": velocities and not bath,
