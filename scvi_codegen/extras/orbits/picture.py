@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,6 @@ from scvi_codegen.extras.orbits.solver import PeriodicOrbit
 from scvi_codegen.extras.pictures.canvas import (
     COLORS,
     SMOOTH,
-    FilePath,
     at_times,
     check_plot_path,
     color,
@@ -31,7 +31,7 @@ MOST_CURVES = 40
 """Number of orbits that are drawn at most, evenly spaced in their order."""
 
 
-def plot_family(family: Any, path: FilePath | None = None) -> Figure:
+def plot_family(family: Any, path: str | os.PathLike[str] | None = None) -> Figure:
     """Draw a :class:`~scvi_codegen.Family`, blue where it is stable; write a .png, .svg or .pdf if a path is passed.
 
     Stability indices are signed, on an axis that is linear where they are stable, from -1 to 1, and logarithmic beyond.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import sys
 import tempfile
 import time
@@ -20,7 +21,6 @@ from scvi_codegen.common.errors import PlotError, StateError
 from scvi_codegen.extras.pictures.canvas import (
     MOTIONS,
     Array,
-    FilePath,
     Motions,
     at_times,
     check_plot_path,
@@ -105,7 +105,7 @@ SIZE = 4.8
 @checks_arguments(trajectory=MOTIONS, seconds=Kind.REAL)
 def animate(
     trajectory: Motions,
-    path: FilePath | None = None,
+    path: str | os.PathLike[str] | None = None,
     *,
     seconds: float = 8.0,
     positions: Callable[[Array], Array] | None = None,
@@ -210,7 +210,7 @@ class Film:
         if self.progress is not None:
             self.progress(min(done[0], len(self.frames)), len(self.frames))
 
-    def save(self, path: FilePath) -> None:
+    def save(self, path: str | os.PathLike[str]) -> None:
         """Write a file .gif, .html or .mp4 atomically; raises as :func:`animate`."""
         check_plot_path(path, FILMS)
         from matplotlib.animation import writers

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.api.checks import Kind, checks_arguments
 from scvi_codegen.common.errors import StateError, closest
-from scvi_codegen.extras.pictures.canvas import FilePath, color, panel, plain
+from scvi_codegen.extras.pictures.canvas import color, panel, plain
 from scvi_codegen.runs.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ def array_values(motion: Trajectory, name: str | None) -> tuple[str, NDArray[np.
 @checks_arguments(trajectory=ARRAYS, ax=Kind.CANVAS)
 def plot_arrays(
     trajectory: Trajectory,
-    path: FilePath | None = None,
+    path: str | os.PathLike[str] | None = None,
     *,
     array: str | None = None,
     state: int = -1,
@@ -113,7 +114,11 @@ def _draw_positions(axes: Axes, values: NDArray[np.float64], name: str) -> None:
 
 @checks_arguments(trajectory=ARRAYS, ax=Kind.CANVAS)
 def plot_spectrum(
-    trajectory: Trajectory, path: FilePath | None = None, *, field: str | None = None, ax: Axes | None = None
+    trajectory: Trajectory,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    field: str | None = None,
+    ax: Axes | None = None,
 ) -> Axes:
     """Draw the spectrum of a field on a mesh in the first and last state: squared amplitudes of the modes of each axis.
 

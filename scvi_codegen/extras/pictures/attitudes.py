@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from scvi_codegen.api.checks import Kind, checks_arguments
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.extras.pictures.canvas import MOTIONS, Array, FilePath, Motions, color, panel, plain, several, smooth
+from scvi_codegen.extras.pictures.canvas import MOTIONS, Array, Motions, color, panel, plain, several, smooth
 from scvi_codegen.runs.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -30,7 +31,9 @@ def unit_vectors(motion: Trajectory, axis: int = 3) -> dict[str, Array]:
 
 
 @checks_arguments(trajectory=MOTIONS, axis=Kind.WHOLE, ax=Kind.CANVAS)
-def plot_attitude(trajectory: Motions, path: FilePath | None = None, *, axis: int = 3, ax: Axes | None = None) -> Axes:
+def plot_attitude(
+    trajectory: Motions, path: str | os.PathLike[str] | None = None, *, axis: int = 3, ax: Axes | None = None
+) -> Axes:
     """Draw the path of a body axis of each rotation, and of directions and spins, on the unit sphere.
 
     Args:

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from scvi_codegen.api.program import Interface
 
 PICTURES = (".png", ".svg", ".pdf")
-FilePath: TypeAlias = str | os.PathLike[str]
 COLORS = ("#1f5fa8", "#d1495b", "#2e8b57", "#b8860b", "#7a4fa3", "#2b8c9e", "#8c564b", "#555555")
 STYLE = {
     "font.size": 10,
@@ -42,7 +41,7 @@ STYLE = {
 }
 
 
-def check_plot_path(path: FilePath, suffixes: tuple[str, ...] = PICTURES) -> None:
+def check_plot_path(path: str | os.PathLike[str], suffixes: tuple[str, ...] = PICTURES) -> None:
     """Check before a long run that a picture can be written; StateError for its suffix, PlotError without library."""
     if Path(path).suffix.lower() not in suffixes:
         formats = f"{', '.join(suffixes[:-1])} or {suffixes[-1]}"
@@ -71,7 +70,7 @@ def style() -> Any:
     return mpl.rc_context(STYLE)
 
 
-def new_figure(path: FilePath | None, size: tuple[float, float]) -> Figure:
+def new_figure(path: str | os.PathLike[str] | None, size: tuple[float, float]) -> Figure:
     """Return a figure of ``size`` inches; without a path pyplot manages it and notebooks display it."""
     if path is None:
         from matplotlib import pyplot
@@ -85,7 +84,10 @@ def new_figure(path: FilePath | None, size: tuple[float, float]) -> Figure:
 
 @contextmanager
 def panel(
-    path: FilePath | None, ax: Axes | None, size: tuple[float, float] = (5.6, 4.4), projection: str | None = None
+    path: str | os.PathLike[str] | None,
+    ax: Axes | None,
+    size: tuple[float, float] = (5.6, 4.4),
+    projection: str | None = None,
 ) -> Iterator[Axes]:
     """Yield the axes to draw on, ``ax`` or new ones; write the picture to ``path`` if there is one."""
     if path is not None:
@@ -97,7 +99,7 @@ def panel(
             save(axes.get_figure(root=True), path)
 
 
-def save(figure: Any, path: FilePath) -> None:
+def save(figure: Any, path: str | os.PathLike[str]) -> None:
     """Write a figure to a file atomically."""
     kind = Path(path).suffix.lower().removeprefix(".")
     write_atomically(path, lambda file: write_figure(figure, file, kind))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from scvi_codegen.api.checks import Kind, checks_arguments
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.extras.pictures.canvas import MOTIONS, Array, FilePath, Motions, color, panel, plain, several, smooth
+from scvi_codegen.extras.pictures.canvas import MOTIONS, Array, Motions, color, panel, plain, several, smooth
 from scvi_codegen.runs.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ class ResidualPlot:
     deviations: Array
     names: tuple[str, ...]
 
-    def __call__(self, path: FilePath | None = None, *, ax: Axes | None = None) -> Axes:
+    def __call__(self, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
         """Draw on the axes ``ax`` or on new ones; write a .png, .svg or .pdf if a path is passed."""
         with panel(path, ax) as axes:
             curves = zip(self.names, self.residuals.T, self.deviations, strict=True)
@@ -51,7 +52,7 @@ LOWEST = 1e-16
 
 
 @checks_arguments(trajectories=MOTIONS, ax=Kind.CANVAS)
-def plot_energy(trajectories: Motions, path: FilePath | None = None, *, ax: Axes | None = None) -> Axes:
+def plot_energy(trajectories: Motions, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
     """Draw the energy error ``|H - H_0| / |H_0|`` over time (absolute if H_0 = 0), a colour a trajectory.
 
     Where forces, damping or contacts change the energy of the exact motion, the change E - E0 is drawn on a linear
@@ -71,7 +72,9 @@ def plot_energy(trajectories: Motions, path: FilePath | None = None, *, ax: Axes
 
 
 @checks_arguments(trajectory=MOTIONS, ax=Kind.CANVAS)
-def plot_momentum_maps(trajectory: Motions, path: FilePath | None = None, *, ax: Axes | None = None) -> Axes:
+def plot_momentum_maps(
+    trajectory: Motions, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None
+) -> Axes:
     """Draw the change of each momentum map over time, relative to the largest size of its terms.
 
     Args:

@@ -8,6 +8,7 @@ Plots of paths: orbits of bodies, planes of two coordinates, coordinates over ti
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -26,7 +27,6 @@ from scvi_codegen.extras.pictures.canvas import (
     COLORS,
     MOTIONS,
     Array,
-    FilePath,
     Motions,
     check_plot_path,
     color,
@@ -73,7 +73,9 @@ def draw_robot(axes: Any, motion: Trajectory, number: int = 0) -> None:
 
 
 @checks_arguments(trajectory=MOTIONS)
-def plot_trajectory(trajectory: Motions, path: FilePath | None = None, *, error: bool = False) -> tuple[Axes, ...]:
+def plot_trajectory(
+    trajectory: Motions, path: str | os.PathLike[str] | None = None, *, error: bool = False
+) -> tuple[Axes, ...]:
     """Draw the path of a trajectory on the left, its relative energy error over time on the right.
 
     Args:
@@ -120,7 +122,7 @@ DIRECTION_TEXT = {1: ", rising", 0: "", -1: ", falling"}
 @checks_arguments(trajectories=MOTIONS, ax=Kind.CANVAS, axes=Kind.NAMES)
 def plot_section(
     trajectories: Motions,
-    path: FilePath | None = None,
+    path: str | os.PathLike[str] | None = None,
     *,
     axes: tuple[str, str] | None = None,
     event: int = 0,
@@ -172,6 +174,9 @@ def _at_crossings(motion: Trajectory, name: str, event: int) -> Array:
     return column(motion.stepper.interface, motion.events[event], name)
 
 
+Path = str | os.PathLike[str] | None
+
+
 @dataclass(frozen=True, slots=True)
 class Plots:
     """Pictures of one trajectory: ``run.plot()``, ``run.plot.energy()``, ``run.plot.phase("orbit.png")``.
@@ -182,21 +187,19 @@ class Plots:
 
     trajectory: Any = field(repr=False)
 
-    def __call__(self, path: FilePath | None = None, *, error: bool = False) -> tuple[Axes, ...]:
+    def __call__(self, path: Path = None, *, error: bool = False) -> tuple[Axes, ...]:
         """Draw path and energy error, as :func:`scvi_codegen.plot_trajectory`."""
         return plot_trajectory(self.trajectory, path, error=error)
 
-    def motion(self, path: FilePath | None = None, *, ax: Axes | None = None) -> Axes:
+    def motion(self, path: Path = None, *, ax: Axes | None = None) -> Axes:
         """Draw the path, as :func:`scvi_codegen.plot_motion`."""
         return plot_motion(self.trajectory, path, ax=ax)
 
-    def phase(
-        self, path: FilePath | None = None, *, axes: tuple[str, str] | None = None, ax: Axes | None = None
-    ) -> Axes:
+    def phase(self, path: Path = None, *, axes: tuple[str, str] | None = None, ax: Axes | None = None) -> Axes:
         """Draw a phase portrait, as :func:`scvi_codegen.plot_phase`."""
         return plot_phase(self.trajectory, path, axes=axes, ax=ax)
 
-    def time(self, *names: str, path: FilePath | None = None, ax: Axes | None = None, error: bool = False) -> Axes:
+    def time(self, *names: str, path: Path = None, ax: Axes | None = None, error: bool = False) -> Axes:
         """Draw quantities over time: names as of ``run[name]``, a curve each; by default the coordinates.
 
         With ``error`` coordinates and momenta have bands of their errors (``run.error``), between saved states.
@@ -212,31 +215,27 @@ class Plots:
                 _draw_times(panel_axes, drawn, names, number if len(motions) > 1 else None, error=error)
         return panel_axes
 
-    def energy(self, path: FilePath | None = None, *, ax: Axes | None = None) -> Axes:
+    def energy(self, path: Path = None, *, ax: Axes | None = None) -> Axes:
         """Draw the energy error over time, as :func:`scvi_codegen.plot_energy`."""
         return plot_energy(self.trajectory, path, ax=ax)
 
-    def attitude(self, path: FilePath | None = None, *, axis: int = 3, ax: Axes | None = None) -> Axes:
+    def attitude(self, path: Path = None, *, axis: int = 3, ax: Axes | None = None) -> Axes:
         """Draw the path of a body axis on the sphere, as :func:`scvi_codegen.plot_attitude`."""
         return plot_attitude(self.trajectory, path, axis=axis, ax=ax)
 
-    def momentum_maps(self, path: FilePath | None = None, *, ax: Axes | None = None) -> Axes:
+    def momentum_maps(self, path: Path = None, *, ax: Axes | None = None) -> Axes:
         """Draw the errors of momentum maps, as :func:`scvi_codegen.plot_momentum_maps`."""
         return plot_momentum_maps(self.trajectory, path, ax=ax)
 
-    def field(
-        self, path: FilePath | None = None, *, field: str | None = None, state: int = -1, ax: Axes | None = None
-    ) -> Axes:
+    def field(self, path: Path = None, *, field: str | None = None, state: int = -1, ax: Axes | None = None) -> Axes:
         """Draw a field of a mesh, or an array, as :func:`scvi_codegen.plot_arrays`."""
         return plot_arrays(self.trajectory, path, array=field, state=state, ax=ax)
 
-    def spectrum(self, path: FilePath | None = None, *, field: str | None = None, ax: Axes | None = None) -> Axes:
+    def spectrum(self, path: Path = None, *, field: str | None = None, ax: Axes | None = None) -> Axes:
         """Draw the spectrum of a field of a mesh, as :func:`scvi_codegen.plot_spectrum`."""
         return plot_spectrum(self.trajectory, path, field=field, ax=ax)
 
-    def section(
-        self, path: FilePath | None = None, *, axes: tuple[str, str], event: int = 0, ax: Axes | None = None
-    ) -> Axes:
+    def section(self, path: Path = None, *, axes: tuple[str, str], event: int = 0, ax: Axes | None = None) -> Axes:
         """Draw a Poincare section, as :func:`scvi_codegen.plot_section`."""
         return plot_section(self.trajectory, path, axes=axes, event=event, ax=ax)
 
@@ -246,7 +245,7 @@ MAX_CURVES = 6
 
 
 @checks_arguments(trajectory=MOTIONS, ax=Kind.CANVAS)
-def plot_motion(trajectory: Motions, path: FilePath | None = None, *, ax: Axes | None = None) -> Axes:
+def plot_motion(trajectory: Motions, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
     """Draw the path of a trajectory: orbits, a plane of coordinates, or coordinates over time.
 
     Between adaptive steps curves are dense output. Robots from files are drawn as links in space, at a few times.
@@ -271,7 +270,11 @@ def plot_motion(trajectory: Motions, path: FilePath | None = None, *, ax: Axes |
 
 @checks_arguments(trajectories=MOTIONS, ax=Kind.CANVAS, axes=Kind.NAMES)
 def plot_phase(
-    trajectories: Motions, path: FilePath | None = None, *, axes: tuple[str, str] | None = None, ax: Axes | None = None
+    trajectories: Motions,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    axes: tuple[str, str] | None = None,
+    ax: Axes | None = None,
 ) -> Axes:
     """Draw a phase portrait, a colour a trajectory.
 
