@@ -168,18 +168,18 @@ class _Binding:
             if not isinstance(value, str):
                 return repeat(value)
             term = parse_constraint(value if value == first else value + loops, entries, self.names | self.functions)
-            return [term.formula.xreplace(rule) for _, rule in rules.rules(term)]
+            return rules.formulas(term)
 
         fields = {name: getattr(item, name) for name in item.__dataclass_fields__ if name not in WORDS}
         if fields.get("where") is not None:
             fields["where"] = tuple(map(str, cast("Contact", item).conditions))  # formulas that are >= 0
-        elements = [
-            dict(zip(fields, values, strict=True)) for values in zip(*map(formulas, fields.values()), strict=False)
-        ]
-        for element in elements:
+        elements = []
+        for values in zip(*map(formulas, fields.values()), strict=False):
+            element = dict(zip(fields, values, strict=True))
             if element.get("where") is not None:
                 element["where"] = tuple(self.sympy.Ge(part, 0, evaluate=False) for part in element["where"])
-        return [replace(cast("Any", item), **element) for element in elements]
+            elements.append(replace(cast("Any", item), **element))
+        return elements
 
     def _read(self, item: ContactLike, formula: Formula, role: str) -> Expr:
         """Return a formula in the names of rotations and directions."""

@@ -45,8 +45,18 @@ class Table:
         axes, values = [_numbers(axis) for axis in (self.x if pair else [self.x])], _numbers(self.y)
         if values.shape != (shape := tuple(map(np.size, axes))) or not np.isfinite(values).all():
             raise SystemDefinitionError(f"y of a table must be finite numbers of the shape {shape} of its abscissae")
-        values = np.flip(values, tuple(k for k, x in enumerate(axes) if x.size and x.flat[0] > x.flat[-1]))
-        x = tuple(tuple(_ascending(axis, self.degree).tolist()) for axis in axes)
+        for k, axis in enumerate(axes):
+            if axis.ndim != 1 or len(axis) <= self.degree or not np.isfinite(axis).all():
+                least = f"at least {self.degree + 1} finite numbers"
+                raise SystemDefinitionError(f"x of a table of degree {self.degree} must be {least}")
+            if axis[0] > axis[-1]:
+                axes[k], values = axis[::-1], np.flip(values, k)
+            for j in np.flatnonzero(np.diff(axes[k]) <= 0.0)[:1]:
+                raise SystemDefinitionError(
+                    f"x of a table must be strictly monotone: it contains {axes[k][j]:g} before {axes[k][j + 1]:g}. "
+                    "Sort the points, and keep one of those with equal x"
+                )
+        x = tuple(tuple(axis.tolist()) for axis in axes)
         object.__setattr__(self, "x", x if pair else x[0])
         object.__setattr__(self, "y", tuple(map(tuple, values.tolist())) if pair else tuple(values.tolist()))
 
@@ -54,19 +64,6 @@ class Table:
     def axes(self) -> tuple[tuple[float, ...], ...]:
         """Abscissae of each argument, ascending."""
         return self.x if isinstance(self.x[0], tuple) else (self.x,)
-
-
-def _ascending(axis: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
-    """Return strictly monotone abscissae in ascending order; raise for others."""
-    if axis.ndim != 1 or len(axis) <= degree or not np.isfinite(axis).all():
-        raise SystemDefinitionError(f"x of a table of degree {degree} must be at least {degree + 1} finite numbers")
-    axis = axis[::-1] if axis[0] > axis[-1] else axis
-    for j in np.flatnonzero(np.diff(axis) <= 0.0)[:1]:
-        raise SystemDefinitionError(
-            f"x of a table must be strictly monotone: it contains {axis[j]:g} before {axis[j + 1]:g}. "
-            "Sort the points, and keep one of those with equal x"
-        )
-    return axis
 
 
 def _numbers(values: Any) -> NDArray[np.float64]:
