@@ -125,6 +125,9 @@ class Kernel:
     tangents: Kernel | None = None
     entries: tuple[tuple[int, int, int], ...] = ()
 
+    def __bool__(self) -> bool:
+        return bool(self.name)
+
     def __hash__(self) -> int:
         """Return a hash of the name and the sizes: that of all expressions takes long."""
         return hash((self.name, self.arguments, len(self.temporaries), self.values))
@@ -183,6 +186,10 @@ class Kernel:
             for number in ready:
                 derivative = number >= self.values
                 yield "derivative" if derivative else "value", number - derivative * self.values, self.results[number]
+
+
+NO_KERNEL = Kernel(name="", arguments=0, temporaries=(), results=(), values=0)
+"""Kernel of what a system does not have; false."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

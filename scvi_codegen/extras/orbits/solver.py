@@ -142,7 +142,7 @@ class PeriodicOrbit:
         Raises:
             MethodError: if the stepper has no finer method (it was loaded without its system).
         """
-        finer = self.stepper.products.finer.with_events(self.stepper.events if self.stepper.changes_states else ())
+        finer = self.stepper.products.finer.with_events(self.stepper.changing_events)
         rest: dict[str, Any] = {"sequence": self.sequence, "fixed_indices": (), "energy": None, "options": self.options}
         exact = np.concatenate([self.q, self.p, [self.period]]) - np.nan_to_num(self.errors.signed)
         z, none = exact[:-1], np.zeros(len(self.q))

@@ -144,7 +144,7 @@ def sections_of(model: Model) -> Mapping[str, Any]:
     """Return the sections of a model file with the density, or with L or H as the system was read from."""
     if model.system.mesh is not None:
         return {"field": model.system.mesh.to_section()}
-    system = model.system.clock.plain if model.system.clock and model.system.clock.plain else model.system
+    system = model.system.in_time
     kind = "hamiltonian" if system.auxiliaries else "lagrangian"
     return {"system": {kind: system.definition.get(kind) or system.text_of(system.formula)}}
 

@@ -190,7 +190,7 @@ def path_of(
     h = np.full(count, duration / count)
     times = begin + np.arange(count) * h
     intervals = kind(stepper, times, h, _parameters_of_steps(stepper, parameters, inputs, times + h / 2.0), options)
-    arguments = {"parameters": parameters, "options": options, **({"inputs": inputs} if inputs is not None else {})}
+    arguments = {"parameters": parameters, "options": options, "inputs": inputs}
     nodes = _nodes_of_start(states, start, begin, duration, count)
     start_energy = None if energy is None else checked_number(energy, "energy")
     energies = partial(_energies_and_velocities, stepper, begin, intervals.parameters)
