@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.codegen.native.binding import ON_CONSTRAINTS
+from scvi_codegen.codegen.native.option_table import OPTION
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.common.errors import MethodError, StateError
@@ -148,6 +149,7 @@ class Stepper(OfSteppers, Integrator):
         action: bool = False,
         seed: int = 0,
         metropolis: bool = False,
+        transitions: str = "located",
     ) -> Trajectory:
         """Integrate ``steps`` steps of h, or to t_end, and save every ``save_every``-th state and the initial one.
 
@@ -207,6 +209,8 @@ class Stepper(OfSteppers, Integrator):
             seed: with a bath or coloured noise, key of the noise, a whole number, by default 0. Noise is a function
                 of the seed, the trajectory, the number of the step and the coordinate.
             metropolis: accept or reject each step, so that averages have no error of the step size.
+            transitions: of contacts, ``"located"`` or ``"by steps"`` of a fixed size h without transitions, by svi:1,
+                for feet and piles (docs/contacts.md).
 
         Returns:
             A :class:`Trajectory` of steps // save_every + 1 states, fewer if an event ended it; with inputs states
@@ -221,6 +225,8 @@ class Stepper(OfSteppers, Integrator):
         if type(save_every) is not int or save_every != 1:
             save_every = checked_count(save_every, "save_every", least=1)
         stepper: Stepper = self if events is None and not action else self._for_run(events, action=action)
+        if transitions != "located":
+            stepper = stepper._by_steps(transitions, h=h, error=error, inputs=inputs)
         interface = self.interface
         noise = stepper._noise(seed, metropolis, inputs) if seed != 0 or metropolis else None
         if not (inputs is None and t_eval is None and observe is None and tables is None and threads is None):
@@ -288,6 +294,15 @@ class Stepper(OfSteppers, Integrator):
         if action:
             require(stepper, "action")
             return stepper.acting
+        return stepper
+
+    def _by_steps(self, transitions: str, **arguments: Any) -> Self:
+        """Return the stepper of runs with contacts by steps; raise for other arguments that these do not have."""
+        OPTION["transitions"].checked(transitions)
+        stepper = self.with_steps_of_contacts
+        for operation, name in (("adaptive", "h"), ("error", "error"), ("inputs", "inputs")):
+            if (arguments[name] is None) == (name == "h"):
+                require(stepper, operation)
         return stepper
 
     def _at_tolerance(self, tolerance: float | None) -> Self:
@@ -372,11 +387,11 @@ class Stepper(OfSteppers, Integrator):
         """Return (q, p), or q and the momenta of a velocity, on the constraints."""
         q, p, velocity, t, parameters, _ = initial
         p = self._initial_momenta(q, p, velocity, t, parameters)
-        if self.interface.contacts:
+        if self.interface.contacts and not self.by_steps:
             from scvi_codegen.runs.events.contacts import in_first_modes
 
             return in_first_modes(self, q, p, t, parameters, duration_of(plan, t))
-        if not self.interface.constraints:
+        if len(self.interface.constraints) == self.interface.masked:
             return q, p
         return consistent(self, q, p, t, parameters)
 

@@ -345,6 +345,8 @@ class Program:
                 constraints and constraints.reactions,
                 constraints and constraints.coefficients,
                 constraints and constraints.coefficient_rounding,
+                constraints and constraints.motion_by_steps,
+                constraints and constraints.drifts,
                 self.damping,
                 self.bath and self.bath.kernel,
                 *(rattle.kernels if rattle else ()),

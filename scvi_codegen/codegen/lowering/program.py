@@ -217,7 +217,7 @@ def lower(
         polynomial_curves=polynomial,
         equations=equations,
         quantities=_quantities(system, method, stages, symmetries, in_lanes=in_lanes),
-        constraints=lowered_constraints(system) if system.constraints else None,
+        constraints=lowered_constraints(system, stages) if system.constraints else None,
         rattle=rattle_of(system, stages, equations.extrapolation) if system.constraints and solver == "auto" else None,
         damping=damping_kernel(system),
         mass_growth=_mass_growth(system, stages),

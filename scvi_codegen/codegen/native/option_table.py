@@ -248,6 +248,13 @@ class RunOptions:
     seed: int = option(
         *("run", COUNT, "N", "Key of the noise of a heat bath [0]."), default=0, most=LARGEST_SEED, common=False
     )
+    transitions: str = option(
+        *("run", CHOICE, "", "Contacts [located]; by steps: of a fixed size, by svi:1, for feet and piles."),
+        choices=("located", "by steps"),
+        requires=FIXED,
+        default="located",
+        common=False,
+    )
     metropolis: bool = option(
         "run", SWITCH, "", "Accept or reject each step in a heat bath.", default=False, common=False
     )

@@ -137,7 +137,8 @@ class CrossingSearch:
         arguments = self.watch, t_end, run._control, size, *run._arguments, most
         states = *(binding.pointer(column[1:]) for column in rows), binding.integers(iterations[1:])
         to = self._capacity, crossings, filled, run._report, run._workspace
-        advance = binding.function("advance_with_changes", run._memory)
+        name = "advance_by_steps" if self.stepper.by_steps else "advance_with_changes"
+        advance = binding.function(name, run._memory)
         status = advance(*arguments, *states, binding.whole_numbers(numbers[1:]), *to)
         self._record(crossings, int(filled[0]))
         report, count = run._report, int(run._report.stored) + 1
