@@ -48,7 +48,7 @@ typedef struct {
   motion_terms first, last;
   row_terms start, end;
   step_matrix moving, resting;
-  int is_near[EVENT_CONTACTS], has_begun[EVENT_CONTACTS];
+  int is_near[EVENT_CONTACTS], pushes[EVENT_CONTACTS], has_begun[EVENT_CONTACTS];
   real response[CONTACT_ROWS][STEP_SIZE], at_start[CONTACT_ROWS][STEP_SIZE];
   real W[CONTACT_ROWS * CONTACT_ROWS];
   cone_problem problem;
@@ -223,7 +223,7 @@ static int find_positions(contact_step *in, const contact_memory *from)
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal;
     const real part = normal < 0 ? 0.5 * in->h : 1.0;
-    in->problem.takes_part[k] = in->is_near[k] && (normal < 0 || from->force[normal] > 0.0);
+    in->problem.takes_part[k] = in->is_near[k] && (normal < 0 || from->pushes[k]);
     in->problem.rests[k] = from->sticks[k];
     in->problem.mu[k] = part * in->start.coefficient[k][0];
     in->problem.mu_static[k] = part * in->start.coefficient[k][1];
@@ -268,8 +268,11 @@ static int find_positions(contact_step *in, const contact_memory *from)
       in->problem.takes_part[k] |= is_missed;
       missed |= is_missed;
     }
-    if (!missed)
-      return OK;
+    if (missed)
+      continue;
+    for (int k = 0; k < EVENT_CONTACTS; k++)
+      in->pushes[k] = CONTACTS[k].normal >= 0 && in->problem.takes_part[k] && in->problem.mode[k].pushes;
+    return OK;
   }
   return NOT_CONVERGED;
 }
@@ -313,7 +316,7 @@ static int rebound(contact_step *in, const contact_memory *from, const real *f1,
   memcpy(f, of->f, sizeof f);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
-    if (normal < 0 || !(f1[normal] > 0.0) || from->is_closed[k])
+    if (!in->pushes[k] || from->is_closed[k])
       continue;
     const real rate = times_row(in->start.G[row], in->v) + in->start.drift[row];
     const real target = in->start.coefficient[k][2] * fmin(rate, 0.0);
@@ -372,7 +375,7 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
     const real part = normal < 0 ? 0.5 * in->h : 1.0;
-    of->takes_part[k] = in->is_near[k] && (normal < 0 || f1[normal] > 0.0 ||
+    of->takes_part[k] = in->is_near[k] && (normal < 0 || in->pushes[k] ||
         in->end.value[row] <= CONTACT_LOWEST * DBL_EPSILON * size_by_position(in->end.G[row], in->q1));
     of->rests[k] = from.sticks[k] && !in->has_begun[k];
     of->mu[k] = part * in->end.coefficient[k][0];
@@ -400,6 +403,7 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
     const real rate = normal < 0 ? 0.0 : times_row(in->end.G[row], v) + in->end.drift[row];
+    to->pushes[k] = in->pushes[k];
     to->is_closed[k] = of->takes_part[k] && rate <= CONTACT_ROUNDING * fastest;
     to->sticks[k] = to->is_closed[k] && of->mode[k].sticks;
     memcpy(to->direction[k], of->mode[k].direction, sizeof *to->direction);
