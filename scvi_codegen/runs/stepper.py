@@ -77,6 +77,7 @@ class Stepper(OfSteppers, Integrator):
     def _copy(self, events: tuple[Event, ...], source: Source | None = None) -> Self:
         copy = super()._copy(events, source)
         copy._precise, copy._doubles, copy._finer = self._precise, self._doubles, self._finer
+        copy.by_steps = self.by_steps
         return copy
 
     @property
@@ -114,7 +115,9 @@ class Stepper(OfSteppers, Integrator):
             reason=self._reason,
             looser=self._looser,
         )
-        further: dict[str, Any] = {} if self._finer is None else {"_finer": self._finer}
+        further: dict[str, Any] = {"by_steps": True} if self.by_steps else {}
+        if self._finer is not None:
+            further["_finer"] = self._finer
         if self._doubles is not None and self.events:
             further["_doubles"] = constantly(self._doubles())
         return made, (self._plain, self.interface), further

@@ -19,7 +19,7 @@ from scvi_codegen.runs.events.contacts import (
     undefined_friction,
     warn_of_choices,
 )
-from scvi_codegen.runs.results.saved_states import Array, ModeHistory, SavedStates
+from scvi_codegen.runs.results.saved_states import Array, ContactsBySteps, ModeHistory, SavedStates
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.step_plan import Fixed
 from scvi_codegen.systems.event import (
@@ -239,7 +239,9 @@ class CrossingSearch:
         latest = np.array(list(self.watch.mode))
         values = np.concatenate([records["mode"], latest[np.newaxis]])
         ambiguous, missed = (getattr(self.watch, name, 0) for name in ("ambiguous", "missed"))
-        return ModeHistory(records["t"], values, bool(ambiguous), float(missed))
+        steps = self.watch.steps if self.stepper.by_steps else None
+        by_steps = steps and ContactsBySteps(steps.residual, steps.compliance, steps.lost_energy)
+        return ModeHistory(records["t"], values, bool(ambiguous), float(missed), by_steps)
 
     def _joined(self, recorded: Sequence[NDArray[Any]]) -> Any:
         none = self.binding.records(self.binding.new("crossing[1]"), 0)

@@ -28,6 +28,7 @@ OPERATIONS = {
     "ensemble_events": "integrate_ensemble of a stepper with events",
     "observe_ensemble": "integrate_ensemble(observe=)",
     "single": "integrate_ensemble(precision='single')",
+    "crossings": "run.crossings",
     "checkpoint": "checkpoint",
     "recording": "record_run",
     "dense_output": "dense output",
@@ -172,11 +173,8 @@ FEATURES = {
             f"observe_ensemble single hessian chaos_ensemble flow advice {_ACTIONS}",
             "use runs and ensembles with {h}, or with {t_end} and a {tolerance}, without it",
         ),
-        (
-            "with contacts by steps",
-            f"adaptive error run_error inputs recording {_DERIVATIVES} work",
-            "give {h} and {t_end}, and leave it out, or locate the transitions",
-        ),
+        ("with contacts", "crossings", "pass events= to the run"),
+        ("with contacts by steps", f"adaptive error run_error {_DERIVATIVES} work", "give {h}, or omit {transitions=}"),
         (
             "without steps of contacts",
             "by_steps",

@@ -461,12 +461,22 @@ static int step_by_steps(contact_step *in, contact_memory *memory, real t, real 
   return step_by_steps(in, memory, t + 0.5 * h, 0.5 * h, q, p, depth + 1, workspace);
 }
 
+/* Modes of contacts as parameters of a run. */
+static void put_memory(const contact_memory *memory, real *mode)
+{
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    contact_mode now = {memory->is_closed[k], memory->sticks[k] ? 3 : 0, 0, {0.0, 0.0}};
+    for (int i = 0; i < 2 && now.closed && !now.sticks; i++)
+      now.direction[i] = memory->direction[k][i];
+    put_mode(CONTACTS + k, now, AT_REST, 0.0, mode);
+  }
+}
+
 /* Velocities of a run at its start, and slips that rest there. */
 static int begin_by_steps(contact_step *in, event_run *run, event_watch *watch, real *workspace)
 {
   contact_memory *const memory = &watch->steps;
   real fastest = 0.0;
-  memset(memory, 0, sizeof *memory);
   TRY(NAME(velocity)(run->t, run->q, run->p, in->idle, memory->v, workspace));
   in->t = run->t;
   memcpy(in->q, run->q, BYTES(M));
@@ -494,19 +504,9 @@ static int begin_by_steps(contact_step *in, event_run *run, event_watch *watch, 
     for (int i = 0; i < 2; i++)
       memory->direction[k][i] = w[i] / fmax(speed, DBL_MIN);
   }
-  watch->begun = 1;
+  memory->begun = 1;
+  put_memory(memory, watch->mode);
   return OK;
-}
-
-/* Modes of contacts as parameters of a run. */
-static void put_memory(const contact_memory *memory, real *mode)
-{
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    contact_mode now = {memory->is_closed[k], memory->sticks[k] ? 3 : 0, 0, {0.0, 0.0}};
-    for (int i = 0; i < 2 && now.closed && !now.sticks; i++)
-      now.direction[i] = memory->direction[k][i];
-    put_mode(CONTACTS + k, now, AT_REST, 0.0, mode);
-  }
 }
 
 /* Whether a contact is open, sticks or slips unlike before. */
@@ -586,10 +586,9 @@ int NAME(advance_by_steps)(event_run *run, event_watch *watch, real t_end, const
   in.imposed = imposed;
   *filled = 0;
   report->t = run->t;
-  if (!watch->begun) {
+  if (!watch->steps.begun)
     TRY(begin_by_steps(&in, run, watch, workspace));
-    put_memory(&watch->steps, watch->mode);
-  }
+  watch->begun = 1;
   while (report->steps < steps && !watch->ended && (t_end - run->t) - run->t_low != 0.0) {
     const real rest = (t_end - run->t) - run->t_low, h = rest < (1.0 - CHANGE_WHOLE) * run->h ? rest : run->h;
     const contact_memory before = watch->steps;
