@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.codegen.native.binding import ON_CONSTRAINTS
-from scvi_codegen.codegen.native.option_table import OPTION
+from scvi_codegen.codegen.native.option_table import LOCATED, OPTION
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.common.errors import MethodError, StateError
@@ -152,7 +152,7 @@ class Stepper(OfSteppers, Integrator):
         action: bool = False,
         seed: int = 0,
         metropolis: bool = False,
-        transitions: str = "located",
+        transitions: str = LOCATED,
     ) -> Trajectory:
         """Integrate ``steps`` steps of h, or to t_end, and save every ``save_every``-th state and the initial one.
 
@@ -228,8 +228,8 @@ class Stepper(OfSteppers, Integrator):
         if type(save_every) is not int or save_every != 1:
             save_every = checked_count(save_every, "save_every", least=1)
         stepper: Stepper = self if events is None and not action else self._for_run(events, action=action)
-        if transitions != "located":
-            stepper = stepper._by_steps(transitions, h=h, error=error, inputs=inputs)
+        if transitions != LOCATED:
+            stepper = stepper.by_transitions(transitions)
         interface = self.interface
         noise = stepper._noise(seed, metropolis, inputs) if seed != 0 or metropolis else None
         if not (inputs is None and t_eval is None and observe is None and tables is None and threads is None):
@@ -299,14 +299,10 @@ class Stepper(OfSteppers, Integrator):
             return stepper.acting
         return stepper
 
-    def _by_steps(self, transitions: str, **arguments: Any) -> Self:
-        """Return the stepper of runs with contacts by steps; raise for other arguments that these do not have."""
+    def by_transitions(self, transitions: str) -> Self:
+        """Return the stepper whose runs treat transitions of contacts so: "located" or "by steps"; MethodError."""
         OPTION["transitions"].checked(transitions)
-        stepper = self.with_steps_of_contacts
-        for operation, name in (("adaptive", "h"), ("error", "error"), ("inputs", "inputs")):
-            if (arguments[name] is None) == (name == "h"):
-                require(stepper, operation)
-        return stepper
+        return self if transitions == LOCATED else self.with_steps_of_contacts
 
     def _at_tolerance(self, tolerance: float | None) -> Self:
         """Return the stepper of adaptive runs of a tolerance, whose degree follows it unless the method was named."""
@@ -522,6 +518,7 @@ class Stepper(OfSteppers, Integrator):
         seed: int = 0,
         metropolis: bool = False,
         precision: str = "double",
+        transitions: str = LOCATED,
     ) -> EnsembleTrajectory:
         """Run k trajectories on all cores, with common fixed steps (SIMD lanes) or with adaptive steps for each.
 
@@ -551,6 +548,7 @@ class Stepper(OfSteppers, Integrator):
                 float32 with compensated sums, so that states have some 45 bits, and are float64. The step size,
                 parameters, constants and the time in forces are rounded to 24 bits (docs/ensembles.md). A trajectory
                 whose step fails is continued in double precision.
+            transitions: of contacts, as of :meth:`integrate`.
 
         Returns:
             An :class:`EnsembleTrajectory`; states equal those of :meth:`integrate` to round-off. A trajectory that
@@ -563,9 +561,10 @@ class Stepper(OfSteppers, Integrator):
         from scvi_codegen.runs.ensembles.ensemble import EnsembleSettings, settings_in
 
         settings = EnsembleSettings(*settings_in(locals()))
-        runs = self.products.ensemble_runs(q, p, settings, velocity=velocity, action=action)
+        stepper = self.by_transitions(transitions)
+        runs = stepper.products.ensemble_runs(q, p, settings, velocity=velocity, action=action)
         runs.run(progress=progress, threads=threads)
-        return self.products.ensemble_result(runs)
+        return stepper.products.ensemble_result(runs)
 
     def _ensemble(
         self,

@@ -45,6 +45,8 @@ NOT_NEGATIVE = Range("not be negative", lambda value: value >= 0.0)
 BELOW_ONE = Range("be positive and below 1", lambda value: 0.0 < value < 1.0)
 SOLVED = Range(f"be positive and at most {LARGEST_TOLERANCE:g}", lambda value: 0.0 < value <= LARGEST_TOLERANCE)
 
+LOCATED = "located"
+"""How transitions of contacts are treated by default."""
 STEP_SIZE, DURATION, VELOCITY = "the step size", "the duration", "the velocity"
 """What alternatives determine, of which at most one is given."""
 ADAPTIVE, FIXED = "adaptive steps", "a fixed step size"
@@ -250,9 +252,8 @@ class RunOptions:
     )
     transitions: str = option(
         *("run", CHOICE, "", "Contacts [located]; by steps: of a fixed size, by svi:1, for feet and piles."),
-        choices=("located", "by steps"),
-        requires=FIXED,
-        default="located",
+        choices=(LOCATED, "by steps"),
+        default=LOCATED,
         common=False,
     )
     metropolis: bool = option(

@@ -129,6 +129,7 @@ class ExampleRun:
         end: of a run with inputs.
         arrays: of a system whose array sizes are known at run time; ``outputs`` is then the number of steps.
         events: of the run, also of its source.
+        by_steps: whether contacts act in steps, without transitions.
     """
 
     q: tuple[float, ...]
@@ -150,6 +151,7 @@ class ExampleRun:
     end: float = 0.0
     arrays: ExampleArrays | None = None
     events: tuple[Any, ...] = ()
+    by_steps: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

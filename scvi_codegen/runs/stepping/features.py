@@ -23,7 +23,7 @@ OPERATIONS = {
     "threads": "{threads=}",
     "tables": "tables=",
     "with_sizes": "with_sizes",
-    "by_steps": "{transitions=}'by steps'",
+    "by_steps": "{transitions} 'by steps'",
     "ensembles": "integrate_ensemble",
     "ensemble_events": "integrate_ensemble of a stepper with events",
     "observe_ensemble": "integrate_ensemble(observe=)",
@@ -174,7 +174,7 @@ FEATURES = {
             "use runs and ensembles with {h}, or with {t_end} and a {tolerance}, without it",
         ),
         ("with contacts", "crossings", "pass events= to the run"),
-        ("with contacts by steps", f"adaptive error run_error {_DERIVATIVES} work", "give {h}, or omit {transitions=}"),
+        ("with contacts by steps", f"adaptive error run_error recording {_DERIVATIVES} work", "give {h}, or omit {transitions=}"),
         (
             "without steps of contacts",
             "by_steps",

@@ -593,7 +593,7 @@ int NAME(advance_by_steps)(event_run *run, event_watch *watch, real t_end, const
     const real rest = (t_end - run->t) - run->t_low, h = rest < (1.0 - CHANGE_WHOLE) * run->h ? rest : run->h;
     const contact_memory before = watch->steps;
     int changed = -1;
-    if (room - *filled < EVENTS + 1 || report->stored == states)
+    if (room - *filled < EVENT_FIRST[FIRST_TRANSITION] + 1 || report->stored == states)
       return OK;
     report->t = left.t = run->t;
     copy_state(left.q, left.p, run->q, run->p);
