@@ -227,9 +227,8 @@ class Stepper(OfSteppers, Integrator):
         """
         if type(save_every) is not int or save_every != 1:
             save_every = checked_count(save_every, "save_every", least=1)
-        stepper: Stepper = self if events is None and not action else self._for_run(events, action=action)
-        if transitions != LOCATED:
-            stepper = stepper.by_transitions(transitions)
+        is_plain = events is None and not action and transitions == LOCATED
+        stepper: Stepper = self if is_plain else self._for_run(events, action=action, transitions=transitions)
         interface = self.interface
         noise = stepper._noise(seed, metropolis, inputs) if seed != 0 or metropolis else None
         if not (inputs is None and t_eval is None and observe is None and tables is None and threads is None):
@@ -291,9 +290,11 @@ class Stepper(OfSteppers, Integrator):
 
         return partial(integrated, self)
 
-    def _for_run(self, events: EventLike | Sequence[EventLike] | None, *, action: bool) -> Self:
+    def _for_run(
+        self, events: EventLike | Sequence[EventLike] | None, *, action: bool, transitions: str = LOCATED
+    ) -> Self:
         """Return the stepper of runs with these events, ``None`` for its own, that sum the action if requested."""
-        stepper = self if events is None else self.with_events(events)
+        stepper = (self if events is None else self.with_events(events)).by_transitions(transitions)
         if action:
             require(stepper, "action")
             return stepper.acting

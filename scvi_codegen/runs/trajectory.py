@@ -539,6 +539,7 @@ class Trajectory(
         """
         if not (asked := as_events(events)):
             raise EventError("crossings requires at least one event, such as 'q' or Event('q', direction=1)")
+        require(self.stepper, "crossings")
         stepper = self.stepper.with_events(asked)
         by_piece = [crossings_of(stepper, piece) for piece in self._runs]
         return tuple(map(joined_crossings, zip(*by_piece, strict=True)))

@@ -327,7 +327,9 @@ def _steps_of_contacts(system: LagrangianSystem) -> dict[str, Any]:
     values = [value.xreplace(idle) for value in (*forms.momentum, *forms.force)]
     by_state = jacobian(values, (*system.coordinates, *system.velocities))
     partials = {(i, j): entry for (i, j), entry in by_state.items() if i < system.dimension or j >= system.dimension}
-    still = {reaction.active: Integer(1) for reaction in system.reactions} | dict.fromkeys(system.velocities, Integer(0))
+    still = {reaction.active: Integer(1) for reaction in system.reactions} | dict.fromkeys(
+        system.velocities, Integer(0)
+    )
     return {
         "motion_by_steps": system_kernel(
             system,

@@ -504,7 +504,16 @@ class Model(TimeSpan):
 
     def _run_arguments(self) -> dict[str, Any]:
         """Return the arguments of :meth:`Stepper.integrate` and ensembles for time, steps, saved states and inputs."""
-        others = ("span", "threads", "action", "precision", "sums", "controller", "observe", "transitions")  # those of the stepper
+        others = (
+            "span",
+            "threads",
+            "action",
+            "precision",
+            "sums",
+            "controller",
+            "observe",
+            "transitions",
+        )  # those of the stepper
         arguments = {
             option.field: getattr(self, option.field)
             for option in RUN_FIELDS

@@ -90,7 +90,9 @@ class TimeSpan(ModelOptions):
     def _check_located(self, what: str) -> None:
         """Raise an error if contacts are by steps, which something does not have."""
         if self.transitions != LOCATED:
-            raise ModelFileError(f"{what} has located transitions alone: omit transitions = {self.transitions!r} ([run])")
+            raise ModelFileError(
+                f"{what} has located transitions alone: omit transitions = {self.transitions!r} ([run])"
+            )
 
     def _check_alone(self) -> None:
         """Raise an error for a single run with an option of ensembles."""

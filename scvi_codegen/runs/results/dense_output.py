@@ -48,7 +48,9 @@ def states_and_steps_at(states: SavedStates, times: Array) -> tuple[Array, Array
     left = np.searchsorted(states.forward * states.t, states.forward * times, side="right") - 1
     if states.stepper.by_steps:  # linear in between
         right = np.minimum(left + 1, len(states) - 1)
-        part = ((times - states.t[left]) / np.fmax(states.t[right] - states.t[left], np.finfo(float).tiny))[:, np.newaxis]
+        part = ((times - states.t[left]) / np.fmax(states.t[right] - states.t[left], np.finfo(float).tiny))[
+            :, np.newaxis
+        ]
         q, p = (x[left] + part * (x[right] - x[left]) for x in (states.q, states.p))
         return q, p, times
     lengths, fixed, several = states.step_sizes[:-1], isinstance(states.plan, FixedSteps), False

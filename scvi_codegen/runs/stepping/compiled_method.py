@@ -468,4 +468,4 @@ class CompiledMethod:
     @property
     def _has_error_estimate(self) -> bool:
         """True if the method has adaptive steps for this system; also if that follows from sizes at run time."""
-        return "advance_to" in self.source.contents.functions
+        return "advance_to" in self.source.contents.functions and not self.by_steps

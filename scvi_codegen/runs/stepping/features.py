@@ -174,7 +174,11 @@ FEATURES = {
             "use runs and ensembles with {h}, or with {t_end} and a {tolerance}, without it",
         ),
         ("with contacts", "crossings", "pass events= to the run"),
-        ("with contacts by steps", f"adaptive error run_error recording {_DERIVATIVES} work", "give {h}, or omit {transitions=}"),
+        (
+            "with contacts by steps",
+            f"adaptive error run_error recording {_DERIVATIVES} work",
+            "give {h}, or omit {transitions=}",
+        ),
         (
             "without steps of contacts",
             "by_steps",
