@@ -79,6 +79,7 @@ class Box:
         return np.array([q[:, 1] + u * np.sin(q[:, 2]) + v * np.cos(q[:, 2]) for u, v in corners]) / self.unit
 
 
+@pytest.mark.tiers(2, 8)
 @pytest.mark.parametrize("number", range(8))
 def test_static_friction_holds_to_its_angle_and_sliding_has_its_acceleration(number: int) -> None:
     """A tenth of a degree below its angle a box at rest stays, a tenth above it slides with g (sin s - mu cos s)."""
@@ -86,7 +87,7 @@ def test_static_friction_holds_to_its_angle_and_sliding_has_its_acceleration(num
     mus = of.random.uniform(0.1, 0.6)
     mu, angle = mus * of.random.uniform(0.5, 0.9), np.arctan(mus)
     held, slides = (of.run(of.flat, [0, 0, 0], 30, mu=mu, mus=mus, s=angle + np.deg2rad(by)) for by in (-0.1, 0.1))
-    assert abs(held.q - held.q[0]).max() < CREEPS * of.unit
+    assert (abs(held.q - held.q[0]) / [of.unit, of.unit, 1.0]).max() < CREEPS
     assert held.contact_modes[-1][1].count("stick") == 2
     t = slides.t[-1]
     s = angle + np.deg2rad(0.1)
@@ -94,7 +95,8 @@ def test_static_friction_holds_to_its_angle_and_sliding_has_its_acceleration(num
     assert slides.q[-1, 0] - slides.q[0, 0] == pytest.approx(way, rel=1e-3)
 
 
-@pytest.mark.parametrize("number", range(12))
+@pytest.mark.tiers(3, 20)
+@pytest.mark.parametrize("number", range(100))
 def test_thrown_boxes_rest_and_do_not_creep(number: int) -> None:
     """From any pose and velocity; their loss of energy is the work of the contacts."""
     of = Box(number)
@@ -105,7 +107,7 @@ def test_thrown_boxes_rest_and_do_not_creep(number: int) -> None:
     energy = run.energy()
     fall = np.ptp(energy)
     rests = abs(run.t - 50 * of.time).argmin()
-    assert abs(run.q[rests:] - run.q[-1]).max() < CREEPS * of.unit
+    assert (abs(run.q[rests:] - run.q[-1]) / [of.unit, of.unit, 1.0]).max() < CREEPS
     assert run.p[-1] @ run.velocity[-1] < RESTS * fall
     assert of.gaps(run.q).min() > -PENETRATES
     assert run.lost_energy == pytest.approx(energy[0] - energy[-1], abs=1e-3 * fall)
@@ -114,7 +116,8 @@ def test_thrown_boxes_rest_and_do_not_creep(number: int) -> None:
     assert len(run.contact_modes) < 60
 
 
-@pytest.mark.parametrize("e", [0.0, 0.5, 0.9, 1.0])
+@pytest.mark.tiers(1, 4)
+@pytest.mark.parametrize("e", [0.9, 0.0, 0.5, 1.0])
 def test_rebounds_have_their_restitution_and_gain_no_energy(e: float) -> None:
     of = Box(3)
     height = of.unit

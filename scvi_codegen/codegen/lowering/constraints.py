@@ -231,8 +231,9 @@ def _parts(stages: StageSystem, method: Method) -> Vector:
 def _is_trapezoid(stages: StageSystem) -> bool:
     """Return whether a step is that of h/2 (L(q0, v) + L(q1, v)), v = (q1 - q0)/h: SVI(1) on two Lobatto points."""
     shape = stages.shape
-    is_variational = isinstance(shape, Velocities) and shape.variational
-    return is_variational and shape.abscissae == (0, 1) and len(shape.blocks) == 1
+    if not (isinstance(shape, Velocities) and shape.variational):
+        return False
+    return shape.abscissae == (0, 1) and len(shape.blocks) == 1
 
 
 def _kernels(system: ArraySystem) -> Iterator[tuple[RolledKernel, RolledKernel]]:

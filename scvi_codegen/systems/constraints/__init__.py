@@ -157,7 +157,7 @@ def constraint_jacobian(system: Constrained) -> dict[tuple[int, int], Expr]:
     return jacobian(constraint_rates(system), system.velocities)
 
 
-def masks_of_contacts(system: Constrained) -> list[Symbol]:
+def masks_of_contacts(system: Any) -> list[Symbol]:
     """Return the parameters of the modes of contacts."""
     return [x for x in system.parameters if re.match(r"contact_\d+_(?!quantity_)", x.name)]
 
