@@ -224,17 +224,17 @@ def _orbits(family: Family, *, from_momenta: bool) -> dict[str, Any]:
     _, kinds, orbits = zip(*sorted(places, key=lambda place: place[0]), strict=True)  # stable
     name, indices = indices_of(orbits)
 
-    def entry(kind: str, orbit: PeriodicOrbit, moduli: Any) -> dict[str, Any]:
+    def entry(kind: str, orbit: PeriodicOrbit, signed: Any) -> dict[str, Any]:
         q, p, names, parameters = orbit.q, orbit.p, orbit.stepper.parameters, orbit.parameters
         v = p if from_momenta else np.asarray(orbit.stepper.velocity(q, p, orbit.t, parameters))
         return {
             "q": q.tolist(), "p": p.tolist(), "v": v.tolist(), "value": family.value_of(orbit), "period": orbit.period,
             "energy": orbit.energy, "parameters": dict(zip(names, parameters.tolist(), strict=False)),
-            "sizes": moduli.tolist(), "stability": "stable" if orbit.stable else "unstable", "bifurcation": kind,
+            "indices": signed.tolist(), "stability": "stable" if orbit.stable else "unstable", "bifurcation": kind,
         }  # fmt: skip
 
-    entries = [*map(entry, kinds, orbits, np.abs(indices))]
-    return {"value": family.parameter or "energy", "sizes": f"|{name}|", "orbits": entries}
+    entries = [*map(entry, kinds, orbits, indices.real)]
+    return {"value": family.parameter or "energy", "indices": f"Real part of the {name}", "orbits": entries}
 
 
 def _check(model: Model, ranges: Mapping[str, tuple[float, float]]) -> None:
