@@ -176,18 +176,18 @@ FEATURES = {
         ("with contacts", "crossings", "pass events= to the run"),
         (
             "with contacts by steps",
-            f"adaptive error run_error recording {_DERIVATIVES} work",
+            "adaptive error run_error recording tangent pullback sensitivity chaos periodic_orbit fit",
             "give {h}, or omit {transitions=}",
         ),
+        ("with nonholonomic constraints", "by_steps", "locate the transitions"),
+        ("with events that change the state", "by_steps", "make them terminal and restart"),
+        ("with kinks that runs locate", "by_steps", "locate the transitions"),
         (
             "without steps of contacts",
             "by_steps",
             "it requires contacts and svi:1 in double precision, named coordinates or known sizes, a kinetic energy "
             "that is quadratic in the velocities, no kinks and no damping=",
         ),
-        ("with nonholonomic constraints", "by_steps", "locate the transitions"),
-        ("with events that change the state", "by_steps", "make them terminal and restart"),
-        ("with kinks that runs locate", "by_steps", "locate the transitions"),
         ("with constraints", "observe_ensemble", "use coordinates without constraints, or omit it"),
         ("with constraints", "fit", "use coordinates without constraints, such as the angles of rods"),
         ("with nonholonomic constraints", "periodic_orbit", "use coordinates without constraints, or integrate"),

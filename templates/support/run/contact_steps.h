@@ -129,6 +129,15 @@ static int terms_between(contact_step *in)
   return NAME(row_terms)(in->t + in->h, in->q1, v, in->imposed, in->end.value);
 }
 
+/* Friction of a contact that takes part in a problem, static or that of sliding; without a gap half of the step's. */
+static void pose_friction(contact_step *in, int k, const row_terms *rows, int rests)
+{
+  const real part = CONTACTS[k].normal < 0 ? 0.5 * in->h : 1.0;
+  in->problem.rests[k] = rests;
+  in->problem.mu[k] = part * rows->coefficient[k][0];
+  in->problem.mu_static[k] = part * rows->coefficient[k][1];
+}
+
 /* Change x of q1 without contacts that satisfies the linearised step, in x also the forces of constraints. */
 static int linearise_step(contact_step *in, real *x)
 {
@@ -136,8 +145,7 @@ static int linearise_step(contact_step *in, real *x)
   for (int i = 0; i < M; i++) {
     x[i] = in->p[i] + 0.5 * (in->h * in->first.force[i] - in->first.momentum[i] - in->last.momentum[i]);
     for (int j = 0; j < M; j++)
-      A[i][j] = 0.5 * ((in->first.by_state[i][M + j] + in->last.by_state[i][M + j]) / in->h +
-          in->last.by_state[i][j] - in->first.by_state[M + i][M + j]);
+      A[i][j] = 0.5 * ((in->first.by_state[i][M + j] + in->last.by_state[i][M + j]) / in->h + in->last.by_state[i][j] - in->first.by_state[M + i][M + j]);
   }
   for (int c = 0; c < STEP_FIXED; c++)
     x[M + c] = -in->end.value[c];
@@ -216,17 +224,51 @@ static real norm_of(const contact_step *in, const real *x)
   return sqrt(fmax(sum, 0.0));
 }
 
+/* Rates of the row of a gap or a slip at a state. */
+static real rate_of(const row_terms *rows, int row, const real *v)
+{
+  return times_row(rows->G[STEP_FIXED + row], v) + rows->drift[STEP_FIXED + row];
+}
+
+/* Limits of friction, which the first solution of a problem chooses, for its further ones. */
+static void keep_limits(contact_step *in, const contact_memory *from)
+{
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    in->has_begun[k] = from->sticks[k] && in->problem.takes_part[k] && !in->problem.is_static[k];
+    in->problem.mu[k] = cone_limit(&in->problem, k);
+    in->problem.rests[k] = 0;
+  }
+}
+
+/* Contacts join whose gaps only the forces of others close; returns whether there is one. */
+static int find_missed(contact_step *in)
+{
+  int missed = 0;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int is_missed = in->is_near[k] && !in->problem.takes_part[k] &&
+        in->end.value[STEP_FIXED + CONTACTS[k].normal] < 0.0;
+    in->problem.takes_part[k] |= is_missed;
+    missed |= is_missed;
+    in->pushes[k] = CONTACTS[k].normal >= 0 && in->problem.takes_part[k] && in->problem.mode[k].pushes;
+  }
+  return missed;
+}
+
+/* x += X f with responses X. */
+static void add_responses(const contact_step *in, const real *f, real *x)
+{
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    for (int i = 0; i < M && f[r] != 0.0; i++)
+      x[i] += in->response[r][i] * f[r];
+}
+
 /* Solves the first problem for q1 and the impulses f1: Newton's method on both at once, a contact problem an iteration. */
 static int find_positions(contact_step *in, const contact_memory *from)
 {
   real size = 0.0, *const f = in->problem.f;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const int normal = CONTACTS[k].normal;
-    const real part = normal < 0 ? 0.5 * in->h : 1.0;
-    in->problem.takes_part[k] = in->is_near[k] && (normal < 0 || from->pushes[k]);
-    in->problem.rests[k] = from->sticks[k];
-    in->problem.mu[k] = part * in->start.coefficient[k][0];
-    in->problem.mu_static[k] = part * in->start.coefficient[k][1];
+    in->problem.takes_part[k] = in->is_near[k] && (CONTACTS[k].normal < 0 || from->pushes[k]);
+    pose_friction(in, k, &in->start, from->sticks[k]);
   }
   for (int r = 0; r < CONTACT_ROWS; r++)
     f[r] = in->h * from->force[r];
@@ -234,27 +276,19 @@ static int find_positions(contact_step *in, const contact_memory *from)
     in->q1[i] = in->q[i] + in->h * in->v[i];
   for (int iteration = 0; iteration < STEP_ITERATIONS; iteration++) {
     real x[STEP_SIZE], rounding[M];
-    int slow = 0, missed = 0;
+    int slow;
     TRY(terms_between(in));
     if (iteration == 0)
       TRY(factorise_step(NULL, &in->first, &in->start, &in->start, &in->resting));
     TRY(linearise_step(in, x));
     find_near(in, x);
-    if (iteration == 0) {
-      for (int i = 0; i < M; i++)
-        rounding[i] = in->h * in->v[i];
-      size = STEP_UPDATE * (norm_of(in, rounding) + norm_of(in, x));
-    }
+    for (int i = 0; i < M; i++)
+      rounding[i] = in->h * in->v[i];
+    size = iteration == 0 ? STEP_UPDATE * (norm_of(in, rounding) + norm_of(in, x)) : size;
     TRY(solve_positions(in, from, x, iteration == 0, &slow));
-    for (int k = 0; k < EVENT_CONTACTS && iteration == 0; k++)
-      in->has_begun[k] = from->sticks[k] && in->problem.takes_part[k] && !in->problem.is_static[k];
-    for (int k = 0; k < EVENT_CONTACTS && iteration == 0; k++) {
-      in->problem.mu[k] = cone_limit(&in->problem, k);
-      in->problem.rests[k] = 0;
-    }
-    for (int r = 0; r < CONTACT_ROWS; r++)
-      for (int i = 0; i < M && f[r] != 0.0; i++)
-        x[i] += in->response[r][i] * f[r];
+    if (iteration == 0)
+      keep_limits(in, from);
+    add_responses(in, f, x);
     for (int i = 0; i < M; i++) {
       in->q1[i] += x[i];
       rounding[i] = CONTACT_LOWEST * DBL_EPSILON * fabs(in->q1[i]);
@@ -262,17 +296,8 @@ static int find_positions(contact_step *in, const contact_memory *from)
     if (!(norm_of(in, x) <= (slow ? STEP_SLOW_UPDATE / STEP_UPDATE : 1.0) * size + norm_of(in, rounding)))
       continue;
     TRY(terms_between(in));
-    for (int k = 0; k < EVENT_CONTACTS; k++) { /* gaps that only the forces of others close */
-      const int is_missed = in->is_near[k] && !in->problem.takes_part[k] &&
-          in->end.value[STEP_FIXED + CONTACTS[k].normal] < 0.0;
-      in->problem.takes_part[k] |= is_missed;
-      missed |= is_missed;
-    }
-    if (missed)
-      continue;
-    for (int k = 0; k < EVENT_CONTACTS; k++)
-      in->pushes[k] = CONTACTS[k].normal >= 0 && in->problem.takes_part[k] && in->problem.mode[k].pushes;
-    return OK;
+    if (!find_missed(in))
+      return OK;
   }
   return NOT_CONVERGED;
 }
@@ -285,15 +310,6 @@ static real half_product(const contact_step *in, const real *v, const real *w)
     for (int j = 0; j < M; j++)
       sum += 0.5 * v[i] * in->last.by_state[i][M + j] * w[j];
   return sum;
-}
-
-/* Velocities after impulses of the second problem. */
-static void velocities_after(const contact_step *in, const real *before, const real *f, real *v)
-{
-  memcpy(v, before, BYTES(M));
-  for (int r = 0; r < CONTACT_ROWS; r++)
-    for (int i = 0; i < M && f[r] != 0.0; i++)
-      v[i] += in->response[r][i] * f[r];
 }
 
 /* Work of moving surfaces by impulses of the rows of a state. */
@@ -315,12 +331,10 @@ static int rebound(contact_step *in, const contact_memory *from, const real *f1,
   int bounces = 0;
   memcpy(f, of->f, sizeof f);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
     if (!in->pushes[k] || from->is_closed[k])
       continue;
-    const real rate = times_row(in->start.G[row], in->v) + in->start.drift[row];
-    const real target = in->start.coefficient[k][2] * fmin(rate, 0.0);
-    of->b[normal] += target;
+    const real target = in->start.coefficient[k][2] * fmin(rate_of(&in->start, CONTACTS[k].normal, in->v), 0.0);
+    of->b[CONTACTS[k].normal] += target;
     bounces |= target < 0.0;
   }
   if (!bounces)
@@ -331,7 +345,8 @@ static int rebound(contact_step *in, const contact_memory *from, const real *f1,
   room -= energy - half_product(in, v, v) - work_of_surfaces(&in->start, f1);
   if (!solve_cone_within(of, STEP_POINTS))
     return NOT_CONVERGED;
-  velocities_after(in, before, of->f, w);
+  memcpy(w, before, sizeof w);
+  add_responses(in, of->f, w);
   for (int i = 0; i < M; i++)
     w[i] -= v[i];
   const real plastic = work_of_surfaces(&in->end, f);
@@ -374,17 +389,13 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   memcpy(before, x, sizeof before);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
-    const real part = normal < 0 ? 0.5 * in->h : 1.0;
-    of->takes_part[k] = in->is_near[k] && (normal < 0 || in->pushes[k] ||
-        in->end.value[row] <= CONTACT_LOWEST * DBL_EPSILON * size_by_position(in->end.G[row], in->q1));
-    of->rests[k] = from.sticks[k] && !in->has_begun[k];
-    of->mu[k] = part * in->end.coefficient[k][0];
-    of->mu_static[k] = part * in->end.coefficient[k][1];
+    of->takes_part[k] = in->is_near[k] && (normal < 0 || in->pushes[k] || in->end.value[row] <= CONTACT_LOWEST * DBL_EPSILON * size_by_position(in->end.G[row], in->q1));
+    pose_friction(in, k, &in->end, from.sticks[k] && !in->has_begun[k]);
   }
   respond(in, &in->moving, &in->end, in->response);
   pose_matrix(in, &in->end, in->response, 1.0);
   for (int r = 0; r < CONTACT_ROWS; r++) {
-    of->b[r] = times_row(in->end.G[STEP_FIXED + r], before) + in->end.drift[STEP_FIXED + r];
+    of->b[r] = rate_of(&in->end, r, before);
     of->terms[r] = fabs(of->b[r]);
     fastest = fmax(fastest, of->terms[r]);
   }
@@ -392,7 +403,8 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   to->compliance = fmax(to->compliance, of->compliance);
   if (!solve_cone_within(of, STEP_POINTS))
     return NOT_CONVERGED;
-  velocities_after(in, before, of->f, v);
+  memcpy(v, before, sizeof v);
+  add_responses(in, of->f, v);
   TRY(rebound(in, &from, f1, before, v, workspace));
   to->residual = fmax(to->residual, of->residual);
   to->compliance = fmax(to->compliance, of->compliance);
@@ -401,8 +413,8 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   for (int r = 0; r < CONTACT_ROWS; r++)
     to->force[r] = f1[r] / in->h;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
-    const real rate = normal < 0 ? 0.0 : times_row(in->end.G[row], v) + in->end.drift[row];
+    const int normal = CONTACTS[k].normal;
+    const real rate = normal < 0 ? 0.0 : rate_of(&in->end, normal, v);
     to->pushes[k] = in->pushes[k];
     to->is_closed[k] = of->takes_part[k] && rate <= CONTACT_ROUNDING * fastest;
     to->sticks[k] = to->is_closed[k] && of->mode[k].sticks;
@@ -411,9 +423,22 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   return OK;
 }
 
-/* Contacts whose conditions hold at a state and whose surface it is not behind. */
-static int find_existing(contact_step *in, const real *parameters, real *workspace)
+static void begin_step(contact_step *in, const contact_memory *memory, real t, real h, const real *q, const real *p)
 {
+  in->t = t;
+  in->h = h;
+  memcpy(in->q, q, BYTES(M));
+  memcpy(in->p, p, BYTES(M));
+  memcpy(in->v, memory->v, BYTES(M));
+}
+
+/* Rows at the start, and contacts whose conditions hold there and whose surface it is not behind. */
+static int find_existing(contact_step *in, real *workspace)
+{
+  TRY(NAME(row_terms)(in->t, in->q, in->v, in->imposed, in->start.value));
+  in->fastest = 0.0;
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    in->fastest = fmax(in->fastest, fabs(rate_of(&in->start, r, in->v)));
   for (int k = 0; k < EVENT_CONTACTS; k++)
     in->is_near[k] = 1;
   for (int i = 0; i < TRANSITIONS; i++) {
@@ -421,7 +446,7 @@ static int find_existing(contact_step *in, const real *parameters, real *workspa
     int exists;
     if (TRANSITION[i][1] != CONTACT_CLOSES || !IS_CONDITIONAL[event])
       continue;
-    TRY(conditions(EVENT_FIRST[event], in->t, in->q, in->p, parameters, &exists, workspace));
+    TRY(conditions(EVENT_FIRST[event], in->t, in->q, in->p, in->idle, &exists, workspace));
     in->is_near[k] = exists &&
         in->start.value[row] >= -CONTACT_PENETRATION * size_by_position(in->start.G[row], in->q);
   }
@@ -434,16 +459,8 @@ static int step_by_steps(contact_step *in, contact_memory *memory, real t, real 
 {
   contact_memory next = *memory;
   int status;
-  in->t = t;
-  in->h = h;
-  memcpy(in->q, q, BYTES(M));
-  memcpy(in->p, p, BYTES(M));
-  memcpy(in->v, memory->v, BYTES(M));
-  TRY(NAME(row_terms)(t, q, in->v, in->imposed, in->start.value));
-  TRY(find_existing(in, in->idle, workspace));
-  in->fastest = 0.0;
-  for (int r = STEP_FIXED; r < STEP_ROWS; r++)
-    in->fastest = fmax(in->fastest, fabs(times_row(in->start.G[r], in->v) + in->start.drift[r]));
+  begin_step(in, memory, t, h, q, p);
+  TRY(find_existing(in, workspace));
   status = find_positions(in, memory);
   if (status == OK)
     status = find_velocities(in, &next, workspace);
@@ -476,17 +493,11 @@ static void put_memory(const contact_memory *memory, real *mode)
 static int begin_by_steps(contact_step *in, event_run *run, event_watch *watch, real *workspace)
 {
   contact_memory *const memory = &watch->steps;
-  real fastest = 0.0;
   TRY(NAME(velocity)(run->t, run->q, run->p, in->idle, memory->v, workspace));
-  in->t = run->t;
-  memcpy(in->q, run->q, BYTES(M));
-  memcpy(in->p, run->p, BYTES(M));
-  TRY(NAME(row_terms)(run->t, run->q, memory->v, in->imposed, in->start.value));
-  TRY(find_existing(in, in->idle, workspace));
-  for (int r = STEP_FIXED; r < STEP_ROWS; r++)
-    fastest = fmax(fastest, fabs(times_row(in->start.G[r], memory->v) + in->start.drift[r]));
+  begin_step(in, memory, run->t, run->h, run->q, run->p);
+  TRY(find_existing(in, workspace));
   for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal, slip = STEP_FIXED + CONTACTS[k].tangential;
+    const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
     const real size = normal < 0 ? 0.0 : size_by_position(in->start.G[row], run->q);
     const real gap = normal < 0 ? 0.0 : in->start.value[row];
     real w[2] = {0.0};
@@ -497,10 +508,10 @@ static int begin_by_steps(contact_step *in, event_run *run, event_watch *watch, 
       return NOT_CONVERGED;
     }
     for (int i = 0; i < CONTACTS[k].slips; i++)
-      w[i] = times_row(in->start.G[slip + i], memory->v) + in->start.drift[slip + i];
+      w[i] = rate_of(&in->start, CONTACTS[k].tangential + i, memory->v);
     const real speed = length_of(w, 2);
     memory->is_closed[k] = in->is_near[k] && gap <= CONTACT_ROUNDING * size;
-    memory->sticks[k] = memory->is_closed[k] && CONTACTS[k].slips > 0 && speed <= CONTACT_ROUNDING * fastest;
+    memory->sticks[k] = memory->is_closed[k] && CONTACTS[k].slips > 0 && speed <= CONTACT_ROUNDING * in->fastest;
     for (int i = 0; i < 2; i++)
       memory->direction[k][i] = w[i] / fmax(speed, DBL_MIN);
   }
