@@ -218,7 +218,7 @@ class CrossingSearch:
     def transitions(self, recorded: Sequence[NDArray[Any]]) -> tuple[Switches, ...]:
         """Return the transitions of contacts, and the changes of the side of each kink, among some of the records."""
         kinks = len(self.stepper.searched) - len(self.stepper.events)
-        if not kinks:
+        if not kinks or self.stepper.by_steps:  # whose changes of modes have no functions
             return ()
         records = self._joined(recorded)
         records = records[records["direction"] != 0]  # without touches, which keep their side

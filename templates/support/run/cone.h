@@ -263,6 +263,7 @@ static void cone_gather(cone_problem *in, const int *member, cone_block *of, rea
   real start[CONTACT_ROWS];
   of->count = of->parts = 0;
   of->weight = of->size = 0.0;
+  memset(of->near, 0, sizeof of->near);
   for (int k = 0; k < EVENT_CONTACTS; k++)
     if (member[k])
       cone_part_of(in, k, of);
@@ -426,8 +427,10 @@ static int solve_cone_within(cone_problem *in, int most_points)
     for (int j = 0; j < EVENT_CONTACTS; j++)
       done[j] |= member[j];
   }
-  for (int r = 0; r < CONTACT_ROWS; r++)
-    in->u[r] = cone_rate(in, r);
+  memcpy(in->u, in->b, sizeof in->u);
+  for (int j = 0; j < CONTACT_ROWS; j++) /* rows of others may be undefined */
+    for (int r = 0; r < CONTACT_ROWS && in->f[j] != 0.0; r++)
+      in->u[r] += in->W[r * CONTACT_ROWS + j] * in->f[j];
   return solved;
 }
 

@@ -367,16 +367,14 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
 {
   cone_problem *const of = &in->problem;
   const contact_memory from = *to;
-  real x[STEP_SIZE], f1[CONTACT_ROWS], before[M], v[M], work, fastest = 0.0;
+  real x[STEP_SIZE], f1[CONTACT_ROWS], before[M], v[M], work = 0.0, fastest = 0.0;
   memcpy(f1, of->f, sizeof f1);
-  work = 0.0;
+  memcpy(v, in->v, sizeof v); /* the mean of those before and after f1 */
   for (int r = 0; r < CONTACT_ROWS; r++)
-    for (int i = 0; i < M && f1[r] != 0.0; i++) {
-      real kick = in->v[i];
-      for (int s = 0; s < CONTACT_ROWS; s++)
-        kick += f1[s] == 0.0 ? 0.0 : 0.5 * in->at_start[s][i] * f1[s];
-      work += f1[r] * in->start.G[STEP_FIXED + r][i] * kick;
-    }
+    for (int i = 0; i < M && f1[r] != 0.0; i++)
+      v[i] += 0.5 * in->at_start[r][i] * f1[r];
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    work += f1[r] == 0.0 ? 0.0 : f1[r] * times_row(in->start.G[STEP_FIXED + r], v);
   for (int i = 0; i < M; i++) {
     x[i] = 0.5 * (in->h * in->last.force[i] + in->first.momentum[i] - in->last.momentum[i]);
     for (int j = 0; j < M; j++)
