@@ -301,7 +301,11 @@ class Stepper(OfSteppers, Integrator):
         return stepper
 
     def by_transitions(self, transitions: str) -> Self:
-        """Return the stepper whose runs treat transitions of contacts so: "located" or "by steps"; MethodError."""
+        """Return the stepper whose runs locate transitions of contacts, ``"located"``, or take steps, ``"by steps"``.
+
+        Raises:
+            MethodError: if the stepper has no steps of contacts, as those of other methods than svi:1.
+        """
         OPTION["transitions"].checked(transitions)
         return self if transitions == LOCATED else self.with_steps_of_contacts
 

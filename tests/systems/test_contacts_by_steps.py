@@ -2,6 +2,7 @@
 
 import pickle
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -287,3 +288,57 @@ def test_thrown_bipeds_rest() -> None:
         assert lowest(run.q).min() > -PENETRATES
         assert abs(run.q[-200:] - run.q[-1]).max() < CREEPS
         assert run.contact_residual < 1e-10
+
+
+@pytest.mark.rotated
+def test_spheres_roll_whose_attitude_is_a_rotation() -> None:
+    """Rolling has the velocity (5 v + 2 r w)/7; quaternions keep their length."""
+    sphere = sc.LagrangianSystem.from_text(
+        "sphere",
+        ["x", "y", "z"],
+        "x_dot**2 + y_dot**2 + z_dot**2 + (omega_1**2 + omega_2**2 + omega_3**2)/10 - 19.62*z",
+        rotations={"R": "omega"},
+    )
+    wx, wy = (f"rotate_{k}(R, omega_1, omega_2, omega_3)" for k in (1, 2))
+    plane = sc.contact("z - 0.5", slip=[f"x_dot - {wy}/2", f"y_dot + {wx}/2"], friction=0.3)
+    run = sc.compile_stepper(sphere, "svi:1", contacts=[plane]).integrate(
+        {"x": 0, "y": 0, "z": 0.5, "R": [1, 0, 0, 0]},
+        velocity={"x": 3, "y": 1, "z": 0, "omega": [-2, 4, 5]},
+        h=2e-3,
+        t_end=1.0,
+        **BY_STEPS,
+    )
+    assert run.contact_modes[-1][1] == ("stick",)
+    assert np.allclose(run.velocity[-1, :3], [(5 * 3 + 4) / 7, (5 * 1 + 2) / 7, 0], rtol=0, atol=1e-6)
+    assert abs(np.linalg.norm(run.q[:, 3:], axis=1) - 1).max() < 1e-11
+
+
+ROBOT = """
+<mujoco model="hopper">
+  <default> <joint axis="0 1 0"/> <geom type="capsule" size="0.04" friction="0.7"/> </default>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 0.1"/>
+    <body name="trunk" pos="0 0 0.6">
+      <joint name="x" type="slide" axis="1 0 0"/> <joint name="z" type="slide" axis="0 0 1"/> <joint name="pitch"/>
+      <geom fromto="-0.2 0 0 0.2 0 0" mass="6"/>
+      <body name="leg"> <joint name="hip" damping="1" range="-60 60"/> <geom fromto="0 0 0 0 0 -0.4" mass="1"/> </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.rotated
+def test_robots_of_files_rest_on_their_limits(tmp_path: Path) -> None:
+    (tmp_path / "hopper.xml").write_text(ROBOT)
+    robot = sc.LagrangianSystem.from_mjcf(tmp_path / "hopper.xml", limits="contact", contacts="planes")
+    stepper = sc.compile_stepper(robot, "svi:1")
+    random = np.random.default_rng(4)
+    for _ in range(4):
+        start = {"x": 0.0, "z": 0.0, "pitch": random.uniform(-0.5, 0.5), "hip": random.uniform(-1, 1)}
+        run = stepper.integrate(
+            start, velocity=dict.fromkeys(start, 0.0) | {"x": random.normal()}, h=2e-3, t_end=10.0, **BY_STEPS
+        )
+        assert run.p[-1] @ run.velocity[-1] < RESTS * np.ptp(run.energy())
+        assert abs(run["hip"]).max() < np.pi / 3 + PENETRATES
+        assert run.contact_residual < 1e-6
