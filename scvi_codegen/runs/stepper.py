@@ -229,7 +229,7 @@ class Stepper(OfSteppers, Integrator):
             save_every = checked_count(save_every, "save_every", least=1)
         is_plain = events is None and not action and transitions == LOCATED
         stepper: Stepper = self if is_plain else self._for_run(events, action=action, transitions=transitions)
-        interface = self.interface
+        interface, inputs = self.interface, inputs or None
         noise = stepper._noise(seed, metropolis, inputs) if seed != 0 or metropolis else None
         if not (inputs is None and t_eval is None and observe is None and tables is None and threads is None):
             from scvi_codegen.runs.results.dense_output import check_has_end
@@ -294,11 +294,11 @@ class Stepper(OfSteppers, Integrator):
         self, events: EventLike | Sequence[EventLike] | None, *, action: bool, transitions: str = LOCATED
     ) -> Self:
         """Return the stepper of runs with these events, ``None`` for its own, that sum the action if requested."""
-        stepper = (self if events is None else self.with_events(events)).by_transitions(transitions)
-        if action:
-            require(stepper, "action")
-            return stepper.acting
-        return stepper
+        stepper = self.with_events(events).by_transitions(transitions)
+        if not action:
+            return stepper
+        require(stepper, "action")
+        return stepper.acting
 
     def by_transitions(self, transitions: str) -> Self:
         """Return the stepper whose runs locate transitions of contacts, ``"located"``, or take steps, ``"by steps"``.
@@ -317,9 +317,7 @@ class Stepper(OfSteppers, Integrator):
 
         if tolerance < LOOSE:
             return self
-        stepper = self._looser()
-        if self.events:
-            stepper = stepper.with_events(self.events)
+        stepper = self._looser().with_events(self.events)
         return stepper.acting if self.sums_action else stepper
 
     def _bounded(self, motion: BoundedMotion) -> Trajectory:
@@ -612,6 +610,7 @@ class Stepper(OfSteppers, Integrator):
             MethodError: if the system has no constraints.
             StateError: if the iteration fails, or if the constraints are linearly dependent there.
         """
+        require(self, "project")
         momenta = self._initial_momenta(
             q, p, np.zeros(self.dimension) if p is velocity is None else velocity, t, parameters
         )
