@@ -130,7 +130,7 @@ static int terms_between(contact_step *in)
 }
 
 /* Friction of a contact that takes part in a problem, static or that of sliding; without a gap half of the step's. */
-static void pose_friction(contact_step *in, int k, const row_terms *rows, int rests)
+static void pose_limits(contact_step *in, int k, const row_terms *rows, int rests)
 {
   const real part = CONTACTS[k].normal < 0 ? 0.5 * in->h : 1.0;
   in->problem.rests[k] = rests;
@@ -268,7 +268,7 @@ static int find_positions(contact_step *in, const contact_memory *from)
   real size = 0.0, *const f = in->problem.f;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     in->problem.takes_part[k] = in->is_near[k] && (CONTACTS[k].normal < 0 || from->pushes[k]);
-    pose_friction(in, k, &in->start, from->sticks[k]);
+    pose_limits(in, k, &in->start, from->sticks[k]);
   }
   for (int r = 0; r < CONTACT_ROWS; r++)
     f[r] = in->h * from->force[r];
@@ -388,7 +388,7 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
     of->takes_part[k] = in->is_near[k] && (normal < 0 || in->pushes[k] || in->end.value[row] <= CONTACT_LOWEST * DBL_EPSILON * size_by_position(in->end.G[row], in->q1));
-    pose_friction(in, k, &in->end, from.sticks[k] && !in->has_begun[k]);
+    pose_limits(in, k, &in->end, from.sticks[k] && !in->has_begun[k]);
   }
   respond(in, &in->moving, &in->end, in->response);
   pose_matrix(in, &in->end, in->response, 1.0);
@@ -421,7 +421,7 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   return OK;
 }
 
-static void begin_step(contact_step *in, const contact_memory *memory, real t, real h, const real *q, const real *p)
+static void take_state(contact_step *in, const contact_memory *memory, real t, real h, const real *q, const real *p)
 {
   in->t = t;
   in->h = h;
@@ -457,7 +457,7 @@ static int step_by_steps(contact_step *in, contact_memory *memory, real t, real 
 {
   contact_memory next = *memory;
   int status;
-  begin_step(in, memory, t, h, q, p);
+  take_state(in, memory, t, h, q, p);
   TRY(find_existing(in, workspace));
   status = find_positions(in, memory);
   if (status == OK)
@@ -492,7 +492,7 @@ static int begin_by_steps(contact_step *in, event_run *run, event_watch *watch, 
 {
   contact_memory *const memory = &watch->steps;
   TRY(NAME(velocity)(run->t, run->q, run->p, in->idle, memory->v, workspace));
-  begin_step(in, memory, run->t, run->h, run->q, run->p);
+  take_state(in, memory, run->t, run->h, run->q, run->p);
   TRY(find_existing(in, workspace));
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
