@@ -54,6 +54,9 @@ def our_contacts(case: Case, quick: bool) -> Iterator[Contender]:
     for degree in (3,) if quick else (1, 2, 3):
         stepper, seconds = compiled(case.system, f"svi:{degree}")
         yield from _contenders(case, f"{OURS} svi:{degree}", OUR_STEPS, seconds, partial(run, stepper))
+    stepper, seconds = compiled(case.system, "svi:1")
+    by_steps = partial(run, stepper.by_transitions("by steps"))
+    yield from _contenders(case, f"{OURS} by steps", STEPS[: 2 if quick else None], seconds, by_steps)
 
 
 def _sampled(h: float, times: list[float], advance: Callable[[int], object], first: Callable[[], float]) -> Array:

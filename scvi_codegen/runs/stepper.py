@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.codegen.native.binding import ON_CONSTRAINTS
+from scvi_codegen.codegen.native.option_table import LOCATED, OPTION
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.common.errors import MethodError, StateError
@@ -76,6 +77,7 @@ class Stepper(OfSteppers, Integrator):
     def _copy(self, events: tuple[Event, ...], source: Source | None = None) -> Self:
         copy = super()._copy(events, source)
         copy._precise, copy._doubles, copy._finer = self._precise, self._doubles, self._finer
+        copy.by_steps = self.by_steps
         return copy
 
     @property
@@ -113,7 +115,9 @@ class Stepper(OfSteppers, Integrator):
             reason=self._reason,
             looser=self._looser,
         )
-        further: dict[str, Any] = {} if self._finer is None else {"_finer": self._finer}
+        further: dict[str, Any] = {"by_steps": True} if self.by_steps else {}
+        if self._finer is not None:
+            further["_finer"] = self._finer
         if self._doubles is not None and self.events:
             further["_doubles"] = constantly(self._doubles())
         return made, (self._plain, self.interface), further
@@ -148,6 +152,7 @@ class Stepper(OfSteppers, Integrator):
         action: bool = False,
         seed: int = 0,
         metropolis: bool = False,
+        transitions: str = LOCATED,
     ) -> Trajectory:
         """Integrate ``steps`` steps of h, or to t_end, and save every ``save_every``-th state and the initial one.
 
@@ -207,6 +212,8 @@ class Stepper(OfSteppers, Integrator):
             seed: with a bath or coloured noise, key of the noise, a whole number, by default 0. Noise is a function
                 of the seed, the trajectory, the number of the step and the coordinate.
             metropolis: accept or reject each step, so that averages have no error of the step size.
+            transitions: of contacts, ``"located"`` or ``"by steps"`` of a fixed size h without transitions, by svi:1,
+                for feet and piles (docs/contacts.md).
 
         Returns:
             A :class:`Trajectory` of steps // save_every + 1 states, fewer if an event ended it; with inputs states
@@ -220,7 +227,8 @@ class Stepper(OfSteppers, Integrator):
         """
         if type(save_every) is not int or save_every != 1:
             save_every = checked_count(save_every, "save_every", least=1)
-        stepper: Stepper = self if events is None and not action else self._for_run(events, action=action)
+        is_plain = events is None and not action and transitions == LOCATED
+        stepper: Stepper = self if is_plain else self._for_run(events, action=action, transitions=transitions)
         interface, inputs = self.interface, inputs or None
         noise = stepper._noise(seed, metropolis, inputs) if seed != 0 or metropolis else None
         if not (inputs is None and t_eval is None and observe is None and tables is None and threads is None):
@@ -282,13 +290,24 @@ class Stepper(OfSteppers, Integrator):
 
         return partial(integrated, self)
 
-    def _for_run(self, events: EventLike | Sequence[EventLike] | None, *, action: bool) -> Self:
+    def _for_run(
+        self, events: EventLike | Sequence[EventLike] | None, *, action: bool, transitions: str = LOCATED
+    ) -> Self:
         """Return the stepper of runs with these events, ``None`` for its own, that sum the action if requested."""
-        stepper = self.with_events(events)
+        stepper = self.with_events(events).by_transitions(transitions)
         if not action:
             return stepper
         require(stepper, "action")
         return stepper.acting
+
+    def by_transitions(self, transitions: str) -> Self:
+        """Return the stepper whose runs locate transitions of contacts, ``"located"``, or take steps, ``"by steps"``.
+
+        Raises:
+            MethodError: if the stepper has no steps of contacts, as those of other methods than svi:1.
+        """
+        OPTION["transitions"].checked(transitions)
+        return self if transitions == LOCATED else self.with_steps_of_contacts
 
     def _at_tolerance(self, tolerance: float | None) -> Self:
         """Return the stepper of adaptive runs of a tolerance, whose degree follows it unless the method was named."""
@@ -370,10 +389,12 @@ class Stepper(OfSteppers, Integrator):
         """Return (q, p), or q and the momenta of a velocity, on the constraints."""
         q, p, velocity, t, parameters, _ = initial
         p = self._initial_momenta(q, p, velocity, t, parameters)
-        if self.interface.contacts:
+        if self.interface.contacts and not self.by_steps:
             from scvi_codegen.runs.events.contacts import in_first_modes
 
             return in_first_modes(self, q, p, t, parameters, duration_of(plan, t))
+        if len(self.interface.constraints) == self.interface.masked:
+            return q, p
         return consistent(self, q, p, t, parameters)
 
     @property
@@ -500,6 +521,7 @@ class Stepper(OfSteppers, Integrator):
         seed: int = 0,
         metropolis: bool = False,
         precision: str = "double",
+        transitions: str = LOCATED,
     ) -> EnsembleTrajectory:
         """Run k trajectories on all cores, with common fixed steps (SIMD lanes) or with adaptive steps for each.
 
@@ -529,6 +551,7 @@ class Stepper(OfSteppers, Integrator):
                 float32 with compensated sums, so that states have some 45 bits, and are float64. The step size,
                 parameters, constants and the time in forces are rounded to 24 bits (docs/ensembles.md). A trajectory
                 whose step fails is continued in double precision.
+            transitions: of contacts, as of :meth:`integrate`.
 
         Returns:
             An :class:`EnsembleTrajectory`; states equal those of :meth:`integrate` to round-off. A trajectory that
@@ -541,9 +564,10 @@ class Stepper(OfSteppers, Integrator):
         from scvi_codegen.runs.ensembles.ensemble import EnsembleSettings, settings_in
 
         settings = EnsembleSettings(*settings_in(locals()))
-        runs = self.products.ensemble_runs(q, p, settings, velocity=velocity, action=action)
+        stepper = self.by_transitions(transitions)
+        runs = stepper.products.ensemble_runs(q, p, settings, velocity=velocity, action=action)
         runs.run(progress=progress, threads=threads)
-        return self.products.ensemble_result(runs)
+        return stepper.products.ensemble_result(runs)
 
     def _ensemble(
         self,

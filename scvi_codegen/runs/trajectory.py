@@ -42,7 +42,7 @@ from scvi_codegen.runs.results.joining import (
 from scvi_codegen.runs.results.quantities import describe_states, describe_step_size, quantities_in_modes, quantities_of
 from scvi_codegen.runs.results.recomputation import work_and_impulses_until, work_until
 from scvi_codegen.runs.results.recorded import OfMethod, WithUnsetAttributes, changed, without
-from scvi_codegen.runs.results.saved_states import Array, ModeHistory, checked_row, in_modes
+from scvi_codegen.runs.results.saved_states import Array, ContactsBySteps, ModeHistory, checked_row, in_modes
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.rotation_quantities import named_quantities
 from scvi_codegen.runs.states.validation import columns_of_inputs
@@ -396,6 +396,28 @@ class Trajectory(
         changes = [change for run in self._runs for change in contact_modes(run)]
         return [change for k, change in enumerate(changes) if not k or change[1] != changes[k - 1][1]]
 
+    @property
+    def _by_steps(self) -> ContactsBySteps:
+        last = self._runs[-1].modes
+        if last is None or last.by_steps is None:
+            raise StateError("this is known of runs with contacts by steps: integrate(.., transitions='by steps')")
+        return last.by_steps
+
+    @property
+    def contact_residual(self) -> float:
+        """Largest residual of the contact problems of a run by steps, relative to their forces and rates."""
+        return self._by_steps.residual
+
+    @property
+    def compliance(self) -> float:
+        """Largest compliance of contacts of a run by steps, relative to that by inertia; 0 where they were rigid."""
+        return self._by_steps.compliance
+
+    @property
+    def lost_energy(self) -> float:
+        """Energy that contacts took in a run by steps, negative where surfaces that move supply more."""
+        return self._by_steps.lost_energy
+
     def contact_forces(self) -> Array:
         """Return (n, k, 2) normal and tangential forces of the k contacts; at a transition those after it.
 
@@ -517,6 +539,7 @@ class Trajectory(
         """
         if not (asked := as_events(events)):
             raise EventError("crossings requires at least one event, such as 'q' or Event('q', direction=1)")
+        require(self.stepper, "crossings")
         stepper = self.stepper.with_events(asked)
         by_piece = [crossings_of(stepper, piece) for piece in self._runs]
         return tuple(map(joined_crossings, zip(*by_piece, strict=True)))

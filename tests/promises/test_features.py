@@ -99,6 +99,9 @@ SITUATIONS = {
     "with contacts": lambda: sc.compile_stepper(
         sc.LagrangianSystem.from_text("body", ["q"], "q_dot**2/2 - q"), "svi:2", contacts=[sc.contact("q + 1")]
     ),
+    "with contacts by steps": lambda: sc.compile_stepper(
+        sc.LagrangianSystem.from_text("body", ["q"], "q_dot**2/2 - q"), "svi:1", contacts=[sc.contact("q + 1")]
+    ).by_transitions("by steps"),
     "with kinks that runs locate": lambda: stepper_of(lagrangian="q_dot**2/2 - q**2/2 - positive_part(q - 0.25)**2"),
     "where L or H jumps": lambda: stepper_of(lagrangian="q_dot**2/2 - q**2/2 - unit_step(q - 0.25)"),
     "with constraints of arrays": lambda: array_with_constraint("stoermer-verlet"),
@@ -119,7 +122,10 @@ SITUATIONS = {
     "": stepper_of,
 }
 """Steppers with the properties of the table; one without any lacks constraints, work, a mesh and run-time sizes."""
-PLAIN = ("without constraints", "without the work of forces", "without a mesh", "with sizes known when compiled")
+PLAIN = (
+    *("without constraints", "without the work of forces", "without a mesh", "with sizes known when compiled"),
+    "without steps of contacts",
+)
 
 
 def run_of(stepper, **arguments):
@@ -153,6 +159,8 @@ OPERATIONS = {
     "ensembles": lambda s: s.integrate_ensemble(*map(stacked, state_of(s)), h=0.1, steps=3),
     "observe_ensemble": lambda s: s.integrate_ensemble(*map(stacked, state_of(s)), h=0.1, steps=3, observe="extremes"),
     "single": lambda s: s.integrate_ensemble(*map(stacked, state_of(s)), h=0.1, steps=3, precision="single"),
+    "by_steps": lambda s: s.by_transitions("by steps"),
+    "crossings": lambda s: run_of(s).crossings("t - 0.17"),
     "checkpoint": lambda s: s.start(*state_of(s), h=0.1, **end_of(s)).checkpoint(),
     "recording": lambda s: sc.record_run(
         s.start(*state_of(s), h=0.1, **end_of(s)), mkdtemp() + "/a.run", steps=None if end_of(s) else 3
@@ -180,6 +188,7 @@ OPERATIONS = {
 """Each operation of the table that one stepper can run; inputs have their own tests."""
 OF_OTHER_STATES = {
     "with contacts": {"jacobian", "multipliers", "work", "discrete_lagrangian"},  # modes as parameters
+    "with contacts by steps": {"jacobian", "multipliers", "work", "discrete_lagrangian"},
     "with kinks that runs locate": {"shadow_energy"},  # runs that cross none
 }
 """Operations that these situations support, but not with the states of ``OPERATIONS``."""

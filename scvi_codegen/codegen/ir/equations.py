@@ -158,6 +158,9 @@ class Constraints:
         masked: number of the last constraints, which are imposed in some modes only.
         coefficients: friction, static friction and restitution of each contact at u = (q, v), or ``None``.
         coefficient_rounding: bounds of their rounding errors, in units of the round-off.
+        motion_by_steps: L_v and L_q + f without contacts at u = (q, v), then their derivatives in ``motion_entries``,
+            columns (q, v); ``None`` if the method has no steps of contacts.
+        drifts: rates of the constraints at rest, by time.
     """
 
     formulas: tuple[str, ...] = ()
@@ -170,6 +173,9 @@ class Constraints:
     masked: int = 0
     coefficients: Kernel | None = None
     coefficient_rounding: Kernel | None = None
+    motion_by_steps: Kernel | None = None
+    motion_entries: tuple[tuple[int, int], ...] = ()
+    drifts: Kernel | None = None
 
     def __len__(self) -> int:
         return len(self.formulas)
@@ -183,7 +189,7 @@ class Constraints:
     def kernels(self) -> tuple[Kernel | None, ...]:
         """Those that the constraints have, in the order of emission."""
         reactions = self.reactions, self.coefficients, self.coefficient_rounding
-        return self.kernel, self.rounding, self.motion, *reactions
+        return self.kernel, self.rounding, self.motion, *reactions, self.motion_by_steps, self.drifts
 
 
 NO_CONSTRAINTS = Constraints()

@@ -37,7 +37,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, TypeAlias
 
-from sympy import Symbol
+from sympy import Integer, Symbol
 from sympy.utilities.iterables import connected_components
 
 from scvi_codegen.codegen.ir.equations import (
@@ -68,12 +68,14 @@ from scvi_codegen.systems.constraints import (
     constraint_masks,
     constraint_rates,
     force_directions,
+    masks_of_contacts,
     position_conditions,
     time_derivatives,
     velocity_conditions,
 )
 from scvi_codegen.systems.contact import coefficients
 from scvi_codegen.systems.derived_expressions import forms_of
+from scvi_codegen.systems.formulas.expressions import jacobian
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 from scvi_codegen.systems.system import MechanicalSystem
 
@@ -225,15 +227,22 @@ def constrained_steps(system: ArraySystem, stages: StageSystem, method: Method) 
 
 def _parts(stages: StageSystem, method: Method) -> Vector:
     """Return the fractions of h of the RATTLE steps of which a step is composed."""
-    shape = stages.shape
     if method.fractions and not method.drifts_first:
         return method.fractions
-    if isinstance(shape, Velocities) and shape.variational and shape.abscissae == (0, 1) and len(shape.blocks) == 1:
+    if _is_trapezoid(stages):
         return (mp.one,)
     raise MethodError(
         f"{method.name} does not support constraints of array systems: use 'stoermer-verlet', which is "
         "RATTLE, as is SVI(1, 'gauss-lobatto:2'), or 'composition:8' of it"
     )
+
+
+def _is_trapezoid(stages: StageSystem) -> bool:
+    """Return whether a step is that of h/2 (L(q0, v) + L(q1, v)), v = (q1 - q0)/h: SVI(1) on two Lobatto points."""
+    shape = stages.shape
+    if not (isinstance(shape, Velocities) and shape.variational):
+        return False
+    return shape.abscissae == (0, 1) and len(shape.blocks) == 1
 
 
 def _kernels(system: ArraySystem) -> Iterator[tuple[RolledKernel, RolledKernel]]:
@@ -251,8 +260,8 @@ def _kernels(system: ArraySystem) -> Iterator[tuple[RolledKernel, RolledKernel]]
         )
 
 
-def lowered_constraints(system: MechanicalSystem) -> Constraints:
-    """Return the kernels of the constraints of a system."""
+def lowered_constraints(system: MechanicalSystem, stages: StageSystem) -> Constraints:
+    """Return the kernels of the constraints of a system, with a method's stages."""
     if not isinstance(system, LagrangianSystem) or not system.constraints:
         return NO_CONSTRAINTS
     partials, rates = constraint_jacobian(system), constraint_rates(system)
@@ -284,6 +293,7 @@ def lowered_constraints(system: MechanicalSystem) -> Constraints:
             purpose="L_q - L_vq v - L_vt + f, then rates G v + .., and their derivatives in time at constant v.",
         ),
         **(_reactions(system) if system.reactions else {}),
+        **(_steps_of_contacts(regular) if system.reactions and _is_trapezoid(stages) else {}),
     )
 
 
@@ -315,5 +325,37 @@ def _reactions(system: LagrangianSystem) -> dict[str, Any]:
             u=(*system.coordinates, *system.velocities),
             purpose="Rounding errors of these coefficients at u = (q, v), in units of the round-off.",
             of_rounding=True,
+        ),
+    }
+
+
+def _steps_of_contacts(system: LagrangianSystem) -> dict[str, Any]:
+    """Return the kernels of contacts by steps; none for kinetic energies that are not quadratic, and with damping."""
+    idle = dict.fromkeys(masks_of_contacts(system), Integer(0))
+    forms = forms_of(system)
+    if not forms.has_quadratic_energy or system.damping != 0:
+        return {}
+    values = [value.xreplace(idle) for value in (*forms.momentum, *forms.force)]
+    by_state = jacobian(values, (*system.coordinates, *system.velocities))
+    partials = {(i, j): entry for (i, j), entry in by_state.items() if i < system.dimension or j >= system.dimension}
+    still = {reaction.active: Integer(1) for reaction in system.reactions} | dict.fromkeys(
+        system.velocities, Integer(0)
+    )
+    return {
+        "motion_by_steps": system_kernel(
+            system,
+            "motion_by_steps",
+            values,
+            u=(*system.coordinates, *system.velocities),
+            partials=partials.values(),
+            purpose="L_v and L_q + f without contacts, and their derivatives but L_qq, at u = (q, v).",
+        ),
+        "motion_entries": tuple(partials),
+        "drifts": system_kernel(
+            system,
+            "drifts",
+            [rate.xreplace(still) for rate in constraint_rates(system)],
+            u=system.coordinates,
+            purpose="Rates of the constraints at rest, by time, at u = q.",
         ),
     }

@@ -217,7 +217,7 @@ def lower(
         polynomial_curves=polynomial,
         equations=equations,
         quantities=_quantities(system, method, stages, symmetries, in_lanes=in_lanes),
-        constraints=lowered_constraints(system),
+        constraints=lowered_constraints(system, stages),
         rattle=rattle_of(system, stages, equations.extrapolation) if solver == "auto" else NO_RATTLE,
         damping=damping_kernel(system),
         mass_growth=_mass_growth(system, stages),

@@ -45,6 +45,8 @@ NOT_NEGATIVE = Range("not be negative", lambda value: value >= 0.0)
 BELOW_ONE = Range("be positive and below 1", lambda value: 0.0 < value < 1.0)
 SOLVED = Range(f"be positive and at most {LARGEST_TOLERANCE:g}", lambda value: 0.0 < value <= LARGEST_TOLERANCE)
 
+LOCATED = "located"
+"""How transitions of contacts are treated by default."""
 STEP_SIZE, DURATION, VELOCITY = "the step size", "the duration", "the velocity"
 """What alternatives determine, of which at most one is given."""
 ADAPTIVE, FIXED = "adaptive steps", "a fixed step size"
@@ -247,6 +249,12 @@ class RunOptions:
     action: bool = option("run", SWITCH, "", "Sum the action along the run.", default=False, common=False)
     seed: int = option(
         *("run", COUNT, "N", "Key of the noise of a heat bath [0]."), default=0, most=LARGEST_SEED, common=False
+    )
+    transitions: str = option(
+        *("run", CHOICE, "", "Contacts [located]; by steps: of a fixed size, by svi:1, for feet and piles."),
+        choices=(LOCATED, "by steps"),
+        default=LOCATED,
+        common=False,
     )
     metropolis: bool = option(
         "run", SWITCH, "", "Accept or reject each step in a heat bath.", default=False, common=False

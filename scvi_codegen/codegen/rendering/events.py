@@ -64,6 +64,8 @@ from scvi_codegen.systems.formulas.symbols import DOT, TIME, identifier, input_f
 from scvi_codegen.systems.formulas.table import functions_of
 
 DEGREE = 4
+FUNCTIONS = {"controlled": "advance_to", "by_steps": "motion_terms"}
+"""Functions of an integrator of adaptive steps, and of contacts by steps."""
 Formula: TypeAlias = "str | Expr | float"
 
 
@@ -99,8 +101,8 @@ def with_events(source: Source, interface: Interface, events: tuple[SearchedEven
         ExpressionError: for text outside the grammar, with its column.
         EventError: naming the invalid symbol or function, or what events that change the state do not support.
     """
-    controlled = "advance_to" in source.contents.functions
-    return replace(source, beside=render_events(_search(interface, events, controlled=controlled)))
+    has = {word: name in source.contents.functions for word, name in FUNCTIONS.items()}
+    return replace(source, beside=render_events(_search(interface, events, **has)))
 
 
 class EventFormulas:
@@ -328,7 +330,9 @@ def _translated(function: Expr, role: str) -> Expr:
         raise EventError(f"in the {role}: {error}") from error
 
 
-def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controlled: bool) -> EventSearch:
+def _search(
+    interface: Interface, events: tuple[SearchedEvent, ...], *, controlled: bool, by_steps: bool
+) -> EventSearch:
     """Return the search: Chebyshev points of the second kind, inverse Vandermonde matrix."""
     points = chebyshev_lobatto(DEGREE).points
     inverse = mp.matrix([[x**k for k in range(DEGREE + 1)] for x in points]) ** -1
@@ -344,6 +348,7 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controll
         "impacts": tuple(int(event.restitution is not None) for event in events),
         "conditional": tuple(int(bool(event.conditions)) for event in events),
         "controlled": controlled,
+        "by_steps": by_steps and not interface.modes,
         "changes_states": any(event.changes_state for event in events),
     }
     if interface.layout.coordinates:

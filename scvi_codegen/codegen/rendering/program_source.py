@@ -129,6 +129,7 @@ class ExampleRun:
         end: of a run with inputs.
         arrays: of a system whose array sizes are known at run time; ``outputs`` is then the number of steps.
         events: of the run, also of its source.
+        by_steps: whether contacts act in steps, without transitions.
     """
 
     q: tuple[float, ...]
@@ -150,6 +151,7 @@ class ExampleRun:
     end: float = 0.0
     arrays: ExampleArrays | None = None
     events: tuple[Any, ...] = ()
+    by_steps: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,6 +170,7 @@ class EventSearch:
         impacts: 1 for each event that is the wall of an impact, else 0.
         conditional: 1 for each event with conditions, else 0.
         controlled: whether the integrator has adaptive steps.
+        by_steps: whether runs may have contacts by steps.
         changes_states: whether crossings change the state of a run.
         kernels: the functions at u = (q, p, v); conditions; values of variables that crossings change, gradient and
             restitution of impacts.
@@ -202,6 +205,7 @@ class EventSearch:
     impacts: tuple[int, ...]
     conditional: tuple[int, ...]
     controlled: bool
+    by_steps: bool
     changes_states: bool
     kernels: tuple[Kernel, ...]
     uses_velocity: bool

@@ -38,6 +38,7 @@ FILES = {
         (
             *("momentum", "velocity", "energy", "energies", "momentum_maps", "rates"),
             *("constraint_values", "project", "apart", "multipliers", "contact_terms"),
+            *("motion_terms", "row_terms"),
             *("discrete_legendre", "work_and_impulses"),
         ),
     ),

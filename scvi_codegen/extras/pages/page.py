@@ -181,6 +181,7 @@ def page_of(model: Model, document: Mapping[str, Any], settings: Mapping[str, An
     ranges = {**model.page.get("ranges", {}), **settings.get("ranges", {})}
     model = replace(model, page={**model.page, **settings, "ranges": ranges})
     model._check_double("a page")
+    model._check_located("a page")
     _check(model, ranges)
     check_compiler()  # before the equations are derived
     adaptive = model.h is None or model.time_transformation is not None

@@ -62,6 +62,7 @@ def _verified(name: str, choices: Mapping[str, Any]) -> Certificate:
         if model.array_system is not None and (model.h is None or model.array_system.constraints):
             model = model.with_known_sizes("verify (adaptive steps, constraints)")
         model._check_double("a certificate")
+        model._check_located("a certificate")
         model = replace(model, method=copy(model.method))  # named, so that runs with a tolerance have it, too
         return _certificate(model, model.stepper())
     if not (folder / MODEL_FILE).is_file():

@@ -164,7 +164,8 @@ def _flag(option: Option) -> Callable[[Command], Command]:
     """Return the decorator that adds the flag of an option to a command."""
     further = dict(PARSERS.get(option.kind, {}))
     if option.choices:
-        further["type"] = click.Choice(option.choices)
+        words = {choice.replace(" ", "-"): choice for choice in option.choices}
+        further |= {"type": click.Choice([*words]), "callback": lambda _, __, value: words.get(value)}
     if option.default is not None:
         further |= {"default": option.default, "show_default": True}
     return click.option(option.flag, option.name, metavar=option.metavar or None, help=option.help, **further)

@@ -12,7 +12,7 @@ import numpy as np
 
 from scvi_codegen.codegen.ir.variants import SUMS
 from scvi_codegen.codegen.lowering.arrays import check_solver
-from scvi_codegen.codegen.native.option_table import VELOCITY, check_agreement
+from scvi_codegen.codegen.native.option_table import LOCATED, VELOCITY, check_agreement
 from scvi_codegen.common.display.cards import Html, card, listed, plain
 from scvi_codegen.common.errors import ArgumentError, ModelFileError, StateError, speaking
 from scvi_codegen.common.representation import summary
@@ -354,6 +354,8 @@ class Model(TimeSpan):
 
             require(stepper, "action")
             stepper = stepper.acting
+        if self.transitions != LOCATED:
+            stepper = stepper.by_transitions(self.transitions)
         return stepper.with_events(self.events)
 
     def momenta(self, stepper: Stepper) -> Array:
@@ -497,7 +499,16 @@ class Model(TimeSpan):
 
     def _run_arguments(self) -> dict[str, Any]:
         """Return the arguments of :meth:`Stepper.integrate` and ensembles for time, steps, saved states and inputs."""
-        others = ("span", "threads", "action", "precision", "sums", "controller", "observe")  # those of the stepper
+        others = (
+            "span",
+            "threads",
+            "action",
+            "precision",
+            "sums",
+            "controller",
+            "observe",
+            "transitions",
+        )  # those of the stepper
         arguments = {
             option.field: getattr(self, option.field)
             for option in RUN_FIELDS

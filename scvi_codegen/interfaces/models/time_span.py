@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from typing import Any, Self
 
-from scvi_codegen.codegen.native.option_table import DURATION, STEP_SIZE, check_agreement, in_words
+from scvi_codegen.codegen.native.option_table import DURATION, LOCATED, STEP_SIZE, check_agreement, in_words
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE
 from scvi_codegen.common.errors import MethodWarning, ModelFileError, warn
@@ -85,6 +85,13 @@ class TimeSpan(ModelOptions):
             raise ModelFileError(
                 f"{what} is not available with precision = 'double-double': omit it, or use precision = 'double' "
                 "([run] precision)"
+            )
+
+    def _check_located(self, what: str) -> None:
+        """Raise an error if contacts are by steps, which something does not have."""
+        if self.transitions != LOCATED:
+            raise ModelFileError(
+                f"{what} has located transitions alone: omit transitions = {self.transitions!r} ([run])"
             )
 
     def _check_alone(self) -> None:

@@ -101,11 +101,11 @@ def start_of_ensemble(
     if stepper.interface.constraints:
         if stepper.interface.words == 1:
             positions, momenta = map(np.ascontiguousarray, (positions, momenta))
-        if stepper.interface.contacts:
+        if stepper.interface.contacts and not stepper.by_steps:
             for k, lasts in enumerate(np.broadcast_to(durations, len(values)).tolist()):
                 with of_trajectory(k):
                     positions[k], momenta[k] = in_first_modes(stepper, positions[k], momenta[k], t, values[k], lasts)
-        else:
+        elif len(stepper.interface.constraints) > stepper.interface.masked:
             make_consistent(stepper, positions, momenta, t, values)
     return positions, momenta, values
 

@@ -19,7 +19,7 @@ from scvi_codegen.runs.events.contacts import (
     undefined_friction,
     warn_of_choices,
 )
-from scvi_codegen.runs.results.saved_states import Array, ModeHistory, SavedStates
+from scvi_codegen.runs.results.saved_states import Array, ContactsBySteps, ModeHistory, SavedStates
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.step_plan import Fixed
 from scvi_codegen.systems.event import (
@@ -137,7 +137,8 @@ class CrossingSearch:
         arguments = self.watch, t_end, run._control, size, *run._arguments, most
         states = *(binding.pointer(column[1:]) for column in rows), binding.integers(iterations[1:])
         to = self._capacity, crossings, filled, run._report, run._workspace
-        advance = binding.function("advance_with_changes", run._memory)
+        name = "advance_by_steps" if self.stepper.by_steps else "advance_with_changes"
+        advance = binding.function(name, run._memory)
         status = advance(*arguments, *states, binding.whole_numbers(numbers[1:]), *to)
         self._record(crossings, int(filled[0]))
         report, count = run._report, int(run._report.stored) + 1
@@ -217,7 +218,7 @@ class CrossingSearch:
     def transitions(self, recorded: Sequence[NDArray[Any]]) -> tuple[Switches, ...]:
         """Return the transitions of contacts, and the changes of the side of each kink, among some of the records."""
         kinks = len(self.stepper.searched) - len(self.stepper.events)
-        if not kinks:
+        if not kinks or self.stepper.by_steps:  # whose changes of modes have no functions
             return ()
         records = self._joined(recorded)
         records = records[records["direction"] != 0]  # without touches, which keep their side
@@ -238,7 +239,9 @@ class CrossingSearch:
         latest = np.array(list(self.watch.mode))
         values = np.concatenate([records["mode"], latest[np.newaxis]])
         ambiguous, missed = (getattr(self.watch, name, 0) for name in ("ambiguous", "missed"))
-        return ModeHistory(records["t"], values, bool(ambiguous), float(missed))
+        steps = self.watch.steps if self.stepper.by_steps else None
+        by_steps = steps and ContactsBySteps(steps.residual, steps.compliance, steps.lost_energy)
+        return ModeHistory(records["t"], values, bool(ambiguous), float(missed), by_steps)
 
     def _joined(self, recorded: Sequence[NDArray[Any]]) -> Any:
         none = self.binding.records(self.binding.new("crossing[1]"), 0)

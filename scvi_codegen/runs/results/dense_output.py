@@ -47,6 +47,13 @@ def states_and_steps_at(states: SavedStates, times: Array) -> tuple[Array, Array
         _check_on_grid(states)
         return states_in_transformed_time(states, times)
     left = number_until(states.t, times, states.forward) - 1
+    if states.stepper.by_steps:  # linear in between
+        right = np.minimum(left + 1, len(states) - 1)
+        part = ((times - states.t[left]) / np.fmax(states.t[right] - states.t[left], np.finfo(float).tiny))[
+            :, np.newaxis
+        ]
+        q, p = (x[left] + part * (x[right] - x[left]) for x in (states.q, states.p))
+        return q, p, times
     lengths, fixed, several = states.step_sizes[:-1], isinstance(states.plan, FixedSteps), False
     if states.stepper.divides_steps:
         several = not (np.abs(np.diff(states.t)) < 1.5 * np.abs(lengths) + states.grid_tolerance[:-1]).all()

@@ -60,8 +60,8 @@ def ends_of_steps(states: SavedStates) -> Array:
 def changes_by_events(states: SavedStates) -> Iterator[tuple[Crossings, NDArray[np.intp]]]:
     """Yield the crossings of each event that changes the state, and the rows of the states after them."""
     t, transitions = states.forward * states.t, getattr(states, "transitions", ())
-    if states.stepper.interface.contacts and not transitions:
-        raise StateError("this requires the transitions of contacts, which only integrate(..) stores")
+    if states.stepper.interface.contacts and (not transitions or states.stepper.by_steps):
+        raise StateError("this requires the located transitions of contacts, which only integrate(..) stores")
     for crossings in (*getattr(states, "events", ()), *transitions):
         times = _times_of_rows(t, states.forward * crossings.t)
         here = (t[0] <= times) & (times <= t[-1])

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,6 +100,20 @@ class SavedStates:
         return Memory.started(self.stepper, self.q[k], self.p[k], plan=Fixed(h), t=scalar(self.t[k]), **settings)
 
 
+class ContactsBySteps(NamedTuple):
+    """Contact problems of the steps of a run up to its end.
+
+    Attributes:
+        residual: largest residual relative to 1 + |f|, for rows with W_kk = 1 and rates b of at most 1.
+        compliance: largest compliance of a contact relative to W_kk, 0 where the contacts were rigid.
+        lost_energy: energy that contacts took, without the work of surfaces that move a loss.
+    """
+
+    residual: float
+    compliance: float
+    lost_energy: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ModeHistory:
     """Values of ``stepper.modes`` along a run: parameters that events set, modes of contacts and of kinks.
@@ -109,12 +123,14 @@ class ModeHistory:
         values: (k + 1, modes) values before the first change and after each.
         ambiguous: whether several motions of contacts were consistent at a transition since the start.
         missed: tolerance of an adaptive step that missed that of the run, by rounding of the gaps of contacts, else 0.
+        by_steps: the contact problems of a run with contacts by steps, else ``None``.
     """
 
     t: Array
     values: Array
     ambiguous: bool = False
     missed: float = 0.0
+    by_steps: ContactsBySteps | None = None
 
     def at(self, t: float, forward: float) -> Array:
         """Return (modes,) values after time t; ``forward`` is -1 for a run backward in time."""
@@ -127,15 +143,16 @@ class ModeHistory:
         if not len(inside):  # no change since the last one before
             earlier = (self.t < low) if not len(self.t) or self.t[0] <= self.t[-1] else (self.t > high)
             last = int(np.count_nonzero(earlier))
-            return ModeHistory(self.t[:0], self.values[last : last + 1], self.ambiguous, self.missed)
-        return ModeHistory(self.t[inside], self.values[inside[0] : inside[-1] + 2], self.ambiguous, self.missed)
+            return replace(self, t=self.t[:0], values=self.values[last : last + 1])
+        return replace(self, t=self.t[inside], values=self.values[inside[0] : inside[-1] + 2])
 
     @classmethod
     def joined(cls, histories: Sequence[ModeHistory]) -> ModeHistory:
         """Return the history of consecutive parts of a run."""
         values = [*(part.values[:-1] for part in histories), histories[-1].values[-1:]]
         ambiguous, missed = any(part.ambiguous for part in histories), max(part.missed for part in histories)
-        return cls(np.concatenate([part.t for part in histories]), np.concatenate(values), ambiguous, missed)
+        t = np.concatenate([part.t for part in histories])
+        return replace(histories[-1], t=t, values=np.concatenate(values), ambiguous=ambiguous, missed=missed)
 
 
 def times_of_changes(states: Any) -> Array:

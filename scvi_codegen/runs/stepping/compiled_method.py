@@ -127,6 +127,7 @@ class CompiledMethod:
         self._known: dict[Hashable, Self] = {}
         self._with_action: Self | None = None
         self.sums_action = False  # whether runs sum the action of their steps
+        self.by_steps = False  # whether contacts of runs act in steps, without transitions
         self._entries: dict[Event, tuple[Event, ...]] = {}
         self._plain = cast(Source, source)
         self._states = layout_of(interface)
@@ -188,6 +189,14 @@ class CompiledMethod:
             acting = stepper._with_action = stepper._copy(stepper.events, source) if source else stepper
             acting._with_action, acting.sums_action = acting, source is not None
         return stepper._with_action
+
+    @cached_property
+    def with_steps_of_contacts(self) -> Self:
+        """The integrator whose runs have contacts by steps."""
+        require(self, "by_steps")
+        stepper = self._copy(self.events)
+        stepper.by_steps = True
+        return stepper
 
     def _copy(self, events: tuple[Event, ...], source: Source | None = None) -> Self:
         sizes = source.contents.sizes if source else None
@@ -461,4 +470,4 @@ class CompiledMethod:
     @property
     def _has_error_estimate(self) -> bool:
         """True if the method has adaptive steps for this system; also if that follows from sizes at run time."""
-        return "advance_to" in self.source.contents.functions
+        return "advance_to" in self.source.contents.functions and not self.by_steps

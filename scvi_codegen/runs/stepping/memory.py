@@ -140,7 +140,9 @@ class Memory:
         self._untimed = len(self._q) <= MOST_UNTIMED  # whether ``advance`` takes steps without looking at the clock
         self._chunk = 1  # steps of the next C call otherwise
         self._start_function = binding.function("start", memory)
-        self._step_error = binding.function("step_error", memory) if binding.has("step_error") else None
+        self._step_error = None
+        if binding.has("step_error") and not stepper.by_steps:
+            self._step_error = binding.function("step_error", memory)
         self._plan: StepPlan = NO_PLAN
         self._h = cast("float | None", NO_PLAN.h)  # fixed step size; None for other steps
         self.longest, self._can_measure_growth = 0.0, hasattr(memory, "measures_growth")

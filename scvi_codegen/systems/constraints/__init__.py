@@ -157,6 +157,11 @@ def constraint_jacobian(system: Constrained) -> dict[tuple[int, int], Expr]:
     return jacobian(constraint_rates(system), system.velocities)
 
 
+def masks_of_contacts(system: Any) -> list[Symbol]:
+    """Return the parameters of the modes of contacts."""
+    return [x for x in system.parameters if re.match(r"contact_\d+_(?!quantity_)", x.name)]
+
+
 def has_oblique_forces(system: Constrained) -> bool:
     """Return whether the force of a constraint is not in the direction of G^T: sliding friction, which does work."""
     if not system.reactions:

@@ -8,7 +8,8 @@
  * 2008): normal forces and rates are not negative, one of them is 0, and friction of at most mu f_n opposes the slip,
  * with mu f_n where that is not 0. Without gap the limit is a given size instead of mu f_n. Second rates b pose forces,
  * rates b impulses, and rates + h second rates those of a step of length h, for which a solution exists for every b and
- * mu if W > 0. Requires: EVENT_CONTACTS, CONTACT_ROWS, CONTACTS. */
+ * mu if W > 0. Within fewer proximal points the last one is the solution with a compliance R: u = b + (W + R) f up to the
+ * change of f by it. Requires: EVENT_CONTACTS, CONTACT_ROWS, CONTACTS. */
 enum {
   CONE_NEWTON = 12, /* steps of Newton's method */
   CONE_POINTS = 250 /* proximal points */
@@ -39,7 +40,9 @@ typedef struct {
   real mu[EVENT_CONTACTS], mu_static[EVENT_CONTACTS], given[EVENT_CONTACTS][2];
   cone_mode mode[EVENT_CONTACTS];
   int is_static[EVENT_CONTACTS]; /* whether mu_static is the limit of friction in the solution */
+  int most_points; /* proximal points of a block */
   int newtons, points; /* counts of the solution */
+  real compliance, residual; /* largest of the blocks where W_kk = 1: weight of the last point, residual / (1 + |f|) */
 } cone_problem;
 
 /* Unknowns of a contact in a block: x_n (-1: none), first of its friction that is not given, their number, and the
@@ -178,8 +181,8 @@ static int cone_newton(cone_problem *in, cone_block *of, real *x)
  * makes the equations of redundant contacts regular; it decreases with solutions. */
 static int cone_points(cone_problem *in, cone_block *of, real *x)
 {
-  real next[CONTACT_ROWS], r[CONTACT_ROWS], weight = CONE_NEAR;
-  for (int point = 0; point < CONE_POINTS && weight * CONE_NEAR < 1.0; point++) {
+  real next[CONTACT_ROWS], r[CONTACT_ROWS], weight = CONE_NEAR, last = 0.0;
+  for (int point = 0; point < in->most_points && weight * CONE_NEAR < 1.0; point++) {
     in->points++;
     of->weight = weight;
     memcpy(of->near, x, sizeof r);
@@ -193,9 +196,11 @@ static int cone_points(cone_problem *in, cone_block *of, real *x)
     memcpy(x, next, sizeof r);
     if (is_exact(of, x, cone_residuals(of, x, 0, r)))
       return 1;
+    last = weight;
     weight = fmax(DBL_EPSILON, 0.3 * weight);
   }
-  return 0;
+  in->compliance = fmax(in->compliance, last);
+  return in->most_points < CONE_POINTS && last > 0.0;
 }
 
 static real cone_limit(const cone_problem *in, int k)
@@ -258,6 +263,7 @@ static void cone_gather(cone_problem *in, const int *member, cone_block *of, rea
   real start[CONTACT_ROWS];
   of->count = of->parts = 0;
   of->weight = of->size = 0.0;
+  memset(of->near, 0, sizeof of->near);
   for (int k = 0; k < EVENT_CONTACTS; k++)
     if (member[k])
       cone_part_of(in, k, of);
@@ -324,7 +330,7 @@ static void cone_modes(cone_problem *in, const cone_block *of, const real *x)
 /* Solves the problem of one block; its forces are 0 if there is no solution. */
 static int cone_solve_block(cone_problem *in, const int *member, cone_block *of)
 {
-  real x[CONTACT_ROWS] = {0.0}, from[CONTACT_ROWS];
+  real x[CONTACT_ROWS] = {0.0}, from[CONTACT_ROWS], r[CONTACT_ROWS];
   cone_gather(in, member, of, x);
   memcpy(from, x, sizeof x);
   int solved = cone_newton(in, of, x);
@@ -334,6 +340,7 @@ static int cone_solve_block(cone_problem *in, const int *member, cone_block *of)
   }
   if (!solved)
     return 0;
+  in->residual = fmax(in->residual, cone_residuals(of, x, 0, r) / (1.0 + largest_magnitude(x, of->count)));
   for (int i = 0; i < of->count; i++)
     in->f[of->row[i]] = x[i] * of->scale[i] * of->size;
   for (int k = 0; k < of->parts; k++) {
@@ -395,12 +402,14 @@ static int cone_solve_static(cone_problem *in, const int *member, cone_block *of
   return solved;
 }
 
-/* Solves a problem; returns whether a solution was found, f, u and the modes. */
-static int solve_cone(cone_problem *in)
+/* Solves a problem within so many proximal points of a block; returns whether a solution was found, f, u, modes. */
+static int solve_cone_within(cone_problem *in, int most_points)
 {
   cone_block block;
   int done[EVENT_CONTACTS] = {0}, solved = 1;
+  in->most_points = most_points;
   in->newtons = in->points = 0;
+  in->compliance = in->residual = 0.0;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     int row[3];
     in->is_static[k] = in->rests[k];
@@ -418,7 +427,14 @@ static int solve_cone(cone_problem *in)
     for (int j = 0; j < EVENT_CONTACTS; j++)
       done[j] |= member[j];
   }
-  for (int r = 0; r < CONTACT_ROWS; r++)
-    in->u[r] = cone_rate(in, r);
+  memcpy(in->u, in->b, sizeof in->u);
+  for (int j = 0; j < CONTACT_ROWS; j++) /* rows of others may be undefined */
+    for (int r = 0; r < CONTACT_ROWS && in->f[j] != 0.0; r++)
+      in->u[r] += in->W[r * CONTACT_ROWS + j] * in->f[j];
   return solved;
+}
+
+static int solve_cone(cone_problem *in)
+{
+  return solve_cone_within(in, CONE_POINTS);
 }

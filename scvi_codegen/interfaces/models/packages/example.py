@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from scvi_codegen.codegen.native.option_table import LOCATED
 from scvi_codegen.codegen.rendering.environment import template_environment
 from scvi_codegen.codegen.rendering.program_source import Embedded, ExampleArrays, ExampleRun
 from scvi_codegen.codegen.rendering.source import Interface
@@ -114,6 +115,7 @@ def example_of(model: Model, interface: Interface, *, controlled: bool) -> Examp
         inputs=inputs,
         end=model.end if inputs else 0.0,
         events=interface.searched(model.events),
+        by_steps=model.transitions != LOCATED,
     )
 
 

@@ -265,6 +265,7 @@ def _start(model: Model, interface: Interface) -> ExampleRun:
         )
     if model.h < 0:
         raise ModelFileError(f"the step size of an FMU must be positive, not {model.h:g}")
+    model._check_located("an FMU")
     start = example_of(replace(model, inputs={}), interface, controlled=False)
     return start if model.velocity is None else replace(start, p=model.velocity)
 

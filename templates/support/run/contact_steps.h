@@ -1,0 +1,638 @@
+#include "cone.h"
+#include "event_changes.h"
+
+/* Contacts by steps: runs of fixed steps without transitions, two contact problems in each, for svi:1 on two Lobatto
+ * points, Ld(q0, q1) = h/2 (L(q0, v) + L(q1, v)), v = (q1 - q0) / h. With the rows G0, G1 of gaps g and slips at its ends
+ *
+ *   p0 + G0^T f1 = -D1 Ld(q0, q1),   rates (g(q1) / h, (G0 + G1)/2 (q1 - q0) / h)   [positions]
+ *   p1 = D2 Ld(q0, q1) + G1^T f2,    rates G1 M1^-1 p1                             [velocities]
+ *
+ * (RATTLE with contacts: J. Breuling, G. Capobianco, S. Eugster & R. Leine 2024; gaps / h: M. Anitescu & F. Potra,
+ * Nonlinear Dyn. 14, 1997). What rests does not creep, gaps are not negative, and the second problem creates no kinetic
+ * energy. Requires: terms_of_steps.h. */
+enum {
+  STEP_ITERATIONS = 30, /* of the first problem */
+  STEP_HALVINGS = 8,
+  STEP_POINTS = 30, /* proximal points of a contact problem, after which forces have a compliance */
+  STEP_FIXED = CONTACT_FIRST_ROW, /* constraints, whose forces are free */
+  STEP_ROWS = STEP_FIXED + CONTACT_ROWS,
+  STEP_SIZE = M + STEP_FIXED
+};
+
+#define STEP_UPDATE 1e-6 /* last update relative to the motion in a step: the error that is left is about its square */
+#define STEP_SLOW_UPDATE 1e-9 /* the same, where updates converge linearly */
+#define STEP_YIELDS 0.1 /* part of its W with M0 below which a row hardly yields to its own force */
+
+typedef NAME(contact_memory) contact_memory;
+
+/* Momenta L_v, forces L_q + f, and their derivatives by rows, columns (q, v). */
+typedef struct {
+  real momentum[M], force[M], by_state[2 * M][2 * M];
+} motion_terms;
+
+/* Values of all rows, rates at rest, and G; coefficients of the contacts. */
+typedef struct {
+  real value[STEP_ROWS], drift[STEP_ROWS], G[STEP_ROWS][M], coefficient[EVENT_CONTACTS][3];
+} row_terms;
+
+/* Factors of [A, -G^T; G, 0] with the rows of constraints. */
+typedef struct {
+  real matrix[STEP_SIZE * STEP_SIZE], pivot[STEP_SIZE];
+} step_matrix;
+
+/* A step of length h from (t, q, p, v) to q1; contacts whose rows are formed, and their responses: A^-1 G0^T, M0^-1 G0^T
+ * or M1^-1 G1^T. */
+typedef struct {
+  real t, h, q[M], p[M], v[M], q1[M], fastest;
+  const real *idle, *imposed; /* parameters */
+  motion_terms first, last;
+  row_terms start, end;
+  step_matrix moving, resting;
+  int is_near[EVENT_CONTACTS], pushes[EVENT_CONTACTS], has_begun[EVENT_CONTACTS];
+  real response[CONTACT_ROWS][STEP_SIZE], at_start[CONTACT_ROWS][STEP_SIZE];
+  real W[CONTACT_ROWS * CONTACT_ROWS];
+  cone_problem problem;
+} contact_step;
+
+static real times_row(const real *row, const real *x)
+{
+  real sum = 0.0;
+  for (int i = 0; i < M; i++)
+    sum += row[i] * x[i];
+  return sum;
+}
+
+/* Factorises [A, -G_f^T; G, 0] of M rows A, or L_vv of `of` if they are NULL. */
+static int factorise_step(const real (*A)[M], const motion_terms *of, const row_terms *forces, const row_terms *rows,
+    step_matrix *to)
+{
+  const band shape = band_within(STEP_SIZE, STEP_SIZE);
+  memset(to->matrix, 0, sizeof to->matrix);
+  for (int i = 0; i < M; i++)
+    for (int j = 0; j < M; j++)
+      to->matrix[j * STEP_SIZE + i] = A ? A[i][j] : of->by_state[i][M + j];
+  for (int c = 0; c < STEP_FIXED; c++)
+    for (int i = 0; i < M; i++) {
+      to->matrix[(M + c) * STEP_SIZE + i] = -forces->G[c][i];
+      to->matrix[i * STEP_SIZE + M + c] = rows->G[c][i];
+    }
+  return factorise(to->matrix, &shape, to->pivot) ? OK : SINGULAR;
+}
+
+static void solve_step(const step_matrix *of, real *x)
+{
+  const band shape = band_within(STEP_SIZE, STEP_SIZE);
+  back_substitute(of->matrix, &shape, of->pivot, x);
+}
+
+/* Solutions with the rows of the contacts that take part, as columns. */
+static void respond(const contact_step *in, const step_matrix *of, const row_terms *rows, real (*response)[STEP_SIZE])
+{
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    int row[3];
+    for (int i = in->problem.takes_part[k] ? rows_of(k, row) - 1 : -1; i >= 0; i--) {
+      memset(response[row[i]], 0, sizeof *response);
+      memcpy(response[row[i]], rows->G[STEP_FIXED + row[i]], BYTES(M));
+      solve_step(of, response[row[i]]);
+    }
+  }
+}
+
+/* Lists the rows of the contacts that take part. */
+static int rows_in(const contact_step *in, int *list)
+{
+  int count = 0;
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    if (in->problem.takes_part[k])
+      count += rows_of(k, list + count);
+  return count;
+}
+
+/* W of the contacts that take part, by rows and responses. */
+static void pose_matrix(contact_step *in, const row_terms *rows, real (*response)[STEP_SIZE], real part)
+{
+  int list[CONTACT_ROWS];
+  const int count = rows_in(in, list);
+  for (int r = 0; r < count; r++)
+    for (int c = 0; c < count; c++)
+      in->W[list[r] * CONTACT_ROWS + list[c]] = part * times_row(rows->G[STEP_FIXED + list[r]], response[list[c]]);
+  in->problem.W = in->W;
+}
+
+static int terms_between(contact_step *in)
+{
+  real v[M];
+  for (int i = 0; i < M; i++)
+    v[i] = (in->q1[i] - in->q[i]) / in->h;
+  TRY(NAME(motion_terms)(in->t, in->q, v, in->idle, in->first.momentum));
+  TRY(NAME(motion_terms)(in->t + in->h, in->q1, v, in->idle, in->last.momentum));
+  return NAME(row_terms)(in->t + in->h, in->q1, v, in->imposed, in->end.value);
+}
+
+/* Friction of a contact that takes part in a problem, static or that of sliding; without a gap half of the step's. */
+static void pose_limits(contact_step *in, int k, const row_terms *rows, int rests)
+{
+  const real part = CONTACTS[k].normal < 0 ? 0.5 * in->h : 1.0;
+  in->problem.rests[k] = rests;
+  in->problem.mu[k] = part * rows->coefficient[k][0];
+  in->problem.mu_static[k] = part * rows->coefficient[k][1];
+}
+
+/* Change x of q1 without contacts that satisfies the linearised step, in x also the forces of constraints. */
+static int linearise_step(contact_step *in, real *x)
+{
+  real A[M][M];
+  for (int i = 0; i < M; i++) {
+    x[i] = in->p[i] + 0.5 * (in->h * in->first.force[i] - in->first.momentum[i] - in->last.momentum[i]);
+    for (int j = 0; j < M; j++)
+      A[i][j] = 0.5 * ((in->first.by_state[i][M + j] + in->last.by_state[i][M + j]) / in->h + in->last.by_state[i][j] - in->first.by_state[M + i][M + j]);
+  }
+  for (int c = 0; c < STEP_FIXED; c++)
+    x[M + c] = -in->end.value[c];
+  TRY(factorise_step(A, NULL, &in->start, &in->end, &in->moving));
+  solve_step(&in->moving, x);
+  return OK;
+}
+
+/* Contacts join whose gap after the change x is below the path of the fastest row: those whose rows are formed. */
+static void find_near(contact_step *in, const real *x)
+{
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
+    in->problem.takes_part[k] |= in->is_near[k] &&
+        (normal < 0 || in->end.value[row] + times_row(in->end.G[row], x) < in->h * in->fastest);
+  }
+}
+
+/* Rates b + W f of the first problem at a change x, at first static friction where slips rest; *slow: whether a row yields
+ * little to its own force at the end, so that W is that of the start. */
+static int solve_positions(contact_step *in, const contact_memory *from, const real *x, int first, int *slow)
+{
+  cone_problem *const of = &in->problem;
+  int list[CONTACT_ROWS];
+  real force[CONTACT_ROWS];
+  const int count = rows_in(in, list);
+  memcpy(force, of->f, sizeof force);
+  respond(in, &in->moving, &in->start, in->response);
+  respond(in, &in->resting, &in->start, in->at_start);
+  pose_matrix(in, &in->end, in->response, 1.0 / in->h);
+  *slow = 0;
+  for (int i = 0; i < count; i++) {
+    const int r = list[i], row = STEP_FIXED + r;
+    *slow |= in->W[r * (CONTACT_ROWS + 1)] < STEP_YIELDS * times_row(in->start.G[row], in->at_start[r]);
+  }
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    int row[3];
+    for (int i = of->takes_part[k] ? rows_of(k, row) - 1 : -1; i >= 0; i--) {
+      const int all = STEP_FIXED + row[i], is_gap = row[i] == CONTACTS[k].normal;
+      real b = is_gap ? in->end.value[all] : 0.0;
+      for (int m = 0; m < M; m++)
+        b += in->end.G[all][m] * x[m] +
+            (is_gap ? 0.0 : 0.5 * (in->start.G[all][m] + in->end.G[all][m]) * (in->q1[m] - in->q[m]));
+      of->b[row[i]] = b / in->h + (is_gap ? 0.0 : 0.5 * (in->start.drift[all] + in->end.drift[all]));
+      of->terms[row[i]] = fabs(of->b[row[i]]);
+    }
+  }
+  if (*slow) { /* b + W f of the present forces stays */
+    for (int i = 0; i < count; i++)
+      of->b[list[i]] = cone_rate(of, list[i]);
+    pose_matrix(in, &in->start, in->at_start, 1.0);
+    for (int i = 0; i < count; i++)
+      for (int j = 0; j < count; j++)
+        of->b[list[i]] -= in->W[list[i] * CONTACT_ROWS + list[j]] * force[list[j]];
+  }
+  if (!solve_cone_within(of, STEP_POINTS))
+    return NOT_CONVERGED;
+  int reverses = 0;
+  for (int k = 0; k < EVENT_CONTACTS && first; k++) { /* which stop in between have static friction */
+    const int turns = of->takes_part[k] && CONTACTS[k].slips > 0 && !of->rests[k] && !of->mode[k].sticks &&
+        of->mu_static[k] > of->mu[k] &&
+        of->mode[k].direction[0] * from->direction[k][0] + of->mode[k].direction[1] * from->direction[k][1] < 0.0;
+    of->rests[k] |= turns;
+    reverses |= turns;
+  }
+  return !reverses || solve_cone_within(of, STEP_POINTS) ? OK : NOT_CONVERGED;
+}
+
+/* Norm of a change of positions in the metric of the masses at the start. */
+static real norm_of(const contact_step *in, const real *x)
+{
+  real sum = 0.0;
+  for (int i = 0; i < M; i++)
+    for (int j = 0; j < M; j++)
+      sum += x[i] * in->first.by_state[i][M + j] * x[j];
+  return sqrt(fmax(sum, 0.0));
+}
+
+/* Rates of the row of a gap or a slip at a state. */
+static real rate_of(const row_terms *rows, int row, const real *v)
+{
+  return times_row(rows->G[STEP_FIXED + row], v) + rows->drift[STEP_FIXED + row];
+}
+
+/* Limits of friction, which the first solution of a problem chooses, for its further ones. */
+static void keep_limits(contact_step *in, const contact_memory *from)
+{
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    in->has_begun[k] = from->sticks[k] && in->problem.takes_part[k] && !in->problem.is_static[k];
+    in->problem.mu[k] = cone_limit(&in->problem, k);
+    in->problem.rests[k] = 0;
+  }
+}
+
+/* Contacts join whose gaps only the forces of others close; returns whether there is one. */
+static int find_missed(contact_step *in)
+{
+  int missed = 0;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int is_missed = in->is_near[k] && !in->problem.takes_part[k] &&
+        in->end.value[STEP_FIXED + CONTACTS[k].normal] < 0.0;
+    in->problem.takes_part[k] |= is_missed;
+    missed |= is_missed;
+    in->pushes[k] = CONTACTS[k].normal >= 0 && in->problem.takes_part[k] && in->problem.mode[k].pushes;
+  }
+  return missed;
+}
+
+/* x += X f with responses X. */
+static void add_responses(const contact_step *in, const real *f, real *x)
+{
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    for (int i = 0; i < M && f[r] != 0.0; i++)
+      x[i] += in->response[r][i] * f[r];
+}
+
+/* Solves the first problem for q1 and the impulses f1: Newton's method on both at once, a contact problem an iteration. */
+static int find_positions(contact_step *in, const contact_memory *from)
+{
+  real size = 0.0, *const f = in->problem.f;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    in->problem.takes_part[k] = in->is_near[k] && (CONTACTS[k].normal < 0 || from->pushes[k]);
+    pose_limits(in, k, &in->start, from->sticks[k]);
+  }
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    f[r] = in->h * from->force[r];
+  for (int i = 0; i < M; i++)
+    in->q1[i] = in->q[i] + in->h * in->v[i];
+  for (int iteration = 0; iteration < STEP_ITERATIONS; iteration++) {
+    real x[STEP_SIZE], rounding[M];
+    int slow;
+    TRY(terms_between(in));
+    if (iteration == 0)
+      TRY(factorise_step(NULL, &in->first, &in->start, &in->start, &in->resting));
+    TRY(linearise_step(in, x));
+    find_near(in, x);
+    for (int i = 0; i < M; i++)
+      rounding[i] = in->h * in->v[i];
+    size = iteration == 0 ? STEP_UPDATE * (norm_of(in, rounding) + norm_of(in, x)) : size;
+    TRY(solve_positions(in, from, x, iteration == 0, &slow));
+    if (iteration == 0)
+      keep_limits(in, from);
+    add_responses(in, f, x);
+    for (int i = 0; i < M; i++) {
+      in->q1[i] += x[i];
+      rounding[i] = CONTACT_LOWEST * DBL_EPSILON * fabs(in->q1[i]);
+    }
+    if (!(norm_of(in, x) <= (slow ? STEP_SLOW_UPDATE / STEP_UPDATE : 1.0) * size + norm_of(in, rounding)))
+      continue;
+    TRY(terms_between(in));
+    if (!find_missed(in))
+      return OK;
+  }
+  return NOT_CONVERGED;
+}
+
+/* Kinetic energy v^T M1 v / 2, or half the product of two velocities. */
+static real half_product(const contact_step *in, const real *v, const real *w)
+{
+  real sum = 0.0;
+  for (int i = 0; i < M; i++)
+    for (int j = 0; j < M; j++)
+      sum += 0.5 * v[i] * in->last.by_state[i][M + j] * w[j];
+  return sum;
+}
+
+/* Work of moving surfaces by impulses of the rows of a state. */
+static real work_of_surfaces(const row_terms *rows, const real *f)
+{
+  real work = 0.0;
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    work -= f[r] * rows->drift[STEP_FIXED + r];
+  return work;
+}
+
+/* Restitution of contacts that f1 closed, with rates e times those before the step: v += s (v_e - v) with the largest s
+ * in [0, 1] for which the energy is that before at most, with the work of moving surfaces. */
+static int rebound(contact_step *in, const contact_memory *from, const real *f1, const real *before, real *v,
+    real *workspace)
+{
+  cone_problem *const of = &in->problem;
+  real f[CONTACT_ROWS], w[M], p[M], energy, room, part = 1.0;
+  int bounces = 0;
+  memcpy(f, of->f, sizeof f);
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    if (!in->pushes[k] || from->is_closed[k])
+      continue;
+    const real target = in->start.coefficient[k][2] * fmin(rate_of(&in->start, CONTACTS[k].normal, in->v), 0.0);
+    of->b[CONTACTS[k].normal] += target;
+    bounces |= target < 0.0;
+  }
+  if (!bounces)
+    return OK;
+  TRY(NAME(energy)(in->t, in->q, in->p, in->idle, &room, workspace));
+  TRY(NAME(momentum)(in->t + in->h, in->q1, v, in->idle, p, workspace));
+  TRY(NAME(energy)(in->t + in->h, in->q1, p, in->idle, &energy, workspace));
+  room -= energy - half_product(in, v, v) - work_of_surfaces(&in->start, f1);
+  if (!solve_cone_within(of, STEP_POINTS))
+    return NOT_CONVERGED;
+  memcpy(w, before, sizeof w);
+  add_responses(in, of->f, w);
+  for (int i = 0; i < M; i++)
+    w[i] -= v[i];
+  const real plastic = work_of_surfaces(&in->end, f);
+  const real square = half_product(in, w, w);
+  const real linear = 2.0 * half_product(in, v, w) - work_of_surfaces(&in->end, of->f) + plastic;
+  const real rest = half_product(in, v, v) - plastic - room;
+  if (square + linear + rest > 0.0)
+    part = rest >= 0.0 ? 0.0 : fmin(1.0, (-linear + sqrt(linear * linear - 4.0 * square * rest)) / (2.0 * square));
+  for (int i = 0; i < M; i++)
+    v[i] += part * w[i];
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    of->f[r] = f[r] + part * (of->f[r] - f[r]);
+  return OK;
+}
+
+/* Solves the second problem for the velocities at q1, and keeps forces and modes. */
+static int find_velocities(contact_step *in, contact_memory *to, real *workspace)
+{
+  cone_problem *const of = &in->problem;
+  const contact_memory from = *to;
+  real x[STEP_SIZE], f1[CONTACT_ROWS], before[M], v[M], work = 0.0, fastest = 0.0;
+  memcpy(f1, of->f, sizeof f1);
+  memcpy(v, in->v, sizeof v); /* the mean of those before and after f1 */
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    for (int i = 0; i < M && f1[r] != 0.0; i++)
+      v[i] += 0.5 * in->at_start[r][i] * f1[r];
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    work += f1[r] == 0.0 ? 0.0 : f1[r] * times_row(in->start.G[STEP_FIXED + r], v);
+  for (int i = 0; i < M; i++) {
+    x[i] = 0.5 * (in->h * in->last.force[i] + in->first.momentum[i] - in->last.momentum[i]);
+    for (int j = 0; j < M; j++)
+      x[i] += in->last.by_state[i][M + j] * (in->q1[j] - in->q[j]) / in->h;
+  }
+  for (int c = 0; c < STEP_FIXED; c++)
+    x[M + c] = -in->end.drift[c];
+  TRY(factorise_step(NULL, &in->last, &in->end, &in->end, &in->moving));
+  solve_step(&in->moving, x);
+  memcpy(before, x, sizeof before);
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
+    of->takes_part[k] = in->is_near[k] && (normal < 0 || in->pushes[k] || in->end.value[row] <= CONTACT_LOWEST * DBL_EPSILON * size_by_position(in->end.G[row], in->q1));
+    pose_limits(in, k, &in->end, from.sticks[k] && !in->has_begun[k]);
+  }
+  respond(in, &in->moving, &in->end, in->response);
+  pose_matrix(in, &in->end, in->response, 1.0);
+  for (int r = 0; r < CONTACT_ROWS; r++) {
+    of->b[r] = rate_of(&in->end, r, before);
+    of->terms[r] = fabs(of->b[r]);
+    fastest = fmax(fastest, of->terms[r]);
+  }
+  to->residual = fmax(to->residual, of->residual);
+  to->compliance = fmax(to->compliance, of->compliance);
+  if (!solve_cone_within(of, STEP_POINTS))
+    return NOT_CONVERGED;
+  memcpy(v, before, sizeof v);
+  add_responses(in, of->f, v);
+  TRY(rebound(in, &from, f1, before, v, workspace));
+  to->residual = fmax(to->residual, of->residual);
+  to->compliance = fmax(to->compliance, of->compliance);
+  to->lost_energy -= work + half_product(in, v, v) - half_product(in, before, before);
+  memcpy(to->v, v, sizeof v);
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    to->force[r] = f1[r] / in->h;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int normal = CONTACTS[k].normal;
+    const real rate = normal < 0 ? 0.0 : rate_of(&in->end, normal, v);
+    to->pushes[k] = in->pushes[k];
+    to->is_closed[k] = of->takes_part[k] && rate <= CONTACT_ROUNDING * fastest;
+    to->sticks[k] = to->is_closed[k] && of->mode[k].sticks;
+    memcpy(to->direction[k], of->mode[k].direction, sizeof *to->direction);
+  }
+  return OK;
+}
+
+static void take_state(contact_step *in, const contact_memory *memory, real t, real h, const real *q, const real *p)
+{
+  in->t = t;
+  in->h = h;
+  memcpy(in->q, q, BYTES(M));
+  memcpy(in->p, p, BYTES(M));
+  memcpy(in->v, memory->v, BYTES(M));
+}
+
+/* Rows at the start, and contacts whose conditions hold there and whose surface it is not behind. */
+static int find_existing(contact_step *in, real *workspace)
+{
+  TRY(NAME(row_terms)(in->t, in->q, in->v, in->imposed, in->start.value));
+  in->fastest = 0.0;
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    in->fastest = fmax(in->fastest, fabs(rate_of(&in->start, r, in->v)));
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    in->is_near[k] = 1;
+  for (int i = 0; i < TRANSITIONS; i++) {
+    const int event = FIRST_TRANSITION + i, k = TRANSITION[i][0], row = STEP_FIXED + CONTACTS[k].normal;
+    int exists;
+    if (TRANSITION[i][1] != CONTACT_CLOSES || !IS_CONDITIONAL[event])
+      continue;
+    TRY(conditions(EVENT_FIRST[event], in->t, in->q, in->p, in->idle, &exists, workspace));
+    in->is_near[k] = exists &&
+        in->start.value[row] >= -CONTACT_PENETRATION * size_by_position(in->start.G[row], in->q);
+  }
+  return OK;
+}
+
+/* One step of length h from (t, q, p), which become those at its end; where it does not converge, two halves. */
+static int step_by_steps(contact_step *in, contact_memory *memory, real t, real h, real *q, real *p, int depth,
+    real *workspace)
+{
+  contact_memory next = *memory;
+  int status;
+  take_state(in, memory, t, h, q, p);
+  TRY(find_existing(in, workspace));
+  status = find_positions(in, memory);
+  if (status == OK)
+    status = find_velocities(in, &next, workspace);
+  if (status == OK)
+    status = NAME(momentum)(t + h, in->q1, next.v, in->idle, in->p, workspace);
+  if (status == OK) {
+    memcpy(q, in->q1, BYTES(M));
+    memcpy(p, in->p, BYTES(M));
+    *memory = next;
+    return OK;
+  }
+  if (depth == STEP_HALVINGS)
+    return status;
+  TRY(step_by_steps(in, memory, t, 0.5 * h, q, p, depth + 1, workspace));
+  return step_by_steps(in, memory, t + 0.5 * h, 0.5 * h, q, p, depth + 1, workspace);
+}
+
+/* Modes of contacts as parameters of a run. */
+static void put_memory(const contact_memory *memory, real *mode)
+{
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    contact_mode now = {memory->is_closed[k], memory->sticks[k] ? 3 : 0, 0, {0.0, 0.0}};
+    for (int i = 0; i < 2 && now.closed && !now.sticks; i++)
+      now.direction[i] = memory->direction[k][i];
+    put_mode(CONTACTS + k, now, AT_REST, 0.0, mode);
+  }
+}
+
+/* Velocities of a run at its start, and slips that rest there. */
+static int begin_by_steps(contact_step *in, event_run *run, event_watch *watch, real *workspace)
+{
+  contact_memory *const memory = &watch->steps;
+  TRY(NAME(velocity)(run->t, run->q, run->p, in->idle, memory->v, workspace));
+  take_state(in, memory, run->t, run->h, run->q, run->p);
+  TRY(find_existing(in, workspace));
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
+    const real size = normal < 0 ? 0.0 : size_by_position(in->start.G[row], run->q);
+    const real gap = normal < 0 ? 0.0 : in->start.value[row];
+    real w[2] = {0.0};
+    if (in->is_near[k] && gap < -CONTACT_PENETRATION * size) {
+      watch->refusal = CONTACT_PENETRATES;
+      watch->refused = k + 1;
+      watch->behind = gap;
+      return NOT_CONVERGED;
+    }
+    for (int i = 0; i < CONTACTS[k].slips; i++)
+      w[i] = rate_of(&in->start, CONTACTS[k].tangential + i, memory->v);
+    const real speed = length_of(w, 2);
+    memory->is_closed[k] = in->is_near[k] && gap <= CONTACT_ROUNDING * size;
+    memory->sticks[k] = memory->is_closed[k] && CONTACTS[k].slips > 0 && speed <= CONTACT_ROUNDING * in->fastest;
+    for (int i = 0; i < 2; i++)
+      memory->direction[k][i] = w[i] / fmax(speed, DBL_MIN);
+  }
+  memory->begun = 1;
+  put_memory(memory, watch->mode);
+  return OK;
+}
+
+/* Whether a contact is open, sticks or slips unlike before. */
+static int has_changed(const contact_memory *before, const contact_memory *now, int k)
+{
+  return before->is_closed[k] != now->is_closed[k] || before->sticks[k] != now->sticks[k];
+}
+
+/* Adds a crossing at a state. */
+static event_crossing *note_crossing(const event_step *step, int function, real fraction, const event_sample *at)
+{
+  event_crossing *const to = step->found + (*step->filled)++;
+  memset(to, 0, sizeof *to);
+  to->t = at->t;
+  to->fraction = fraction;
+  to->function = function;
+  copy_state(to->q, to->p, at->q, at->p);
+  return to;
+}
+
+/* Notes the zeros of the functions of events in a step, linear between its ends; a terminal one ends the run there. */
+static int note_events(const event_step *step, event_run *run, const event_sample *left, event_sample *right)
+{
+  real before[EVENTS], after[EVENTS];
+  if (FIRST_TRANSITION == 0)
+    return OK;
+  TRY(all_values(left->t, left->q, left->p, step->own, before, step->workspace));
+  TRY(all_values(right->t, right->q, right->p, step->own, after, step->workspace));
+  const long long first = *step->filled;
+  for (int e = 0; e < EVENT_FIRST[FIRST_TRANSITION]; e++) {
+    const int event = EVENT_OF(e), sign = after[e] >= 0.0 ? 1 : -1;
+    real q[M], p[M];
+    event_sample at = {.q = q, .p = p};
+    if ((before[e] >= 0.0) == (after[e] >= 0.0) || before[e] == 0.0 || step->watch->direction[event] * sign < 0)
+      continue;
+    const real part = before[e] / (before[e] - after[e]);
+    at.t = left->t + part * (right->t - left->t);
+    for (int i = 0; i < M; i++) {
+      q[i] = left->q[i] + part * (right->q[i] - left->q[i]);
+      p[i] = left->p[i] + part * (right->p[i] - left->p[i]);
+    }
+    event_crossing *const crossing = note_crossing(step, event, part, &at);
+    crossing->direction = sign;
+    crossing->element = e - EVENT_FIRST[event];
+  }
+  TRY(settle_crossings(step, first));
+  if (step->watch->ended) {
+    event_crossing *const end = step->found + *step->filled - 1;
+    right->t = end->t;
+    copy_state(right->q, right->p, end->q, end->p);
+    set_run(run, end->t, right);
+  }
+  return OK;
+}
+
+int NAME(advance_by_steps)(event_run *run, event_watch *watch, real t_end, const step_control *control,
+    long long steps, const real *parameters, const solver_options *options, long long states, real *t, real *q, real *p,
+    real *length, int *iterations, long long *number, long long room, event_crossing *found, long long *filled,
+    solver_report *report, real *workspace)
+{
+  EVENT_MEMORY(watch, memory, 13 * M)
+  contact_step in;
+  real idle[PARAMETERS], imposed[PARAMETERS], own[PARAMETERS];
+  const stored_states to = {states, number, t, q, p, length, iterations};
+  event_sample left = {.q = memory + 9 * M, .p = memory + 10 * M}, right = {.q = memory + 11 * M, .p = memory + 12 * M};
+  event_step step = {0.0, 0.0, 0.0, NULL, NULL, own, options, watch, found, room, filled, report, workspace, memory,
+      memory + 13 * M, 0, NULL, own};
+  (void)control;
+  memset(report, 0, sizeof *report);
+  memcpy(own, parameters, sizeof own);
+  memcpy(idle, parameters, sizeof idle);
+  memcpy(imposed, parameters, sizeof imposed);
+  put_in_all(CONTACT_IS_OPEN, idle);
+  put_in_all(CONTACT_STICKS, imposed);
+  memset(&in, 0, sizeof in);
+  in.idle = idle;
+  in.imposed = imposed;
+  *filled = 0;
+  report->t = run->t;
+  if (!watch->steps.begun)
+    TRY(begin_by_steps(&in, run, watch, workspace));
+  watch->begun = 1;
+  while (report->steps < steps && !watch->ended && (t_end - run->t) - run->t_low != 0.0) {
+    const real rest = (t_end - run->t) - run->t_low, h = rest < (1.0 - CHANGE_WHOLE) * run->h ? rest : run->h;
+    const contact_memory before = watch->steps;
+    int changed = -1;
+    if (room - *filled < EVENT_FIRST[FIRST_TRANSITION] + 1 || report->stored == states)
+      return OK;
+    report->t = left.t = run->t;
+    copy_state(left.q, left.p, run->q, run->p);
+    copy_state(right.q, right.p, run->q, run->p);
+    TRY(step_by_steps(&in, &watch->steps, run->t, h, right.q, right.p, 0, workspace));
+    set_run(run, run->t, &right);
+    if (h == run->h) {
+      add_compensated(&run->t, &run->t_low, h, 0.0);
+    } else {
+      run->t = t_end;
+      run->t_low = 0.0;
+    }
+    run->step++;
+    right.t = run->t;
+    watch->time += h;
+    TRY(note_events(&step, run, &left, &right));
+    for (int k = EVENT_CONTACTS - 1; k >= 0; k--)
+      changed = has_changed(&before, &watch->steps, k) ? k : changed;
+    if (changed >= 0 && !watch->ended) {
+      int transition = 0;
+      while (TRANSITION[transition][0] != changed)
+        transition++;
+      event_crossing *const crossing = note_crossing(&step, FIRST_TRANSITION + transition, 1.0, &right);
+      crossing->direction = -1;
+      crossing->acted = 1;
+      memcpy(crossing->mode, watch->mode, sizeof crossing->mode);
+      put_memory(&watch->steps, watch->mode);
+    }
+    TRY(store_state(&to, &right, right.t - left.t, 0, watch->ended ? -1 : run->step, report));
+    report->steps++;
+  }
+  return OK;
+}

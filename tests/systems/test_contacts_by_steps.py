@@ -1,0 +1,344 @@
+"""Contacts by steps: what rests does not creep, gaps stay, friction has its angle; random bodies and units."""
+
+import pickle
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+
+CREEPS, PENETRATES, RESTS = 1e-12, 1e-10, 1e-10
+"""Motion of what rests in 10 s and depth of a gap, of the size of the motion; kinetic energy at rest, of its range."""
+BY_STEPS: dict[str, Any] = {"transitions": "by steps"}
+WIDTH, HEIGHT = 0.5, 0.2
+
+
+@cache
+def box() -> Any:
+    """Return the stepper of a box on its corners, on a slope s; its reference point is off its centre: M(q)."""
+    names = {
+        "m": 1.0,
+        "J": 0.1,
+        "g": 9.81,
+        "s": 0.0,
+        "w": WIDTH,
+        "d": HEIGHT,
+        "o": 0.1,
+        "mu": 0.5,
+        "mus": 0.5,
+        "e": 0.0,
+    }
+    speeds = "(x_dot - o*sin(a)*a_dot)**2 + (y_dot + o*cos(a)*a_dot)**2"
+    height, along = "y + o*sin(a)", "x + o*cos(a)"
+    corners = [(f"({i}*w + o)", f"({j}*d)") for i in (-1, 1) for j in (-1, 1)]
+    contacts = [
+        sc.contact(
+            f"y + {u}*sin(a) + {v}*cos(a)",
+            slip=f"x_dot - ({u}*sin(a) + {v}*cos(a))*a_dot",
+            friction="mu",
+            static_friction="mus",
+            restitution="e",
+        )
+        for u, v in corners
+    ]
+    system = sc.LagrangianSystem.from_text(
+        "box",
+        ["x", "y", "a"],
+        f"m*({speeds})/2 + J*a_dot**2/2 - m*g*(({height})*cos(s) - ({along})*sin(s))",
+        parameters=names,
+        contacts=contacts,
+    )
+    return sc.compile_stepper(system, "svi:1")
+
+
+class Box:
+    """A random box in units of length and mass: parameters, times relative to sqrt(length / g)."""
+
+    def __init__(self, number: int) -> None:
+        self.random = np.random.default_rng(number)
+        self.unit = float(10.0 ** self.random.integers(-6, 7))
+        m = float(10.0 ** self.random.uniform(-2, 2))
+        w, d, o = (self.unit * self.random.uniform(*ends) for ends in ((0.3, 0.6), (0.1, 0.3), (-0.1, 0.1)))
+        self.values = {"m": m, "w": w, "d": d, "o": o, "J": m * (w**2 + d**2) / 3}
+        self.time = float(np.sqrt(self.unit / 9.81))
+        self.flat = np.array([-o, d, 0.0])
+
+    def run(self, q: Any, v: Any, times: float, part: float = 5e-3, **further: Any) -> Any:
+        """Return a run by steps of a part of the unit of time."""
+        h = part * self.time
+        return box().integrate(
+            q, velocity=v, h=h, t_end=times * self.time, parameters=self.values | further, **BY_STEPS
+        )
+
+    def gaps(self, q: np.ndarray) -> np.ndarray:
+        """Return the heights of the corners, relative to the unit."""
+        w, d, o = (self.values[name] for name in "wdo")
+        corners = [(i * w + o, j * d) for i in (-1, 1) for j in (-1, 1)]
+        return np.array([q[:, 1] + u * np.sin(q[:, 2]) + v * np.cos(q[:, 2]) for u, v in corners]) / self.unit
+
+
+@pytest.mark.tiers(2, 8)
+@pytest.mark.parametrize("number", range(8))
+def test_static_friction_holds_to_its_angle_and_sliding_has_its_acceleration(number: int) -> None:
+    """A tenth of a degree below its angle a box at rest stays, a tenth above it slides with g (sin s - mu cos s)."""
+    of = Box(number)
+    mus = of.random.uniform(0.1, 0.6)
+    mu, angle = mus * of.random.uniform(0.5, 0.9), np.arctan(mus)
+    held, slides = (of.run(of.flat, [0, 0, 0], 30, mu=mu, mus=mus, s=angle + np.deg2rad(by)) for by in (-0.1, 0.1))
+    assert (abs(held.q - held.q[0]) / [of.unit, of.unit, 1.0]).max() < CREEPS
+    assert held.contact_modes[-1][1].count("stick") == 2
+    t = slides.t[-1]
+    s = angle + np.deg2rad(0.1)
+    way = 9.81 * (np.sin(s) - mu * np.cos(s)) * t**2 / 2
+    assert slides.q[-1, 0] - slides.q[0, 0] == pytest.approx(way, rel=1e-3)
+
+
+@pytest.mark.tiers(3, 20)
+@pytest.mark.parametrize("number", range(100))
+def test_thrown_boxes_rest_and_do_not_creep(number: int) -> None:
+    """From any pose and velocity; their loss of energy is the work of the contacts."""
+    of = Box(number)
+    q = np.array([0.0, 0.0, of.random.uniform(-np.pi, np.pi)])
+    q[1] -= of.unit * (of.gaps(q[np.newaxis]).min() - 0.1)
+    v = of.random.normal(size=3) * [of.unit, of.unit, 1.0] / of.time
+    run = of.run(q, v, 60, e=of.random.choice([0.0, 0.4]), mu=0.4, mus=of.random.choice([0.4, 0.5]))
+    energy = run.energy()
+    fall = np.ptp(energy)
+    rests = abs(run.t - 50 * of.time).argmin()
+    assert (abs(run.q[rests:] - run.q[-1]) / [of.unit, of.unit, 1.0]).max() < CREEPS
+    assert run.p[-1] @ run.velocity[-1] < RESTS * fall
+    assert of.gaps(run.q).min() > -PENETRATES
+    assert run.lost_energy == pytest.approx(energy[0] - energy[-1], abs=1e-3 * fall)
+    assert np.diff(energy).max() < 1e-4 * fall
+    assert run.contact_residual < 1e-10
+    assert len(run.contact_modes) < 60
+
+
+@pytest.mark.tiers(1, 4)
+@pytest.mark.parametrize("e", [0.9, 0.0, 0.5, 1.0])
+def test_rebounds_have_their_restitution_and_gain_no_energy(e: float) -> None:
+    of = Box(3)
+    height = of.unit
+    run = of.run(of.flat + np.array([0, height, 0]), [0, 0, 0], 4.2 if e else 3, 1e-3, e=e, mu=0.0, mus=0.0)
+    lands = np.sqrt(2.0)
+    later = run.t > (1 + 1e-2) * lands * of.time
+    apex = (run.q[later, 1].max() - of.flat[1]) / height
+    assert apex == pytest.approx(e**2, abs=5e-3)
+    energy = run.energy()
+    assert np.diff(energy).max() < 1e-9 * np.ptp(run.q[:, 1]) * of.values["m"] * 9.81
+
+
+def test_order_is_two_in_flight_and_on_a_contact_that_slips() -> None:
+    """Between transitions: a box that tumbles, and one that slides on a corner, whose rows turn."""
+    of = Box(5)
+    v = np.array([of.unit, 2 * of.unit, 3.0]) / of.time
+    flight = [of.run([0, 3 * of.unit, 0.3], v, 1.0, part).q[-1] for part in (0.04, 0.02, 0.01)]
+    corner = of.flat * [1, 0, 0] + [0, 0, 0.5]
+    corner[1] -= of.unit * of.gaps(corner[np.newaxis]).min()
+    tips = [of.run(corner, [0, 0, 0], 0.25, part, mu=0.05, mus=0.05).q[-1] for part in (0.05, 0.025, 0.0125)]
+    for ends in (flight, tips):
+        coarse, fine = (abs(ends[k] - ends[k + 1])[2] for k in range(2))
+        assert np.log2(coarse / fine) == pytest.approx(2.0, abs=0.2)
+
+
+def test_runs_continue_from_checkpoints_and_end_at_events() -> None:
+    of = Box(2)
+    q, v = of.flat + np.array([0, of.unit, 0.4]), np.array([of.unit, 0.0, 1.0]) / of.time
+    stepper, settings = box().by_transitions("by steps"), {"h": 5e-3 * of.time, "parameters": of.values}
+    run = stepper.start(q, velocity=v, **settings)
+    run.advance(400)
+    saved = run.checkpoint()
+    run.advance(400)
+    again = pickle.loads(pickle.dumps(stepper)).from_checkpoint(saved)
+    again.advance(400)
+    assert np.array_equal(run.q, again.q)
+    assert np.array_equal(run.p, again.p)
+    whole = of.run(q, v, 4.0)
+    assert np.array_equal(run.q, whole.q[-1])
+    times = np.array([0.5, 0.5025, 3.1]) * of.time
+    sparse = box().integrate(q, velocity=v, t_end=4 * of.time, t_eval=times, **settings, **BY_STEPS)
+    for k in range(3):
+        assert np.allclose(sparse.q[:, k], np.interp(times, whole.t, whole.q[:, k]), rtol=0, atol=1e-13 * of.unit)
+    end = sc.Event("a", terminal=True)
+    turned = box().integrate(q, velocity=-v, t_end=4 * of.time, events=end, **settings, **BY_STEPS)
+    assert abs(turned.q[-1, 2]) < 1e-14
+    assert turned.ended_by == end
+
+
+REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+    "adaptive": ({"t_end": 1.0}, "adaptive step size"),
+    "error": ({"t_end": 1.0, "error": 1e-3}, "error="),
+    "kind": ({"h": 0.1, "steps": 1, "transitions": "stepped"}, "unknown transitions 'stepped'"),
+    "impact": ({"h": 0.1, "steps": 1, "events": sc.impact("x")}, "events that change the state"),
+    "behind": ({"h": 0.1, "steps": 1, "q": [0.0, -1.0, 0.0]}, "must not be negative"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_runs_by_steps_lack_is_refused_by_name(name: str) -> None:
+    arguments, words = REFUSED[name]
+    settings = {"q": [0.0, 1.0, 0.0], "velocity": [0.0, 0.0, 0.0]} | BY_STEPS | arguments
+    with pytest.raises((sc.MethodError, sc.StateError, sc.ContactError, sc.EventError), match=words):
+        box().integrate(**settings)
+
+
+@pytest.mark.second
+def test_quantities_of_located_runs_are_refused_after_steps() -> None:
+    run = box().integrate([0.0, 1.0, 0.0], velocity=[0, 0, 0], h=0.01, t_end=1.0, **BY_STEPS)
+    for ask in (run.sensitivity, run.work, run.energy_error, lambda: run.error, lambda: run.crossings("a")):
+        with pytest.raises((sc.MethodError, sc.StateError)):
+            ask()
+    with pytest.raises(sc.StateError, match="by steps"):
+        _ = box().integrate([0.0, 1.0, 0.0], velocity=[0, 0, 0], h=0.01, t_end=0.1).compliance
+
+
+@pytest.mark.second
+def test_rods_on_constraints_belts_and_moving_tables() -> None:
+    """Constraints hold to round-off, a belt sticks and slips in turn as located, a table throws what it carries."""
+    rod = sc.LagrangianSystem.from_text(
+        "rod",
+        ["x", "y", "u", "w"],
+        "(x_dot**2 + y_dot**2 + u_dot**2 + w_dot**2)/2 - 9.81*(y + w)",
+        constraints=["(x - u)**2 + (y - w)**2 = 1"],
+    )
+    floor = [
+        sc.contact(y, slip=f"{x}_dot", friction=0.4, restitution=e) for x, y, e in (("x", "y", 0), ("u", "w", 0.5))
+    ]
+    run = sc.compile_stepper(rod, "svi:1", contacts=floor).integrate(
+        [0, 0.5, 0.6, 1.3], velocity=[0.3, 0, 0.3, 0], h=2e-3, t_end=6.0, **BY_STEPS
+    )
+    x, y, u, w = run.q.T
+    assert abs((x - u) ** 2 + (y - w) ** 2 - 1).max() < 1e-13
+    assert min(y.min(), w.min()) > -1e-13
+    assert abs(run.velocity[-1]).max() < 1e-12
+    oscillator = sc.LagrangianSystem.from_text("oscillator", ["x"], "x_dot**2/2 - x**2/2")
+    belt = sc.compile_stepper(oscillator, "svi:1", contacts=[sc.friction("x_dot - 0.3", limit=0.25, static_limit=0.4)])
+    located, stepped = (belt.integrate([0.0], velocity=[0.3], h=2e-3, t_end=30.0, **way) for way in ({}, BY_STEPS))
+    for (t, modes), (at, same) in zip(located.contact_modes, stepped.contact_modes, strict=True):
+        assert modes == same
+        assert t == pytest.approx(at, abs=5e-3)
+    body = sc.LagrangianSystem.from_text("body", ["y"], "y_dot**2/2 - 9.81*y", parameters={"w": 20.0})
+    table = sc.compile_stepper(body, "svi:1", contacts=[sc.contact("y - 0.02*sin(w*t)")])
+    carried, thrown = (
+        table.integrate([0.0], velocity=[0.02 * w], h=1e-3, t_end=1.0, parameters={"w": w}, **BY_STEPS)
+        for w in (10.0, 30.0)
+    )
+    assert abs(carried.q[:, 0] - 0.02 * np.sin(10 * carried.t)).max() < 1e-13
+    assert max(thrown.q[:, 0] - 0.02 * np.sin(30 * thrown.t)) > 0.01
+
+
+def biped() -> tuple[Any, Any]:
+    """Return the stepper of a biped of seven degrees of freedom with eight contacts, and its lowest height."""
+    half, leg, foot = 0.25, 0.4, ((0.4, -0.06), (0.4, 0.12))
+    thighs, shins = (
+        ([(k, half / 2 * 1.6, 0.0)] for k in (1, 2)),
+        ([(k - 2, leg, 0.0), (k, leg / 2, 0.0)] for k in (3, 4)),
+    )
+    links = [
+        (10.0, 0.3, [(0, half, 0.0)]),
+        *((3.0, 0.05, path) for path in thighs),
+        *((2.0, 0.03, path) for path in shins),
+    ]
+    points = [[(k - 2, leg, 0.0), (k, *arm)] for k in (3, 4) for arm in foot] + [
+        [(1, leg, 0.0)],
+        [(2, leg, 0.0)],
+        [],
+        [(0, 2 * half, 0.0)],
+    ]
+
+    def place(path: Any) -> tuple[str, str]:
+        return (
+            "x" + "".join(f" + {c}*cos(a{k}) - {d}*sin(a{k})" for k, c, d in path),
+            "y" + "".join(f" + {c}*sin(a{k}) + {d}*cos(a{k})" for k, c, d in path),
+        )
+
+    def speed(path: Any) -> tuple[str, str]:
+        return (
+            "x_dot" + "".join(f" - ({c}*sin(a{k}) + {d}*cos(a{k}))*a{k}_dot" for k, c, d in path),
+            "y_dot" + "".join(f" + ({c}*cos(a{k}) - {d}*sin(a{k}))*a{k}_dot" for k, c, d in path),
+        )
+
+    terms = [
+        f"{m}*(({speed(path)[0]})**2 + ({speed(path)[1]})**2)/2 + {inertia}*a{k}_dot**2/2 - {m}*9.81*({place(path)[1]})"
+        for k, (m, inertia, path) in enumerate(links)
+    ]
+    contacts = [sc.contact(place(path)[1], slip=speed(path)[0], friction=0.5) for path in points]
+    system = sc.LagrangianSystem.from_text("biped", ["x", "y", *(f"a{k}" for k in range(5))], " + ".join(terms))
+
+    def lowest(q: Any) -> Any:
+        angles = np.atleast_2d(q)[:, 2:].T
+        rows = [sum((c * np.sin(angles[k]) + d * np.cos(angles[k]) for k, c, d in path), 0.0) for path in points]
+        return np.atleast_2d(q)[:, 1] + np.min([np.broadcast_to(row, len(np.atleast_2d(q))) for row in rows], axis=0)
+
+    return sc.compile_stepper(system, "svi:1", contacts=contacts), lowest
+
+
+@pytest.mark.second
+def test_thrown_bipeds_rest() -> None:
+    stepper, lowest = biped()
+    random = np.random.default_rng(7)
+    for _ in range(6):
+        q, v = np.r_[0, 0, random.normal(size=5) * 0.5 + [1.6, 4.7, 4.7, 4.7, 4.7]], random.normal(size=7)
+        q[1] += 0.1 - lowest(q)[0]
+        run = stepper.integrate(q, velocity=v, h=5e-3, t_end=10.0, **BY_STEPS)
+        assert run.p[-1] @ run.velocity[-1] < RESTS * np.ptp(run.energy())
+        assert lowest(run.q).min() > -PENETRATES
+        assert abs(run.q[-200:] - run.q[-1]).max() < CREEPS
+        assert run.contact_residual < 1e-10
+
+
+@pytest.mark.rotated
+def test_spheres_roll_whose_attitude_is_a_rotation() -> None:
+    """Rolling has the velocity (5 v + 2 r w)/7; quaternions keep their length."""
+    sphere = sc.LagrangianSystem.from_text(
+        "sphere",
+        ["x", "y", "z"],
+        "x_dot**2 + y_dot**2 + z_dot**2 + (omega_1**2 + omega_2**2 + omega_3**2)/10 - 19.62*z",
+        rotations={"R": "omega"},
+    )
+    wx, wy = (f"rotate_{k}(R, omega_1, omega_2, omega_3)" for k in (1, 2))
+    plane = sc.contact("z - 0.5", slip=[f"x_dot - {wy}/2", f"y_dot + {wx}/2"], friction=0.3)
+    run = sc.compile_stepper(sphere, "svi:1", contacts=[plane]).integrate(
+        {"x": 0, "y": 0, "z": 0.5, "R": [1, 0, 0, 0]},
+        velocity={"x": 3, "y": 1, "z": 0, "omega": [-2, 4, 5]},
+        h=2e-3,
+        t_end=1.0,
+        **BY_STEPS,
+    )
+    assert run.contact_modes[-1][1] == ("stick",)
+    assert np.allclose(run.velocity[-1, :3], [(5 * 3 + 4) / 7, (5 * 1 + 2) / 7, 0], rtol=0, atol=1e-6)
+    assert abs(np.linalg.norm(run.q[:, 3:], axis=1) - 1).max() < 1e-11
+
+
+ROBOT = """
+<mujoco model="hopper">
+  <default> <joint axis="0 1 0"/> <geom type="capsule" size="0.04" friction="0.7"/> </default>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 0.1"/>
+    <body name="trunk" pos="0 0 0.6">
+      <joint name="x" type="slide" axis="1 0 0"/> <joint name="z" type="slide" axis="0 0 1"/> <joint name="pitch"/>
+      <geom fromto="-0.2 0 0 0.2 0 0" mass="6"/>
+      <body name="leg"> <joint name="hip" damping="1" range="-60 60"/> <geom fromto="0 0 0 0 0 -0.4" mass="1"/> </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.rotated
+def test_robots_of_files_rest_on_their_limits(tmp_path: Path) -> None:
+    (tmp_path / "hopper.xml").write_text(ROBOT)
+    robot = sc.LagrangianSystem.from_mjcf(tmp_path / "hopper.xml", limits="contact", contacts="planes")
+    stepper = sc.compile_stepper(robot, "svi:1")
+    random = np.random.default_rng(4)
+    for _ in range(4):
+        start = {"x": 0.0, "z": 0.0, "pitch": random.uniform(-0.5, 0.5), "hip": random.uniform(-1, 1)}
+        run = stepper.integrate(
+            start, velocity=dict.fromkeys(start, 0.0) | {"x": random.normal()}, h=2e-3, t_end=10.0, **BY_STEPS
+        )
+        assert run.p[-1] @ run.velocity[-1] < RESTS * np.ptp(run.energy())
+        assert abs(run["hip"]).max() < np.pi / 3 + PENETRATES
+        assert run.contact_residual < 1e-6
