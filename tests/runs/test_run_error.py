@@ -134,15 +134,6 @@ def test_error_of_a_slice_is_that_since_its_first_state():
     assert np.array_equal(run[:6].error.q, run.error.q[:6])
 
 
-def test_errors_do_not_depend_on_the_number_of_threads(monkeypatch):
-    run = kepler().integrate(**start_of(0.2), h=0.02, steps=10000)
-    errors = [run.error]
-    monkeypatch.setattr("os.cpu_count", lambda: 1)
-    errors.append(replace(run).error)
-    assert np.array_equal(errors[0].p, errors[1].p)
-    assert np.array_equal(errors[0].rounding_q, errors[1].rounding_q)
-
-
 def test_uncertain_digits():
     cases = {
         (0.5123451, 1.15e-5): "0.512345(12)",
@@ -295,7 +286,7 @@ KINDS = {
 
 
 def table_of_kinds():
-    rows = re.findall(r"^\| (.+?) \| (signed|by comparison|refused) \|", PAGE.read_text("utf-8"), re.M)
+    rows = re.findall(r"^\| (.+?) \| (signed|refused) \|", PAGE.read_text("utf-8"), re.M)
     return {kind: judge for names, judge in rows for kind in names.split("; ")}
 
 
@@ -314,7 +305,6 @@ def test_kinds_of_runs(kind):
                 _ = run.error
             return
     error = run.error
-    assert error.signed == (judge == "signed")
     assert 0.0 < error.relative[-1] < 1e-2
     assert error.lost is None
     assert not error.reason
