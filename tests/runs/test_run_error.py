@@ -78,6 +78,19 @@ def test_what_iterations_leave_does_not_grow_at_pericentres():
     assert np.abs(estimate(run, rows) - true).max() <= 0.05 * np.abs(true).max()
 
 
+@pytest.mark.rotated
+def test_errors_in_transformed_time_contain_the_rounding_of_the_energy():
+    """Orbits of e = 0.5 to 0.99 from both apsides: bounds of their errors, from apocentres thirty times as large."""
+    system = lagrange("kepler", "x y", "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)")
+    stepper = sc.compile_stepper(sc.reparametrise(system, "frequency"), "svi:8")
+    for e in (0.5, 0.99, -0.99):
+        run = stepper.integrate([1.0 - e, 0.0], velocity=[0.0, math.sqrt((1.0 + e) / (1.0 - e))], h=0.5, t_end=60.0)
+        error, exact = run.error, on_an_ellipse(run.q[0], run.p[0], run.t)
+        true = np.asarray(np.concatenate([run.q, run.p], axis=1) - exact, float)
+        assert np.abs(true / error.sizes.ravel()).max() <= error.relative[-1]
+        assert e > 0.0 or error.relative[-1] <= 30.0 * np.abs(true / error.sizes.ravel()).max()
+
+
 @pytest.mark.parametrize("method", ["svi:4", "svi:8"])
 def test_saving_seldom_and_output_times_do_not_change_the_errors(method):
     """Random orbits, tolerances and directions, up to errors and roundings of the finer steps; in ensembles, too."""
