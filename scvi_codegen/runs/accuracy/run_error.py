@@ -200,7 +200,7 @@ def error_of(run: Any) -> RunError:
     finer = finer_of(stepper)
     if _is_compared(stepper, finer):
         return _compared(run, finer)
-    finer = finer.with_events(stepper.events if stepper.changes_states else ())
+    finer = finer.with_events(stepper.changing_events)
     return _Replay(run, finer).error()
 
 
@@ -494,7 +494,7 @@ def _compared(run: Any, finer: Any) -> RunError:
     Samples of rounding errors are differences of runs whose states are rounded in between: of fixed steps in tau at
     ``PIECES`` random times, else one whose initial state is, as a restart at a kink would be another motion.
     """
-    finer = finer.with_events(run.stepper.events if run.stepper.changes_states else ())
+    finer = finer.with_events(run.stepper.changing_events)
     exact, *samples = (_states_of(run, finer, seed) for seed in range(1 + (SAMPLES if run.stepper.in_tau else 1)))
     errors = [np.asarray(x - y).T for x, y in zip((run.q, run.p), exact, strict=True)]
     apart = [np.array([np.asarray(x - y).T for x, y in zip(of, exact, strict=True)]) for of in samples]
@@ -549,8 +549,7 @@ def corrected_states(run: Any, error: RunError) -> CorrectedStates:
     velocity = np.full_like(q, np.nan)
     for k in np.flatnonzero(np.isfinite(q).all(axis=1)).tolist():
         parameters = run.parameters_on_sides(float(run.t[k]))
-        if stepper.interface.constraints:
-            q[k], p[k], _ = projected(stepper, q[k], p[k], float(run.t[k]), parameters)
+        q[k], p[k], _ = projected(stepper, q[k], p[k], float(run.t[k]), parameters)
         velocity[k] = stepper.velocity(q[k], p[k], float(run.t[k]), parameters)
     return CorrectedStates(
         t=np.asarray(run.t), q=stepper.named(q), p=stepper.named(p), velocity=stepper.named(velocity)

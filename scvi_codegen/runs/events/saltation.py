@@ -316,11 +316,10 @@ def _jump(
     # a start moved along the flow has the same end: Phi(z + X+ s, t + s, h - s) = Phi(z, t, h), hence
     # Phi_z X+ = Phi_h - Phi_t, solved for X+ = departure + basis y
     step = products(after, h, t, np.eye(size))
-    departure, basis = np.zeros(2 * m), np.eye(2 * m)
-    if stepper.constraints:  # tangent vectors are admissible: departure + the range of the derivative of the projection
-        onto = _projection(later._replace(all_inputs=False), after)[1]
-        directions, sizes, _ = np.linalg.svd(onto[:, : 2 * m])
-        departure, basis = onto[:, -1], directions[:, sizes > ADMISSIBLE]
+    # tangent vectors are admissible: departure + the range of the derivative of the projection
+    onto = _projection(later._replace(all_inputs=False), after)[1]
+    directions, sizes, _ = np.linalg.svd(onto[:, : 2 * m])
+    departure, basis = onto[:, -1], directions[:, sizes > ADMISSIBLE]
     moved = step[:, -1] - step[:, -2] - step[:, : 2 * m] @ departure
     departure = departure + basis @ np.linalg.lstsq(step[:, : 2 * m] @ basis, moved)[0]
     # dh of a divided step is added to both of its parts, but lengthens only the second: without that of the first,

@@ -86,6 +86,11 @@ class Starts:
         states[:, 0] = q, p
         return cls(np.ascontiguousarray(t), np.ascontiguousarray(h), states[0], states[1], chained=True)
 
+    @property
+    def arrays(self) -> tuple[Array, ...]:
+        """Times, step sizes, positions and momenta, as C takes them."""
+        return self.t, self.h, self.q, self.p
+
     def part(self, first: int, last: int) -> Starts:
         """Return a view of the steps ``first`` to ``last`` - 1."""
         steps, states = slice(first, last), slice(first, last + 1)
@@ -290,7 +295,7 @@ class LinearisedMethod(StateFunctions):
         q1, p1 = (starts.q[1:], starts.p[1:]) if chained else np.empty((2, len(starts.h), m))
         status = binding.function("linearise")(
             len(starts.h),
-            *map(binding.pointer, (starts.t, starts.h, starts.q, starts.p, parameters)),
+            *map(binding.pointer, (*starts.arrays, parameters)),
             binding.options(options),
             int(transpose),
             vectors.shape[1],
@@ -325,7 +330,7 @@ class LinearisedMethod(StateFunctions):
         """
         count, abscissae, pointer = len(starts.h), self._abscissae, self.binding.pointer
         curves = Curves(np.empty((count, self.dimension, len(abscissae))), abscissae)
-        arrays = starts.t, starts.h, starts.q, starts.p, sizes, limits, before, curves.values
+        arrays = *starts.arrays, sizes, limits, before, curves.values
         into = self._columns(errors)
         status, steps, report = self._call_steps("errors", parameters, None, count, *map(pointer, arrays), *into)
         if status:
@@ -360,7 +365,7 @@ class LinearisedMethod(StateFunctions):
         if self.interface.constraints:
             sizes = np.repeat(sizes.reshape(2, -1).max(axis=1), self.dimension)
         pointer, after = self.binding.pointer, np.empty_like(vectors)
-        steps = map(pointer, (starts.t, starts.h, starts.q, starts.p, sizes))
+        steps = map(pointer, (*starts.arrays, sizes))
         settings = len(vectors), rounding, seed, pointer(vectors), pointer(after), *self._columns(deviations)
         status, _, report = self._call_steps("differences", parameters, None, len(starts.h), *steps, *settings)
         if status:
@@ -413,7 +418,7 @@ class LinearisedMethod(StateFunctions):
         ends[0, :, :size] = vectors
         status = binding.function("transport_roundings")(
             len(starts.h),
-            *map(binding.pointer, (starts.t, starts.h, starts.q, starts.p, parameters)),
+            *map(binding.pointer, (*starts.arrays, parameters)),
             binding.null,
             len(curves.abscissae),
             *map(binding.pointer, (curves.abscissae, curves.values)),
@@ -448,7 +453,7 @@ class LinearisedMethod(StateFunctions):
         report = binding.new("report *")
         status = binding.function("second_order")(
             len(starts.h),
-            *map(binding.pointer, (starts.t, starts.h, starts.q, starts.p, parameters)),
+            *map(binding.pointer, (*starts.arrays, parameters)),
             binding.options(options),
             vectors.shape[2],
             *map(binding.pointer, (changes, vectors)),
