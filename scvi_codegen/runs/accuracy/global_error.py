@@ -323,7 +323,6 @@ class Runs:
         apart = differences_in_pieces(run, size, bound)
         if not apart.any():
             return False
-        apart[0] = np.maximum(apart[0] - 2.0 * np.spacing(np.abs(np.asarray(run.q)).max(axis=0)), 0.0)
         entries = relative(apart, run.error.sizes)[..., None]
         leave_out_rounding(run, apart[..., None], entries)
         if entries.max() <= bound:
