@@ -177,7 +177,7 @@ int NAME(call_integrate)(NAME(call) *c, long long steps, long long every)
   return status;
 }
 
-#ifdef HAS_DEFECTS
+#ifdef HAS_ERRORS
 /* Takes `parts` equal steps h from the state after a vector v times a factor, whose low words are in compensation
  * terms. */
 static int NAME(call_step)(NAME(call) *c, double t, double h, long long parts, const double *q, const double *p,
@@ -185,6 +185,7 @@ static int NAME(call_step)(NAME(call) *c, double t, double h, long long parts, c
 {
   __typeof__(NAME(advance)) *volatile fixed = NAME(advance);
   NAME(run) *run = c->run;
+  run->guess = v && run->h != h ? 0 : run->guess; /* predictors are those of equal steps */
   run->t = t, run->t_low = 0.0, run->h = h;
   for (int i = 0; i < M; i++) {
     const double dq = v ? factor * v[i] : 0.0, dp = v ? factor * v[M + i] : 0.0;
@@ -203,7 +204,7 @@ int NAME(call_pieces)(NAME(call) *c, long long count, const double *t, const dou
   int status = 0;
   for (long long k = 0; k < count && !status; k++) {
     const long long row = k * c->coordinates;
-#ifdef HAS_DEFECTS
+#ifdef HAS_ERRORS
     if (k == 0)
       NAME(start)(c->run, t[0], h[0], q, p);
     status = NAME(call_step)(c, t[k], h[k], pieces[k], q + row, p + row, NULL, 0.0);
@@ -221,7 +222,7 @@ int NAME(call_pieces)(NAME(call) *c, long long count, const double *t, const dou
   return status;
 }
 
-#ifdef HAS_DEFECTS
+#ifdef HAS_ERRORS
 #ifdef HAS_SET_FALLBACK
 #define LACKS_NEWTON(status) ((status) == STATUS(FALLBACK_REQUIRED))
 #else
@@ -269,122 +270,137 @@ static double NAME(relative_length)(int count, const double *x, const double *si
   return sqrt(sum);
 }
 
-/* Defect x[k + 1] - phi(x[k]) of the step from x[k] = (q, p) at t to the next state, by phi in `parts` equal steps;
- * their increments have low words, so that no rounding of states remains. Returns 0 if a step fails or Newton's method
- * solves one, unless that is accepted; then the negative status where it is not there. */
-static int NAME(call_defect)(NAME(call) *c, double t, double h, long long parts, int by_newton, const double *q,
-    const double *p, double *defect)
+/* Error x[k + 1] - y[k + 1] after the step phi of y[k] = x[k] - error, x[k] = (q, p) at t, in `parts` equal steps from
+ * states with low words, so that no rounding of states remains. Returns 0 if a step fails or Newton's method solves one,
+ * unless that is accepted; then the negative status where it is not there. */
+static int NAME(call_error)(NAME(call) *c, double t, double h, long long parts, int by_newton, const double *q,
+    const double *p, const double *error, double *next)
 {
   NAME(run) *run = c->run;
-  const int status = NAME(call_step)(c, t, h / (double)parts, parts, q, p, NULL, 0.0);
+  const int status = NAME(call_step)(c, t, h / (double)parts, parts, q, p, error, -1.0);
   if (status || (c->report->fallback_steps && !by_newton))
     return by_newton && LACKS_NEWTON(status) ? -status : 0;
   for (int i = 0; i < M; i++) {
-    defect[i] = (q[M + i] - run->q[i]) - run->carry_q[i];
-    defect[M + i] = (p[M + i] - run->p[i]) - run->carry_p[i];
+    next[i] = (q[M + i] - run->q[i]) - run->carry_q[i];
+    next[M + i] = (p[M + i] - run->p[i]) - run->carry_p[i];
   }
   return 1;
 }
 
-/* Returns 1 if phi in half as many steps, or the change of momenta, shows that the error of phi is small beside the
- * defect: it is below `part` of the change of momenta, the motion by forces, or the last one differs from it by `apart`
- * of it and roundings (Hairer, Norsett & Wanner, Solving ODEs I, II.4). Lengths are relative to sizes of (q, p). */
+#define CARRIED 4.0 /* ranges are twice the amplitudes, and some derivatives twice those of an oscillator */
+
+/* Returns 1 if phi in half as many steps, or the motion, shows that the error of phi is small beside the change of the
+ * error: this is below limits[0] of the change of momenta, the motion by forces, or the last one differs from it by
+ * limits[1] of it and roundings (Hairer, Norsett & Wanner, Solving ODEs I, II.4). After a step of which the first is known,
+ * it also contains (D phi - 1) error, of the size of the motion times the error. Lengths are relative to sizes of (q, p). */
 static int NAME(call_resolved)(const double *q, const double *p, const double *size, const double *limits,
-    const double *defect, const double *last)
+    const double *error, const double *next, const double *last, int follows)
 {
-  double change[2 * M];
-  for (int i = 0; i < M; i++)
-    change[i] = p[M + i] - p[i];
-  const double length = NAME(relative_length)(2 * M, defect, size);
-  if (length <= limits[0] * NAME(relative_length)(M, change, size + M))
-    return 1;
-  for (int i = 0; last && i < 2 * M; i++) {
+  double moved[2 * M], change[2 * M], apart[2 * M];
+  for (int i = 0; i < 2 * M; i++) {
     const double *x = i < M ? q + i : p + i - M;
-    change[i] = fmax(fabs(defect[i] - last[i]) - limits[2] * (fabs(x[0]) + fabs(x[M] - x[0])), 0.0);
+    moved[i] = x[M] - x[0];
+    change[i] = next[i] - error[i];
+    apart[i] = last ? fmax(fabs(next[i] - last[i]) - limits[2] * (fabs(x[0]) + fabs(moved[i])), 0.0) : INFINITY;
   }
-  return last && NAME(relative_length)(2 * M, change, size) <= limits[1] * length;
+  const double length = NAME(relative_length)(2 * M, change, size);
+  const double by_forces = NAME(relative_length)(M, moved + M, size + M);
+  const double carried = NAME(relative_length)(2 * M, error, size) * NAME(relative_length)(2 * M, moved, size);
+  return length <= limits[0] * by_forces + (follows ? CARRIED * carried : 0.0) ||
+      NAME(relative_length)(2 * M, apart, size) <= limits[1] * length;
 }
 
-/* Takes a step of phi in twice as many parts, from *least on, until it is resolved, and finds its defect; returns the
- * number of parts, or 0. *least becomes that which can be solved, or more than MOST_PARTS. */
+/* Takes a step of phi in twice as many parts, from *least on, until it is resolved, and replaces the error by the next
+ * one; returns the number of parts, or 0. *least becomes that which can be solved, or more than MOST_PARTS, and *follows
+ * whether the motion showed that. */
 static int NAME(call_parts)(NAME(call) *c, double t, double h, int by_newton, const double *q, const double *p,
-    const double *size, const double *limits, double *defect, int *least)
+    const double *size, const double *limits, double *error, int *least, int *follows)
 {
   const NAME(run) before = *c->run;
-  double last[2 * M];
-  int solved = 0;
+  double next[2 * M] = {0.0}, last[2 * M];
+  int solved = 0, known = *follows;
+  *follows = 0;
   for (int parts = *least; parts <= MOST_PARTS; parts *= 2) {
-    const int follows = solved;
-    memcpy(last, defect, sizeof last);
+    const int halved = solved;
+    memcpy(last, next, sizeof last);
     *c->run = before;
-    solved = NAME(call_defect)(c, t, h, parts, by_newton, q, p, defect);
+    solved = NAME(call_error)(c, t, h, parts, by_newton, q, p, error, next);
     if (solved < 0)
       return solved;
-    if (solved && NAME(call_resolved)(q, p, size, limits, defect, follows ? last : NULL))
+    if (solved && NAME(call_resolved)(q, p, size, limits, error, next, halved ? last : NULL, known)) {
+      memcpy(error, next, sizeof next);
+      *follows = parts == *least;
       return parts;
+    }
     *least = solved ? *least : 2 * parts;
   }
   return 0;
 }
 
-/* Length of a defect relative to the change of the state in its step, a power of 2, so that sizes, which later states
- * change, do not change bits. */
-static double NAME(call_defect_size)(const double *q, const double *p, const double *size, const double *defect)
+/* Length of a change of the error relative to that of the state in its step, a power of 2, so that sizes, which later
+ * states change, do not change bits. */
+static double NAME(call_change)(const double *q, const double *p, const double *size, const double *error,
+    const double *next)
 {
-  double change[2 * M];
+  double change[2 * M], moved[2 * M];
   for (int i = 0; i < M; i++)
-    change[i] = q[M + i] - q[i], change[M + i] = p[M + i] - p[i];
-  const double part = NAME(relative_length)(2 * M, defect, size) / NAME(relative_length)(2 * M, change, size);
+    moved[i] = q[M + i] - q[i], moved[M + i] = p[M + i] - p[i];
+  for (int i = 0; i < 2 * M; i++)
+    change[i] = next[i] - error[i];
+  const double part = NAME(relative_length)(2 * M, change, size) / NAME(relative_length)(2 * M, moved, size);
   return part > 0.0 && part < INFINITY ? exp2(floor(log2(part))) : 0.0;
 }
 
-/* Defects of `count` + 1 states of another run at times t by one step phi of size h from each, which begins at the
- * curve of the last one. Where the iteration fails it is taken in `parts`; where that does not suffice, Newton's method
- * solves all further ones. 0: no number of parts resolves the step. Iterations leave limits[3] of the defect before.
- * Values of the steps at their points go into curves, unless that is NULL. */
-int NAME(call_defects)(NAME(call) *c, long long count, const double *t, const double *h, const double *q,
-    const double *p, const double *size, const double *limits, double *curves, double *defects, int *parts)
+/* Errors x - y of `count` states of a run x after the first one, with the error `before`, beside states y by steps phi
+ * of its sizes h, into the columns of `errors`, until one is resolved in no number of parts: c->steps states. A step
+ * that the iteration does not solve is taken in parts; where that does not suffice, Newton's method solves all further
+ * ones. Iterations leave limits[3] of the change of the error before. Values of the steps at their points go into
+ * curves. */
+int NAME(call_errors)(NAME(call) *c, long long count, const double *t, const double *h, const double *q,
+    const double *p, const double *size, const double *limits, const double *before, double *curves, long long stride,
+    double *errors)
 {
-  int least = 1, by_newton = 0;
-  double expected = 0.0;
+  int least = 1, by_newton = 0, follows = 0;
+  double error[2 * M], last[2 * M];
   const NAME(options) exact = c->options ? *c->options : NAME(default_options)();
   NAME(options) options = exact;
   c->options = &options;
+  memcpy(error, before, sizeof error);
   NAME(start)(c->run, t[0], h[0], q, p);
-  memset(defects, 0, sizeof(double) * (size_t)(count * 2 * M));
-  for (long long k = 0; k < count; k++, q += M, p += M, defects += 2 * M) {
-    options.tolerance = fmax(exact.tolerance, limits[3] * expected);
-    parts[k] = NAME(call_parts)(c, t[k], h[k], by_newton, q, p, size, limits, defects, &least);
+  for (long long k = 0; k < count; k++, q += M, p += M) {
+    memcpy(last, error, sizeof last);
+    int parts = NAME(call_parts)(c, t[k], h[k], by_newton, q, p, size, limits, error, &least, &follows);
+    c->steps = k;
     if (least > MOST_PARTS) {
       NAME(start)(c->run, t[k], h[k], q, p);
       least = by_newton = 1;
-      parts[k] = NAME(call_parts)(c, t[k], h[k], by_newton, q, p, size, limits, defects, &least);
+      parts = NAME(call_parts)(c, t[k], h[k], by_newton, q, p, size, limits, error, &least, &follows);
       least = 1;
     }
-    if (parts[k] < 0)
-      return -parts[k];
-    curves = NAME(call_keep)(c->run, parts[k], curves);
-    expected = parts[k] == 0 ? 0.0 : NAME(call_defect_size)(q, p, size, defects);
-    if (parts[k] == 0)
-      NAME(start)(c->run, t[k], h[k], q + M, p + M);
+    if (parts <= 0)
+      return -parts;
+    options.tolerance = fmax(exact.tolerance, limits[3] * NAME(call_change)(q, p, size, last, error));
+    curves = NAME(call_keep)(c->run, parts, curves);
+    for (int i = 0; i < 2 * M; i++)
+      errors[i * stride + k] = error[i];
   }
+  c->steps = count;
   return 0;
 }
 
-/* Transports vectors of global errors, from `before` to `now`, over the steps phi of call_defects by differences: phi(x
- * + s v) - phi(x) = s D phi v + O(s^2), with s v_i = sqrt(u |x_i| size_i) at most, where rounding errors and the
- * terms in s^2 are alike (W. H. Press et al., Numerical Recipes, 5.7). */
+/* Transports samples of rounding errors, from `before` to `now`, over the steps psi of a run by differences: psi(x + s
+ * v) - psi(x) = s D psi v + O(s^2), with s v_i = sqrt(u |x_i| size_i) at most, where rounding errors and the terms in
+ * s^2 are alike (W. H. Press et al., Numerical Recipes, 5.7). */
 int NAME(call_differences)(NAME(call) *c, long long count, const double *t, const double *h, const double *q,
-    const double *p, const double *size, const double *defects, const int *parts, int vectors, double rounding,
-    unsigned long long seed, const double *before, double *now, long long stride, double *errors, double *deviations)
+    const double *p, const double *size, int vectors, double rounding, unsigned long long seed, const double *before,
+    double *now, long long stride, double *deviations)
 {
-  error_vectors all = {vectors, 2 * M, rounding, seed, defects, stride, errors, deviations};
+  rounding_vectors all = {vectors, 2 * M, rounding, seed, stride, deviations};
   NAME(run) *run = c->run, last;
   int status = 0;
   memcpy(now, before, sizeof(double) * (size_t)(vectors * 2 * M));
   NAME(start)(run, t[0], h[0], q, p);
   for (long long k = 0; k < count && !status; k++, q += M, p += M) {
-    const double *defect = defects + k * 2 * M;
     last = *run;
     for (int j = 0; j < vectors && !status; j++) {
       double *v = now + j * 2 * M, largest = 0.0;
@@ -394,14 +410,14 @@ int NAME(call_differences)(NAME(call) *c, long long count, const double *t, cons
         continue;
       const double factor = sqrt(DBL_EPSILON) / largest;
       *run = last;
-      status = NAME(call_step)(c, t[k], h[k] / parts[k], parts[k], q, p, v, factor);
+      status = NAME(call_step)(c, t[k], h[k], 1, q, p, v, factor);
       for (int i = 0; i < M; i++) {
-        v[i] = (((run->q[i] - q[M + i]) + run->carry_q[i]) + defect[i]) / factor;
-        v[M + i] = (((run->p[i] - p[M + i]) + run->carry_p[i]) + defect[M + i]) / factor;
+        v[i] = ((run->q[i] - q[M + i]) + run->carry_q[i]) / factor;
+        v[M + i] = ((run->p[i] - p[M + i]) + run->carry_p[i]) / factor;
       }
     }
     if (!status)
-      receive_errors(&all, k, q + M, p + M, now);
+      receive_roundings(&all, k, q + M, p + M, now);
   }
   return status;
 }

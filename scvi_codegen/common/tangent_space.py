@@ -59,8 +59,7 @@ class TangentSpace:
         The first has the largest column, the next ones the largest rest across the columns before.
         """
         rest, pivots = self.rows.copy(), list[int]()
-        for _ in range(self.rank):
-            sizes = np.linalg.norm(rest, axis=0)
+        while len(pivots) < min(rest.shape) and (sizes := np.linalg.norm(rest, axis=0)).max() > DEPENDENT:
             pivots.append(int(np.argmax(sizes)))
             unit = rest[:, pivots[-1]] / sizes[pivots[-1]]
             rest -= np.outer(unit, unit @ rest)

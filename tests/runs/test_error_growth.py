@@ -256,6 +256,9 @@ def test_rounding_far_from_the_origin_is_no_amplification():
         with warnings.catch_warnings(record=True, action="always") as heard:
             stepper.integrate([c + 1.0], [0.0], t_end=300.0, tolerance=1e-12, parameters={"c": c})
         assert [str(warning.message)[: len(word)] for warning, word in zip(heard, words, strict=True)] == words
+    with warnings.catch_warnings(action="error"):  # a motion whose size does not matter
+        far = {"t_end": 300.0, "tolerance": 1e-12, "parameters": {"c": 1e6}}
+        stepper.integrate([1e6 + 1.0], [0.0], **far, absolute_tolerance={"x": 1e4})
     run = stepper.integrate([0.0], [0.0], h=0.1, steps=3)
     assert str(run.error).startswith("t = 0.3: no error\nx = 0.0")
 

@@ -78,6 +78,19 @@ def test_what_iterations_leave_does_not_grow_at_pericentres():
     assert np.abs(estimate(run, rows) - true).max() <= 0.05 * np.abs(true).max()
 
 
+@pytest.mark.rotated
+def test_errors_in_transformed_time_contain_the_rounding_of_the_energy():
+    """Orbits of e = 0.5 to 0.99 from both apsides: bounds of their errors, from apocentres thirty times as large."""
+    system = lagrange("kepler", "x y", "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)")
+    stepper = sc.compile_stepper(sc.reparametrise(system, "frequency"), "svi:8")
+    for e in (0.5, 0.99, -0.99):
+        run = stepper.integrate([1.0 - e, 0.0], velocity=[0.0, math.sqrt((1.0 + e) / (1.0 - e))], h=0.5, t_end=60.0)
+        error, exact = run.error, on_an_ellipse(run.q[0], run.p[0], run.t)
+        true = np.asarray(np.concatenate([run.q, run.p], axis=1) - exact, float)
+        assert np.abs(true / error.sizes.ravel()).max() <= error.relative[-1]
+        assert e > 0.0 or error.relative[-1] <= 30.0 * np.abs(true / error.sizes.ravel()).max()
+
+
 @pytest.mark.parametrize("method", ["svi:4", "svi:8"])
 def test_saving_seldom_and_output_times_do_not_change_the_errors(method):
     """Random orbits, tolerances and directions, up to errors and roundings of the finer steps; in ensembles, too."""
@@ -132,15 +145,6 @@ def test_error_of_a_slice_is_that_since_its_first_state():
     run = kepler().integrate(**start_of(0.2), t_end=12.0, tolerance=1e-6)
     assert not run[5:].error.q[0].any()
     assert np.array_equal(run[:6].error.q, run.error.q[:6])
-
-
-def test_errors_do_not_depend_on_the_number_of_threads(monkeypatch):
-    run = kepler().integrate(**start_of(0.2), h=0.02, steps=10000)
-    errors = [run.error]
-    monkeypatch.setattr("os.cpu_count", lambda: 1)
-    errors.append(replace(run).error)
-    assert np.array_equal(errors[0].p, errors[1].p)
-    assert np.array_equal(errors[0].rounding_q, errors[1].rounding_q)
 
 
 def test_uncertain_digits():
@@ -295,7 +299,7 @@ KINDS = {
 
 
 def table_of_kinds():
-    rows = re.findall(r"^\| (.+?) \| (signed|by comparison|refused) \|", PAGE.read_text("utf-8"), re.M)
+    rows = re.findall(r"^\| (.+?) \| (signed|refused) \|", PAGE.read_text("utf-8"), re.M)
     return {kind: judge for names, judge in rows for kind in names.split("; ")}
 
 
@@ -314,7 +318,6 @@ def test_kinds_of_runs(kind):
                 _ = run.error
             return
     error = run.error
-    assert error.signed == (judge == "signed")
     assert 0.0 < error.relative[-1] < 1e-2
     assert error.lost is None
     assert not error.reason

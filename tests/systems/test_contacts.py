@@ -175,6 +175,30 @@ def test_a_sliding_ball_rolls(degree: int) -> None:
     assert run.t[-1] == 2.0
 
 
+@pytest.mark.second
+def test_a_thrown_ball_has_the_friction_of_rebounds_below_rounding() -> None:
+    """Random backspins, heights and restitutions: bounces accumulate, then it slides and rolls; closed form."""
+    floor = sc.contact("y - r", slip="x_dot + r*a_dot", friction="mu", restitution="e")
+    text = "(x_dot**2 + y_dot**2)/2 + r**2*a_dot**2/5 - 9.81*y"
+    stepper, random = of(text, "x y a", [floor], "svi:3", r=0.1, mu=0.1, e=0.5), np.random.default_rng(7)
+    for _ in range(8):
+        r, mu, e, height = random.uniform([0.05, 0.05, 0.2, 0.3], [0.2, 0.1, 0.6, 0.9])
+        v, w = random.uniform([3.0, 10.0], [4.0, 20.0])
+        run = stepper.integrate(
+            [0.0, r + height, 0.0], velocity=[v, 0.0, w], h=0.02, t_end=4.0, parameters={"r": r, "mu": mu, "e": e}
+        )
+        time = np.sqrt(2.0 * height / 9.81)
+        x, u, speed, rolling = v * time, 9.81 * time, v - mu * (1.0 + e) * 9.81 * time, (5.0 * v - 2.0 * r * w) / 7.0
+        for _ in range(200):
+            u *= e
+            x, time, speed = x + speed * 2.0 * u / 9.81, time + 2.0 * u / 9.81, speed - mu * (1.0 + e) * u
+        slide = (v - rolling) / (mu * 9.81) - time
+        assert 0.0 < slide < 4.0 - time, "choose balls that slide after their bounces"
+        x += speed * slide - mu * 9.81 * slide**2 / 2.0 + rolling * (4.0 - time - slide)
+        assert abs(run.q[-1, 0] - x) < 1e-12
+        assert abs(run.velocity[-1, 0] - rolling) < 1e-13
+
+
 @pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("degree", "error"), [(1, 6e-5), (2, 5e-9), (3, 4e-13)])
 def test_a_ladder_leaves_the_wall(degree: int, error: float) -> None:

@@ -42,14 +42,14 @@ CONSISTENT = (
     "double *p1, double *workspace);\n"
 )
 """Declaration of the function of ``calls.h`` that only constraints of named coordinates have."""
-DEFECTS = (
-    "int NAME(call_defects)(NAME(call) *call, long long count, const double *t, const double *h, const double *q, "
-    "const double *p, const double *size, const double *limits, double *curves, double *defects, int *parts);\n"
+ERRORS = (
+    "int NAME(call_errors)(NAME(call) *call, long long count, const double *t, const double *h, const double *q, "
+    "const double *p, const double *size, const double *limits, const double *before, double *curves, "
+    "long long stride, double *errors);\n"
     "int NAME(call_abscissae)(double *abscissae, int *count);\n"
     "int NAME(call_differences)(NAME(call) *call, long long count, const double *t, const double *h, const double *q, "
-    "const double *p, const double *size, const double *defects, const int *parts, int vectors, "
-    "double rounding, unsigned long long seed, const double *before, double *now, long long stride, double *errors, "
-    "double *deviations);\n"
+    "const double *p, const double *size, int vectors, double rounding, unsigned long long seed, "
+    "const double *before, double *now, long long stride, double *deviations);\n"
 )
 """Declaration of those which only named coordinates in double have."""
 OPTIONAL_FUNCTIONS = frozenset(("advance_to", "set_fallback", "project"))
@@ -62,7 +62,7 @@ def with_calls(source: Source) -> Source:
         return source
     sizes, further, switches = source.contents.sizes, "", ""
     if sizes and "h_low" not in source.contents.run_fields:
-        further, switches = DEFECTS, "#define HAS_DEFECTS\n"
+        further, switches = ERRORS, "#define HAS_ERRORS\n"
         if sizes.constraints:
             further, switches = further + CONSISTENT, switches + LIMITS_ON_CONSTRAINTS
     errors = _text("support/derivatives/error_vectors") if further else ""

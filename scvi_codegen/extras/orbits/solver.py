@@ -982,8 +982,8 @@ class OrbitSearch:
         end, own = (np.concatenate([part.q[-1], part.p[-1]]) for part in (run, error))
         if not (np.isfinite(own).all() and error.lost is None):
             raise StateError(error.reason or "the run of a period has no meaningful digits at its end: take more steps")
-        widths = np.concatenate([bounds[-1] for bounds in error.bounds]) - (np.abs(own) if error.signed else 0.0)
-        return np.hstack([run.q, run.p]), end - own if error.signed else end, widths
+        widths = np.concatenate([bounds[-1] for bounds in error.bounds]) - np.abs(own)
+        return np.hstack([run.q, run.p]), end - own, widths
 
     def _errors(self, z: Array, equations: ClosingEquations) -> tuple[float, ErrorsOfOrbit]:
         """Return the error of a closed orbit and its entries, by the error of a run from its start.

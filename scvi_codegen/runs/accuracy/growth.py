@@ -5,6 +5,7 @@ with steps of round-off) or above 1e-2 is reported; nothing is repeated.
 """
 
 import math
+import sys
 
 from scvi_codegen.common.errors import AccuracyWarning, warn
 from scvi_codegen.common.representation import counted
@@ -13,7 +14,7 @@ from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runs.stepping.features import require
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.memory import Memory
-from scvi_codegen.runs.stepping.step_plan import Adaptive, StepPlan
+from scvi_codegen.runs.stepping.step_plan import Adaptive, StepPlan, absolute_tolerances
 
 UNCHECKED, MEANINGLESS = 1e-4, 1e-2
 """Tolerance from which on only a requested check is made, and error beyond which no digit is left."""
@@ -41,7 +42,7 @@ def warn_of_error_growth(run: Memory, t_end: float, *, requested: bool) -> None:
             warn(f"the growth of errors was not checked: {cause}. Reduce the steps, or use error=", AccuracyWarning)
         return
     error, limit, accurate_until, meaningful_until = growth
-    if error <= limit:
+    if error <= limit or _error_that_matters(run, error) <= limit:
         return
     if error > MEANINGLESS:
         what = f"no meaningful digits are left after t = {meaningful_until:g}"
@@ -54,6 +55,16 @@ def warn_of_error_growth(run: Memory, t_end: float, *, requested: bool) -> None:
         "check",
         AccuracyWarning,
     )
+
+
+def _error_that_matters(run: Memory, error: float) -> float:
+    """Return the error relative to sizes that are at least the absolute tolerances, below which no error matters."""
+    plan, memory = run.plan, run._memory
+    if not isinstance(plan, Adaptive) or plan.absolute_tolerance == ():
+        return error
+    absolute = absolute_tolerances(run.stepper.interface, run.stepper.dimension, plan.absolute_tolerance).tolist()
+    ranges = zip(memory.largest_error, memory.lowest, memory.highest, absolute, strict=True)
+    return float(max(largest / max(high - low, least, sys.float_info.min) for largest, low, high, least in ranges))
 
 
 def _rounding_far_from_origin(run: Memory, error: float) -> str:
@@ -70,6 +81,7 @@ def _rounding_far_from_origin(run: Memory, error: float) -> str:
         if rounding > tolerance and sums * roundoff(1) < error <= sums * rounding:
             return (
                 f"{name}, of size {size:.3g}, moves by {motion:.3g}, so that numbers are rounded by {rounding:.1e} of "
-                f"the motion, more than the steps err: choose an origin of {name} near the motion."
+                f"the motion, more than the steps err: choose an origin of {name} near the motion, or give "
+                f"absolute_tolerance={{'{name}': ..}}, the size below which its motion does not matter."
             )
     return ""

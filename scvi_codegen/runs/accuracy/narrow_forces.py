@@ -62,7 +62,7 @@ def _apart(
     arguments = *map(binding.pointer, (np.ascontiguousarray(part.t[rows]), h)), binding.whole_numbers(pieces)
     parameters = part.parameters_on_sides(float(part.t[rows[0]]))
     pointers = map(binding.pointer, (q, p, *ends))
-    status, _ = stepper._call_steps("pieces", parameters, options, len(rows), *arguments, *pointers)
+    status, *_ = stepper._call_steps("pieces", parameters, options, len(rows), *arguments, *pointers)
     if status:
         return np.full((2, q.shape[1]), np.inf)  # the step was solved over what its pieces meet
     states = np.array([np.asarray(x)[rows + 1] for x in (part.q, part.p)])

@@ -1,23 +1,20 @@
-"""Global error of a run, with its sign: local errors against a finer method, transported by its tangent map.
+"""Global error of a run, with its sign: beside its states, those of a finer method.
 
-For the saved states x_k of a run, the steps phi of a finer method from each of them, and delta_0 = 0,
+For the saved states x_k of a run and the steps phi of a finer method, which have the sizes of those of the run,
 
-    delta_{k+1} = Dphi(x_k) delta_k + (x_{k+1} - phi(x_k))
+    y_{k+1} = phi(y_k),    delta_k = x_k - y_k,    y_0 = x_0
 
-is the error of x_{k+1}, up to terms of the order of delta^2 and the error of phi (E. Hairer, S. P. Norsett, G. Wanner,
-Solving Ordinary Differential Equations I, II.4; R. D. Skeel, Thirteen ways to estimate global error, Numer. Math. 48
-(1986) 1-20). It holds for any sequence of states: phi is one step where all states are saved, else a run at round-off
-from one state to the next, over events, so that no interval ends at one. The differences need no derivatives and are
-those of intervals shared by threads; the derivatives are those of the run's own method along the curves of phi. Further
-vectors rho transport samples of the rounding errors of the states, u |x| with a random sign for each step of the run.
+is the error of x_k, up to that of phi (E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I,
+II.4). As delta_{k+1} = x_{k+1} - phi(x_k - delta_k) it follows from any sequence of states: phi is one step where all
+states are saved, else a run at round-off from one state to the next, over events, so that no interval ends at one.
+Samples of the rounding errors of the states, u |x| with a random sign for each step of the run, are transported by the
+derivatives of its steps.
 """
 
 from __future__ import annotations
 
 import math
-import sys
-from bisect import bisect_left
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -28,13 +25,11 @@ from numpy.typing import NDArray
 from scvi_codegen.codegen.ir.variants import Derivatives
 from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError
 from scvi_codegen.common.representation import with_uncertainty
-from scvi_codegen.common.thread_pool import run_jobs
 from scvi_codegen.runs.accuracy.size import (
     LOST,
     RESOLVED,
     first_of_groups,
     momenta_of_velocities,
-    neighbouring,
     relative,
     roundoff,
     sizes_of_motion,
@@ -49,7 +44,7 @@ from scvi_codegen.runs.states.rotations import members_of
 from scvi_codegen.runs.states.words import low_words, with_low
 from scvi_codegen.runs.stepping.features import refusal, require
 from scvi_codegen.runs.stepping.projection import determined_coordinates, projected
-from scvi_codegen.runs.stepping.step_derivatives import Defects, Starts
+from scvi_codegen.runs.stepping.step_derivatives import Curves, Starts
 from scvi_codegen.runs.stepping.step_plan import Adaptive, absolute_tolerances, ending_at
 
 SAMPLES, DEVIATIONS = 3, 6.0
@@ -60,22 +55,18 @@ mean square of k is Student's t with k degrees of freedom, above 6 in 0.9 % for 
 """
 ROUNDINGS = 1024.0
 """Errors of coordinates that constraints determine, and differences, below so many roundings are those of rounding."""
-MOST_STEPS, PARTS_AT_ONCE = 8192, 16
-"""Number of steps of one call of C, several times as long as the start of the threads that share such calls; calls
-whose curves are in memory."""
+MOST_STEPS, PIECES = 8192, 16
+"""Number of steps of one call of C, whose curves are in memory; times at which compared runs are rounded."""
 LEFT = 1e-6
-"""Relative change of transported errors that the iterations of all steps together leave, as it compounds.
-
-A pericentre enlarges it: with 1e-3 errors of an orbit of eccentricity 0.99 are 5 to 13 times too large, with 1e-6 .2 %.
-"""
+"""Relative change of transported errors that the iterations of all steps together leave, as it compounds."""
 CONVERGED = 1e-4
-"""Defects relative to the change of momenta in a step, d, below which the finer method resolves it.
+"""Changes of errors relative to the change of momenta in a step, d, below which the finer method resolves it.
 
-Errors of orders r and R of one motion are d and about d^(R/r): a tenth of the defect where d is 10^(-r / (R - r)), and
+Errors of orders r and R of one motion are d and about d^(R/r): a tenth of the first where d is 10^(-r / (R - r)), and
 R - r is a quarter of r or more (``finer_method``).
 """
-PART_OF_DEFECT = 1e-4
-"""Of defects, which iterations of the finer method leave where no differences of its steps are taken."""
+PART_OF_CHANGE = 1e-5
+"""Of changes of errors, which iterations of the finer method leave."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -84,16 +75,13 @@ class RunError:
 
     Attributes:
         t: (n,) times of the states.
-        q, p: (n, m) errors of positions and momenta with their signs; absolute values if ``signed`` is false. NaN at
-            events that change the state, and where they are unknown.
+        q, p: (n, m) errors of positions and momenta with their signs. NaN at events that change the state, and where
+            they are unknown.
         rounding_q, rounding_p: (n, m) standard deviations of transported rounding errors, from three samples.
         relative: (n,) largest (abs(error) + 6 rounding) / size up to each state, of all positions and momenta.
             Sizes are the ranges of the coordinates over the run (:mod:`scvi_codegen.runs.accuracy.size`).
-        signed: false for errors by comparison with a run of a finer method.
         reason: why the errors are unknown from some time on, else empty.
         sizes: (2, m) sizes of positions and momenta that ``relative`` refers to.
-        proportional: number of rows up to which terms of the order of squares of errors are below a tenth of these;
-            later ones are lost, ``relative`` is 0.1 or more.
     """
 
     t: Array
@@ -102,16 +90,14 @@ class RunError:
     rounding_q: Array
     rounding_p: Array
     relative: Array
-    signed: bool = True
     reason: str = ""
     sizes: Array = field(default_factory=lambda: np.empty(0), repr=False)
-    proportional: int = sys.maxsize
     _run: Any = field(repr=False)
 
     def relative_until(self, rows: int) -> tuple[Array, Array]:
         """Return (2, m) sizes of the first ``rows`` states and (rows,) running maxima of relative errors."""
         bounds = np.array([part[:rows].T for part in self.bounds])
-        return _relative(self._run, bounds, self.reason, self.proportional)
+        return _relative(self._run, bounds, self.reason)
 
     def roundings(self, sizes: Array) -> Array:
         """Return the (n,) largest bounds of rounding errors relative to (2, m) sizes, 0 where they are unknown."""
@@ -178,8 +164,7 @@ class WithErrors:
         """Global errors of states since :attr:`initial`, with their signs (:class:`RunError`), made at first access.
 
         One step of a finer method and products with the Jacobian of the step for each step, about five times the cost
-        of the run and 0.3 ms, more with constraints; a finer method is compiled once.
-        docs/steps.md lists which runs have signs, which are compared with a finer run, and which are refused.
+        of the run and 0.3 ms; a finer method is compiled once. docs/steps.md lists which runs are refused.
 
         Raises:
             MethodError, StateError: for runs whose error is not defined or not known, with the reason.
@@ -196,9 +181,6 @@ class WithErrors:
 
         They are NaN at events and from ``run.error.lost`` on, where the states have no meaningful digits: errors above
         the motion are no correction. ``error=`` or a smaller tolerance postpone that time.
-
-        Raises:
-            StateError: if the errors have no sign.
         """
         return corrected_states(self, self.error)
 
@@ -256,10 +238,9 @@ def _iterating(stepper: Any, finer: Any) -> Any:
     return next((of for of in (*own, finer) if of.tangent.constant("VECTORS_ITERATED")), None)
 
 
-def _described(run: Any, errors: Array, rounding: Array, **others: Any) -> RunError:
+def _described(run: Any, errors: Array, rounding: Array, reason: str = "") -> RunError:
     """Return the error of a run from (2, m, n) errors and rounding errors of positions and of momenta."""
-    reason, proportional = others.get("reason", ""), others.get("proportional", sys.maxsize)
-    sizes, relative_errors = _relative(run, np.abs(errors) + DEVIATIONS * rounding, reason, proportional)
+    sizes, relative_errors = _relative(run, np.abs(errors) + DEVIATIONS * rounding, reason)
     return RunError(
         t=np.asarray(run.t),
         q=errors[0].T,
@@ -267,13 +248,13 @@ def _described(run: Any, errors: Array, rounding: Array, **others: Any) -> RunEr
         rounding_q=rounding[0].T,
         rounding_p=rounding[1].T,
         relative=relative_errors,
+        reason=reason,
         sizes=sizes,
         _run=run,
-        **others,
     )
 
 
-def _relative(run: Any, bounds: Array, reason: str, proportional: int) -> tuple[Array, Array]:
+def _relative(run: Any, bounds: Array, reason: str) -> tuple[Array, Array]:
     """Return sizes and running maxima for (2, m, n) bounds of the errors of n states, NaN where they are unknown."""
     largest, last = bounds.max(axis=2), bounds.shape[2]
     if np.isnan(largest).any():
@@ -286,27 +267,26 @@ def _relative(run: Any, bounds: Array, reason: str, proportional: int) -> tuple[
     parts = entries.max(axis=(0, 1))
     if reason:  # unknown from the last known state on
         parts[last:] = np.inf
-    parts[proportional:] = np.maximum(parts[proportional:], LOST)
     return sizes, np.asarray(np.maximum.accumulate(parts))
 
 
 def leave_out_rounding(run: Any, bounds: Array, entries: Array) -> None:
     """Set relative errors (2, m, n) to 0 of coordinates that constraints determine, where they are those of rounding.
 
-    The height of a rod that swings by 1e-7 has no digits, as the constraint gives it up to rounding.
+    The height of a rod that swings by 1e-7 has no digits, as the constraint gives it up to rounding. They are those of
+    the state at which errors of rounding are the largest, if these exceed others.
     """
     if not run.stepper.interface.constraints:
         return
     epsilon = roundoff(run.stepper.interface.words)
     tiny = bounds[0] <= ROUNDINGS * epsilon * np.abs(np.asarray(run.q)[: bounds.shape[2]].T)
-    parts, so_far = np.where(tiny, entries, 0.0).max(axis=(0, 1)), np.where(tiny, 0.0, entries).max(initial=0.0)
-    for k in np.flatnonzero(parts > so_far).tolist():
-        if parts[k] > so_far:  # a new maximum
-            determined = np.zeros(tiny.shape[0], bool)
-            q, t = np.asarray(run.q[k]), float(run.t[k])
-            determined[determined_coordinates(run.stepper, q, t, run.parameters_on_sides(t))] = True
-            entries[:, tiny[:, k] & determined, k] = 0.0
-            so_far = max(so_far, entries[:, :, k].max())
+    parts = np.where(tiny, entries, 0.0).max(axis=(0, 1))
+    k = int(np.argmax(parts))
+    if parts[k] > np.where(tiny, 0.0, entries).max(initial=0.0):
+        determined = np.zeros(tiny.shape[0], bool)
+        q, t = np.asarray(run.q[k]), float(run.t[k])
+        determined[determined_coordinates(run.stepper, q, t, run.parameters_on_sides(t))] = True
+        entries[:, tiny & determined[:, None]] = 0.0
 
 
 def sizes_of(run: Any, rows: int, errors: Array) -> Array:
@@ -317,7 +297,8 @@ def sizes_of(run: Any, rows: int, errors: Array) -> Array:
         absolute = absolute_tolerances(interface, m, plan.absolute_tolerance)
     t, q, p = (np.asarray(column)[:rows] for column in (run.t, run.q, run.p))
     kinetic, firsts = momenta_of_velocities(run.stepper, t, q, p, run.parameters), first_of_groups(interface, m)
-    by_reactions = motion_by_reactions(run, t, q, p)
+    moves = np.ptp(q, axis=0).min(initial=np.inf) > math.sqrt(roundoff(1)) * np.abs(q).max(initial=0.0)
+    by_reactions = np.zeros((2, m)) if moves else motion_by_reactions(run, t, q, p)
     q, p = (np.ascontiguousarray(column.T) for column in (q, p))
     return sizes_of_motion(q, p, errors, kinetic, by_reactions, firsts, roundoff(interface.words), absolute)
 
@@ -325,9 +306,9 @@ def sizes_of(run: Any, rows: int, errors: Array) -> Array:
 class _Replay:
     """Replay of a run from its saved states.
 
-    The derivatives of single steps are those of the run's own method or of the finer one, found by iterations: both
-    differ by derivatives of the local error, which times delta is below terms of the order of delta^2. Where iterations
-    do not converge they are differences of steps of the finer method from neighbouring states.
+    The derivatives of single steps are those of the run's own method or of the finer one, found by iterations, or where
+    these do not converge by differences of its steps from neighbouring states: rounding errors are estimated, so that
+    it does not matter which.
 
     Args:
         run: trajectory.
@@ -336,24 +317,18 @@ class _Replay:
 
     def __init__(self, run: Any, finer: Any) -> None:
         self.run, self.finer, self.m = run, finer, run.stepper.dimension
-        self.linear = _iterating(run.stepper, finer)
+        self.linear, self.along_finer = _iterating(run.stepper, finer), bool(run.stepper.interface.time_transformation)
         self.u, self.calls, self.left = roundoff(1), 0, LEFT / max(1, run.steps)
         self.steps = max(1.0, run.steps / max(1, len(run) - 1))  # mean number between two states
-        self.now = np.zeros((1 + SAMPLES, 2 * self.m))
-        self.states = np.concatenate([np.asarray(run.q).T, np.asarray(run.p).T])
-        self.size = np.ptp(self.states, axis=1)
+        self.now, self.samples = np.zeros(2 * self.m), np.zeros((SAMPLES, 2 * self.m))  # at the present state
+        self.size = np.ptp(np.concatenate([np.asarray(run.q), np.asarray(run.p)], axis=1), axis=0)
         self.results = np.full((2, 2 * self.m, len(run)), np.nan)  # errors and rounding errors
-        self.resolved = np.zeros(len(run), bool)  # whether a state is the end of a step that the finer method resolves
 
     def error(self) -> RunError:
-        """Return the error of the run: lost from the row on from which it is not proportional to those before."""
+        """Return the error of the run."""
         reason = self._replayed()
-        vectors = self.results.reshape(2, 2, self.m, -1)
-        result = _described(self.run, *vectors, reason=reason)
-        if result.relative[-1] <= math.sqrt(roundoff(1)) or not self.is_smooth:
-            return result
-        rows = self.rows_proportional(self.results[0], result.relative)
-        return result if rows == len(self.run) else _described(self.run, *vectors, reason=reason, proportional=rows)
+        errors, rounding = self.results.reshape(2, 2, self.m, -1)
+        return _described(self.run, errors, rounding, reason)
 
     def _replayed(self) -> str:
         """Find errors and rounding errors of all states, NaN where unknown; return the reason for that."""
@@ -365,58 +340,14 @@ class _Replay:
                 self._along(piece, first)
                 first += len(piece) - 1
         except (ScviCodegenError, FloatingPointError) as failure:
-            lost = not np.isnan(self.results[0, 0, 0]) and not np.abs(self.now[0]).max() <= np.abs(self.states).max()
+            largest = np.abs(np.concatenate([np.asarray(self.run.q), np.asarray(self.run.p)], axis=1)).max(axis=0)
+            lost = not np.isnan(self.results[0, 0, 0]) and not np.abs(self.now).max() <= largest.max()
             return f"errors are lost: {failure}" if lost else str(failure)
         return ""
 
     def _store(self, row: int) -> None:
-        """Store the present vectors as those of a row; squares may overflow."""
-        deviations = np.hypot.reduce(self.now[1:], axis=0) / math.sqrt(SAMPLES)
-        self.results[:, :, row] = self.now[0], deviations
-
-    @property
-    def is_smooth(self) -> bool:
-        """Return whether states that are moved by their errors are states of the same equations."""
-        stepper = self.run.stepper
-        changes = stepper.changes_states or stepper.interface.kinks or stepper.interface.modes
-        return not (changes or stepper.constraints or stepper.interface.rotations or len(self.run._runs) > 1)
-
-    def rows_proportional(self, errors: Array, so_far: Array) -> int:
-        """Return the number of first rows whose errors (2m, n) follow from those before also without linearisation.
-
-        delta' = x' - Phi(x - delta) for the flow Phi. A step that the finer method resolves is shorter than the scale
-        of the forces, so that terms of the order of delta^2 are small beside delta where delta is small beside the
-        motion in the step. Of other rows, until errors so far are ``LOST``, the first one at which the formula differs
-        by more than a tenth is found by bisection, as errors grow.
-        """
-        states = self.states.T
-        before = lengths(errors.T[:-1], self.size)
-        with np.errstate(all="ignore"):
-            parts = before / lengths(np.diff(states, axis=0), self.size)
-        doubtful = (math.sqrt(roundoff(1)) < so_far[1:]) & (so_far[1:] < LOST) & (before > 0.0)
-        rows = 1 + np.flatnonzero(doubtful & ~(self.resolved[1:] & (parts < LOST)))
-
-        def is_nonlinear(row: int) -> bool:
-            return not self._is_proportional(row, states, errors)
-
-        checked = (*rows[np.argmax(parts[rows - 1]) :][:1].tolist(), *rows[-1:].tolist()) if len(rows) else ()
-        lost = [row for row in checked if is_nonlinear(row)]
-        if not lost:
-            return len(states)
-        first = rows[: np.searchsorted(rows, min(lost))].tolist()
-        return int([*first, min(lost)][bisect_left(first, True, key=is_nonlinear)])
-
-    def _is_proportional(self, row: int, states: Array, errors: Array) -> bool:
-        """Return whether the error of a row follows from that before, up to a tenth."""
-        t, end = map(float, self.run.t[row - 1 : row + 1])
-        start, parameters = states[row - 1] - errors[:, row - 1], parameters_set_until(self.run, t)
-        try:
-            run = self.finer._run(*np.split(start, 2), plan=Adaptive(end), t=t, parameters=parameters)
-            moved = self._state(run._recorded(None, ALL_STATES), -1)
-        except ScviCodegenError:
-            return False
-        apart = np.abs(states[row] - moved - errors[:, row])
-        return bool(relative(apart, self.size).max() <= LOST * relative(np.abs(errors[:, row]), self.size).max())
+        """Store the present errors as those of a row; squares may overflow."""
+        self.results[:, :, row] = self.now, np.hypot.reduce(self.samples, axis=0) / math.sqrt(SAMPLES)
 
     def _along(self, piece: Any, first: int) -> None:
         """Find the errors of the states of a part of the run, which begins at the row ``first``."""
@@ -444,97 +375,98 @@ class _Replay:
         return np.asarray(single & (passed[0] == passed[1]))
 
     def _by_steps(self, piece: SavedStates, begin: int, end: int, first: int) -> None:
-        """Transport the errors over single steps between two rows of a part that begins at the row ``first``."""
+        """Find errors over single steps between two rows of a part that begins at the row ``first``.
+
+        A step that no number of parts of the finer one resolves is one run of it.
+        """
         t, h = np.ascontiguousarray(piece.t[begin:end]), np.ascontiguousarray(steps_after(piece, begin, end))
         q, p = (np.ascontiguousarray(np.asarray(column)[begin : end + 1]) for column in (piece.q, piece.p))
         starts, parameters = Starts(t, h, q, p), piece.parameters_on_sides(float(piece.t[begin]))
-        for k, (part, defects) in enumerate(self._defects(starts, parameters)):
-            resolved, row = defects.parts > 0, begin + k * MOST_STEPS
-            for start, stop in _alike(resolved):
-                if resolved[start]:
-                    rows = slice(first + row + start + 1, first + row + stop + 1)
-                    self.resolved[rows] = True
-                    results = self.results[:, :, rows]
-                    self._transport(part.part(start, stop), defects.part(start, stop), results, parameters)
-                    continue
-                for j in range(row + start, row + stop):
-                    self._by_run(piece, float(piece.t[j]), piece.q[j], piece.p[j], j + 1, steps=1.0)
-                    self._store(first + j + 1)
-
-    def _defects(self, starts: Starts, parameters: Array) -> Iterator[tuple[Starts, Defects]]:
-        """Yield parts of the steps and their defects, ``PARTS_AT_ONCE`` of which are in memory and shared by threads.
-
-        Steps are resolved where the error of the finer method's step is a tenth of the defect, or of rounding.
-        """
-        parts = [starts.part(k, k + MOST_STEPS) for k in range(0, len(starts.h), MOST_STEPS)]
-        limits, defects = self._limits(PART_OF_DEFECT), dict[int, Defects]()
-
-        def find(k: int, _: object = None) -> None:
-            defects[k] = self.finer._defects(here[k], parameters, self.size, limits)
-
-        for first in range(0, len(parts), PARTS_AT_ONCE):
-            here = parts[first : first + PARTS_AT_ONCE]
-            if len(here) == 1:
-                find(0)
-            else:
-                run_jobs(len(here), find, progress=None, threads=None)
-            yield from ((part, defects[k]) for k, part in enumerate(here))
-
-    def _limits(self, left: float) -> Array:
-        return np.array([CONVERGED, LOST, RESOLVED * self.u, left])
+        k, limits = 0, np.array([CONVERGED, LOST, RESOLVED * self.u, PART_OF_CHANGE])
+        while k < len(h):
+            part, row = starts.part(k, k + MOST_STEPS), first + begin + k + 1
+            results = self.results[:, :, row : row + len(part.h)]
+            steps, curves = self.finer._errors(part, parameters, self.size, limits, self.now, results[0])
+            if steps:
+                part, row, before = part.part(0, steps), row + steps, self.now
+                self.now = results[0, :, steps - 1].copy()
+                if self.along_finer:
+                    errors = np.vstack([before, results[0, :, :steps].T])
+                    x, y = (
+                        np.ascontiguousarray(of) for of in np.split(np.hstack([part.q, part.p]) - errors, 2, axis=1)
+                    )
+                    part = Starts(part.t, part.h, x, y)
+                self._transport(part, curves, results[1], parameters)
+            k += steps
+            if steps < len(results[0, 0]):
+                self._by_run(piece, float(t[k]), q[k], p[k], begin + k + 1, steps=1.0)
+                self._store(row)
+                k += 1
 
     def _transport(
-        self, starts: Starts, defects: Defects, results: Array, parameters: Array, steps: float = 1.0
+        self, starts: Starts, curves: Curves | None, deviations: Array, parameters: Array, steps: float = 1.0
     ) -> None:
-        """Transport the errors over n steps of a method, each of so many steps of the run, into (2, 2m, n) results."""
+        """Transport rounding errors over n steps along (curves), or of the finer method, into (2m, n) deviations.
+
+        Args:
+            starts: steps of the run, or of the finer method if there are no ``curves``.
+            steps: number of steps of the run for each.
+        """
         rounding, first, length = math.sqrt(steps) * self.u, 0, len(starts.h) if self.linear is None else 1
+        along = Curves(np.empty((len(starts.h), self.m, 0)), np.empty(0)) if curves is None else curves
+        own = self.finer if curves is None or self.along_finer else self.run.stepper
         while first < len(starts.h):
             if self.linear is not None:
                 self.calls += 1
-                rest = [of.part(first, len(starts.h)) for of in (starts, defects)]
-                into = self.now, results[:, :, first:], parameters
-                first += self.linear._transport_errors(*rest, *into, self.left / steps, rounding, self.calls)
+                into = self.samples, deviations[:, first:], parameters
+                values, rest = along.values[first:], starts.part(first, len(starts.h))
+                first += self.linear._transport_roundings(
+                    rest, Curves(values, along.abscissae), *into, self.left / steps, rounding, self.calls
+                )
             if first < len(starts.h):
                 self.calls += 1
-                part = starts.part(first, first + length)
-                exact = self.finer._defects(part, parameters, self.size, self._limits(0.0))
-                into = self.now, results[:, :, first:], parameters
-                self.finer._transport_by_differences(part, exact, *into, self.size, rounding, self.calls)
+                part, into = starts.part(first, first + length), (self.samples, deviations[:, first:], parameters)
+                own._transport_by_differences(part, *into, self.size, rounding, self.calls)
                 first, length = first + length, 2 * length  # so that calls are few where iterations fail again
 
     def _by_run(self, piece: Any, t: float, q: Array, p: Array, end: int, *, steps: float) -> None:
-        """Transport the errors to a row by a run of the finer method at round-off, over the events in between."""
+        """Find the errors of a row by a run of the finer method at round-off, over the events in between.
+
+        It begins at the state minus its error; where events change states or modes, at the state, whose modes are
+        known, and the error is transported by the derivatives.
+        """
         stop = float(piece.t[end])
         if stop == t:
             return
+        interface, state = self.finer.interface, np.concatenate([np.asarray(q), np.asarray(p)])
+        changes = self.finer.changes_states or interface.kinks or interface.modes or interface.contacts
+        start = np.split(state if changes else state - self.now, 2)
         plan, parameters = ending_at(Adaptive(stop), stop), parameters_set_until(piece, t)
-        run = self.finer._run(np.asarray(q), np.asarray(p), plan=plan, t=t, parameters=parameters)
-        fine = run._recorded(None, ALL_STATES)
-        parts = list[tuple[Starts, Defects]]()
-        if not (len(times_of_changes(fine)) or (fine.modes is not None and len(fine.modes.t))):
-            h, sides = steps_after(fine, 0, len(fine) - 1), fine.parameters_on_sides(t)
-            times, h, x, y = (np.ascontiguousarray(of) for of in (fine.t, h, fine.q, fine.p))
-            parts = [*self._defects(Starts(times, h, x, y), sides)]  # of rounding, as states have no low words
-        if parts and all(defects.parts.all() for _, defects in parts):
-            for part, defects in parts:
-                results = np.empty((2, 2 * self.m, len(part.h)))  # of the states in between
-                self._transport(part, defects, results, sides, steps / len(h))
-        else:
-            self.now = np.ascontiguousarray(fine.tangent(self.now.T)[-1].T)
-            self.calls += 1
-            normal = np.random.default_rng(self.calls).standard_normal((SAMPLES, 2 * self.m))
-            self.now[1:] += math.sqrt(steps) * self.u * normal * np.abs(self._state(piece, end))
-        self.now[0] += self._state(piece, end) - self._state(fine, -1)
+        fine = self.finer._run(*start, plan=plan, t=t, parameters=parameters)._recorded(None, ALL_STATES)
+        after = self._state(piece, end)
+        if changes:
+            at_start = (
+                0.0 if self.finer.constraints or interface.contacts else 0.5
+            )  # rounded states are not on constraints
+            self._round(state, at_start * steps)
+            image = fine.tangent(np.vstack([self.now, self.samples]).T)[-1].T
+            self.now, self.samples = image[0] + (after - self._state(fine, -1)), np.ascontiguousarray(image[1:])
+            self._round(after, (1.0 - at_start) * steps)
+            return
+        h, sides = steps_after(fine, 0, len(fine) - 1), fine.parameters_on_sides(t)
+        times, h, x, y = (np.ascontiguousarray(of) for of in (fine.t, h, fine.q, fine.p))
+        self._transport(Starts(times, h, x, y), None, np.empty((2 * self.m, len(h))), sides, steps / len(h))
+        self.now = after - self._state(fine, -1)
+
+    def _round(self, state: Array, steps: float) -> None:
+        """Add the rounding errors of a state in so many steps to the samples."""
+        self.calls += 1
+        normal = np.random.default_rng(self.calls).standard_normal(self.samples.shape)
+        self.samples += math.sqrt(steps) * self.u * normal * np.abs(state)
 
     @staticmethod
     def _state(states: Any, k: Any) -> Array:
         return np.concatenate([np.asarray(states.q)[k], np.asarray(states.p)[k]], axis=-1)
-
-
-def lengths(vectors: Array, sizes: Array) -> Array:
-    """Return (n,) lengths of (n, k) vectors, parts of the sizes (k,)."""
-    parts = relative(vectors, sizes)
-    return np.asarray(np.sqrt(np.einsum("ij,ij->i", parts, parts)))
 
 
 def _alike(flags: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
@@ -557,41 +489,56 @@ def _rows_between(states: Any, special: Array) -> NDArray[np.intp]:
 
 
 def _compared(run: Any, finer: Any) -> RunError:
-    """Return the differences of a run from one of the finer method at round-off, without signs.
+    """Return the differences of a run from one of the finer method at round-off.
 
-    Rounding errors are estimated by the difference of a second one whose initial state is rounded differently, once for
-    each step of the run as independent ones.
+    Samples of rounding errors are differences of runs whose states are rounded in between: of fixed steps in tau at
+    ``PIECES`` random times, else one whose initial state is, as a restart at a kink would be another motion.
     """
     finer = finer.with_events(run.stepper.changing_events)
-    exact, rounded = _states_of(run, finer, np.asarray), _states_of(run, finer, neighbouring)
-    growth = math.sqrt(max(1.0, run.steps))
-    errors = [np.abs(np.asarray(x - y)).T for x, y in zip((run.q, run.p), exact, strict=True)]
-    rounding = [growth * np.abs(np.asarray(x - y)).T for x, y in zip(exact, rounded, strict=True)]
-    return _described(run, np.array(errors), np.array(rounding), signed=False)
+    exact, *samples = (_states_of(run, finer, seed) for seed in range(1 + (SAMPLES if run.stepper.in_tau else 1)))
+    errors = [np.asarray(x - y).T for x, y in zip((run.q, run.p), exact, strict=True)]
+    apart = [np.array([np.asarray(x - y).T for x, y in zip(of, exact, strict=True)]) for of in samples]
+    return _described(run, np.array(errors), np.sqrt(np.mean(np.square(apart), axis=0)))
 
 
-def _states_of(run: Any, finer: Any, begin: Callable[[Any], Any]) -> tuple[Any, Any]:
-    """Return (n, m) positions and momenta of the finer run at the times of a run, from ``begin`` of its start."""
-    two_words, parts = finer.interface.words > 1, list[Any]()
-    t, *state = run.initial
-    start = [x if two_words else begin(x) for x in state]
-    if two_words and begin is neighbouring:
-        start = [with_low(np.asarray(x), low_words(x) + roundoff(2) * np.asarray(x)) for x in start]
+def _states_of(run: Any, finer: Any, seed: int) -> tuple[Any, Any]:
+    """Return (n, m) positions and momenta of the finer run at the times of a run; with a ``seed`` above 0 rounded."""
+    words, random, parts = finer.interface.words, np.random.default_rng(seed), list[Any]()
+    tolerance = float(finer.binding.function("smallest_tolerance")()) if words > 1 else None
+    t, *start = run.initial
     for piece in run._runs:
-        end = float(piece.t[-1])
-        control = Adaptive(end, float(finer.binding.function("smallest_tolerance")()) if two_words else None)
-        plan = ending_at(piece.plan, end) if run.stepper.in_tau else control
-        fine = finer._run(*start, plan=plan, t=t, parameters=piece.parameters)._recorded(None, ALL_STATES)
-        parts.append(fine._states_at(piece.t))
-        t, start = piece.t[-1], [x[-1] for x in parts[-1]]
+        parameters = piece.parameters
+        if seed and run.stepper.in_tau:  # the energy of the start is a parameter, rounded as its terms
+            parameters, size = (
+                parameters.copy(),
+                0.5 * abs(np.dot(start[1], run.stepper.velocity(*start, float(t), parameters))),
+            )
+            parameters[run.stepper.interface.energy_index] += roundoff(words) * size * random.standard_normal()
+        rows = _rows_between(piece, times_of_changes(piece))
+        count = min(PIECES, len(rows)) if seed and run.stepper.in_tau else 0
+        inside = random.choice(rows, count, replace=False)
+        breaks = np.unique([0, *inside.tolist(), len(piece) - 1]) if len(piece) > 1 else [0, 0]
+        for first, last in pairwise(breaks):
+            if seed:
+                rounding = math.sqrt(max(1, run.steps) / (len(breaks) - 1)) * roundoff(words)
+                start = [_rounded(x, rounding * random.standard_normal(x.shape[-1]), words) for x in start]
+            stop = float(piece.t[last])
+            plan = ending_at(piece.plan if run.stepper.in_tau else Adaptive(stop, tolerance), stop)
+            fine = finer._run(*start, plan=plan, t=t, parameters=parameters)._recorded(None, ALL_STATES)
+            parts.append(fine._states_at(piece.t[first : last + 1]))
+            t, start = piece.t[last], [x[-1] for x in parts[-1]]
     q, p = (concatenated(list(of)) for of in zip(*parts, strict=True))
     return q, p
 
 
+def _rounded(x: Any, relative_change: Array, words: int) -> Any:
+    """Return a state of one or two words with relative changes."""
+    change = relative_change * np.asarray(x)
+    return with_low(np.asarray(x), low_words(x) + change) if words > 1 else np.asarray(x) + change
+
+
 def corrected_states(run: Any, error: RunError) -> CorrectedStates:
     """Return the states of a run minus their errors; raises as :attr:`WithErrors.corrected`."""
-    if not error.signed:
-        raise StateError("corrected requires errors with signs, but those of this run are by comparison: use run.error")
     stepper, q, p = run.stepper, np.asarray(run.q) - error.q, np.asarray(run.p) - error.p
     q[~(error.relative < LOST)] = p[~(error.relative < LOST)] = np.nan
     for member in members_of(stepper.dimension, stepper.interface.rotations):

@@ -125,13 +125,6 @@ def _momenta_at_rest(stepper: Any, t: Array, q: Array, parameters: Array) -> Arr
     return 0.0
 
 
-def neighbouring(x: Array) -> Array:
-    """Return the next numbers above or below numbers other than 0, as of another rounding."""
-    x = np.asarray(x)
-    towards = np.where(np.cos(np.arange(x.size)).reshape(x.shape) > 0.0, np.inf, -np.inf)
-    return np.asarray(np.where(x == 0.0, x, np.nextafter(x, towards)))
-
-
 def relative(errors: Array, sizes: Array) -> Array:
     """Return errors (.., m) relative to sizes; 0 for errors of 0, infinite for others of sizes of 0."""
     with np.errstate(all="ignore"):

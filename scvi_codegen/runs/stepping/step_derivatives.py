@@ -7,10 +7,9 @@ are composed of these. In transformed time the energy is one of the parameters, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -98,26 +97,16 @@ class Starts:
         return Starts(self.t[steps], self.h[steps], self.q[states], self.p[states], self.chained)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Defects:
-    """Defects of n steps of a run: its states minus the ends of the steps of another method from those before.
+class Curves(NamedTuple):
+    """What a method keeps of n steps.
 
     Attributes:
-        misfits: (n, 2m) defects of positions and momenta.
-        parts: (n,) numbers of equal parts in which the other method takes each step; 0 where it does not resolve it.
-        curves: (n, m, k) forces or velocities at the points of these steps; NaN where they are unknown.
+        values: (n, m, k) forces or velocities at the points of the steps; NaN where they are unknown.
         abscissae: (k,) of the points; k = 0: none.
     """
 
-    misfits: Array
-    parts: NDArray[np.int32]
-    curves: Array
+    values: Array
     abscissae: Array
-
-    def part(self, first: int, last: int) -> Defects:
-        """Return a view of those of the steps ``first`` to ``last`` - 1."""
-        steps = slice(first, last)
-        return Defects(self.misfits[steps], self.parts[steps], self.curves[steps], self.abscissae)
 
 
 class LinearisedMethod(StateFunctions):
@@ -322,27 +311,31 @@ class LinearisedMethod(StateFunctions):
             raise step_failure(status, report, step=failed, h=float(starts.h[failed]))
         return q1, p1
 
-    def _defects(self, starts: Starts, parameters: Array, sizes: Array, limits: Array) -> Defects:
-        """Return the defects of n steps along a run of another method.
+    def _errors(
+        self, starts: Starts, parameters: Array, sizes: Array, limits: Array, before: Array, errors: Array
+    ) -> tuple[int, Curves]:
+        """Find the errors of n steps of a run of another method beside steps of this one.
 
         Args:
             starts: the steps and the states of the run.
             parameters: as of :meth:`_propagate`.
             sizes: (2m,) sizes of positions and momenta.
-            limits: defects relative to changes of momenta, and differences of defects by halved steps relative to
-                them and in addition to the state, below which they are resolved; part of the defect before that the
-                iterations leave.
+            limits: changes of errors relative to changes of momenta, and differences of such changes by halved steps
+                relative to them and in addition to the state, below which steps are resolved.
+            before: (2m,) error of the first state.
+            errors: (2m, n) errors of the others, a view of rows of contiguous numbers.
+
+        Returns:
+            The number of steps until one that is not resolved, and the curves.
         """
-        count, m, abscissae = len(starts.h), self.dimension, self._abscissae
-        curves = np.empty((count, m, len(abscissae)))
-        defects = Defects(np.empty((count, 2 * m)), np.empty(count, np.int32), curves, abscissae)
-        arrays = *starts.arrays, sizes, limits, defects.curves, defects.misfits
-        pointers = map(self.binding.pointer, arrays)
-        into = self.binding.pointer(defects.parts)
-        status, report = self._call_steps("defects", parameters, None, count, *pointers, into)
+        count, abscissae, pointer = len(starts.h), self._abscissae, self.binding.pointer
+        curves = Curves(np.empty((count, self.dimension, len(abscissae))), abscissae)
+        arrays = *starts.arrays, sizes, limits, before, curves.values
+        into = self._columns(errors)
+        status, steps, report = self._call_steps("errors", parameters, None, count, *map(pointer, arrays), *into)
         if status:
-            raise step_failure(status, report, step=0, h=float(starts.h[0]))
-        return defects
+            raise step_failure(status, report, step=steps, h=float(starts.h[steps]))
+        return steps, curves
 
     @cached_property
     def _abscissae(self) -> Array:
@@ -356,15 +349,14 @@ class LinearisedMethod(StateFunctions):
     def _transport_by_differences(
         self,
         starts: Starts,
-        defects: Defects,
         vectors: Array,
-        results: Sequence[Array],
+        deviations: Array,
         parameters: Array,
         sizes: Array,
         rounding: float,
         seed: int,
     ) -> None:
-        """As :meth:`_transport_errors`, by the steps of :meth:`_defects` from neighbouring states; (2m,) sizes.
+        """As :meth:`_transport_roundings`, by steps from neighbouring states; (2m,) sizes.
 
         Positions on a constraint are functions of each other, with the size of the motion of all, and so are momenta:
         the height of a pendulum moves by the square of the swing.
@@ -373,53 +365,49 @@ class LinearisedMethod(StateFunctions):
         if self.interface.constraints:
             sizes = np.repeat(sizes.reshape(2, -1).max(axis=1), self.dimension)
         pointer, after = self.binding.pointer, np.empty_like(vectors)
-        given = (*map(pointer, (*starts.arrays, sizes, defects.misfits)), pointer(defects.parts))
-        settings = len(vectors), rounding, seed, pointer(vectors), pointer(after)
-        status, report = self._call_steps(
-            "differences", parameters, None, len(starts.h), *given, *settings, *self._columns(self.binding, results)
-        )
+        steps = map(pointer, (*starts.arrays, sizes))
+        settings = len(vectors), rounding, seed, pointer(vectors), pointer(after), *self._columns(deviations)
+        status, _, report = self._call_steps("differences", parameters, None, len(starts.h), *steps, *settings)
         if status:
             raise step_failure(status, report, step=0, h=float(starts.h[0]))
         vectors[:] = after
 
-    @staticmethod
-    def _columns(binding: Any, results: Sequence[Array]) -> tuple[Any, ...]:
-        """Return arguments of C for two (2m, n) arrays of columns: the distance of their rows, and their first rows."""
-        return results[0].strides[0] // results[0].itemsize, *(binding.pointer(of[0]) for of in results)
+    def _columns(self, results: Array) -> tuple[Any, ...]:
+        """Return arguments of C for a (2m, n) array of columns: the distance of its rows, and the first row."""
+        return results.strides[0] // results.itemsize, self.binding.pointer(results[0])
 
     def _call_steps(self, name: str, parameters: Array, options: SolverOptions | None, *arguments: Any) -> Any:
-        """Call a function of C that takes steps from states of its own; return its status and report."""
+        """Call a function of C that takes steps from states of its own; return its status, steps and report."""
         binding = self.binding
         run, call, report = map(binding.new, ("run *", "call *", "report *"))
         settings, workspace = binding.options(options), binding.workspace(run)
         call.run, call.parameters, call.options = run, binding.pointer(parameters), settings
         call.report, call.workspace = report, workspace
         call.coordinates = self.dimension
-        return binding.call(name, call)(*arguments), report
+        status = binding.call(name, call)(*arguments)
+        return status, int(call.steps), report
 
-    def _transport_errors(
+    def _transport_roundings(
         self,
         starts: Starts,
-        defects: Defects,
+        curves: Curves,
         vectors: Array,
-        results: Sequence[Array],
+        deviations: Array,
         parameters: Array,
         left: float,
         rounding: float,
         seed: int,
     ) -> int:
-        """Transport global errors, and further tangent vectors, along saved states by iterations.
+        """Transport samples of rounding errors along saved states by iterations.
 
         Args:
             starts: n steps and their (n + 1, m) states.
-            defects: those of a finer method, along whose curves vectors are transported.
-            vectors: (count, 2m) at the first state, replaced by those at the last one that is reached; the first one is
-                the error, to which the defect of each state is added.
-            results: two (2m, n) arrays, views of rows of contiguous numbers, which receive the errors and the root mean
-                squares of the other vectors after each step.
+            curves: those of a finer method, along which vectors are transported.
+            vectors: (count, 2m) at the first state, replaced by those at the last one that is reached.
+            deviations: (2m, n) root mean squares of the vectors after each step, a view of rows of contiguous numbers.
             parameters: as of :meth:`_propagate`.
             left: relative change of vectors that the iterations of a step leave.
-            rounding: rounding errors relative to the states, which further vectors receive with random signs.
+            rounding: rounding errors relative to the states, which the vectors receive with random signs.
             seed: of the signs.
 
         Returns:
@@ -428,19 +416,18 @@ class LinearisedMethod(StateFunctions):
         binding, size = self.tangent, 2 * self.dimension
         report, ends = binding.new("report *"), np.zeros((2, len(vectors), self._input_size))
         ends[0, :, :size] = vectors
-        status = binding.function("transport_errors")(
+        status = binding.function("transport_roundings")(
             len(starts.h),
             *map(binding.pointer, (*starts.arrays, parameters)),
             binding.null,
-            len(defects.abscissae),
-            *map(binding.pointer, (defects.abscissae, defects.curves)),
+            len(curves.abscissae),
+            *map(binding.pointer, (curves.abscissae, curves.values)),
             len(vectors),
             left,
             rounding,
             seed,
-            binding.pointer(defects.misfits),
             binding.pointer(ends),
-            *self._columns(binding, results),
+            *self._columns(deviations),
             report,
             binding.workspace(),
         )

@@ -7,13 +7,13 @@
 
 typedef struct stored_curves stored_curves;
 
-/* Steps and the vectors propagated over them, of shape (steps + 1, count, STEP_INPUTS); of global errors only those at
+/* Steps and the vectors propagated over them, of shape (steps + 1, count, STEP_INPUTS); of rounding errors only those at
  * both ends of the present step, (2, count, STEP_INPUTS). */
 typedef struct {
   const real *t, *h, *q, *p, *parameters;
   const solver_options *options;
   int back, count;
-  error_vectors *errors; /* of a run; NULL: others */
+  rounding_vectors *errors; /* samples of a run; NULL: others */
   const stored_curves *curves; /* of the steps, which are solved otherwise */
   real *vectors, *q1, *p1, *workspace;
   solver_report *report;
@@ -209,7 +209,7 @@ static int propagate_steps(propagation *over, long long first, long long end)
     else if (!all_finite(vectors_at(over, k + !over->back), over->count * STEP_INPUTS))
       status = NOT_FINITE;
     if (status == OK && over->errors)
-      receive_errors(over->errors, k, over->q + (k + 1) * M, over->p + (k + 1) * M, vectors_at(over, k + 1));
+      receive_roundings(over->errors, k, over->q + (k + 1) * M, over->p + (k + 1) * M, vectors_at(over, k + 1));
     over->report->steps += status == OK;
   }
   return status;
@@ -240,18 +240,17 @@ int NAME(linearise)(long long steps, const real *t, const real *h, const real *q
 }
 
 #ifdef VECTORS_BY_ITERATION
-/* Global errors delta[k + 1] = D psi(x[k]) delta[k] + defect[k] of a run by the step psi from its saved states, and
- * samples of rounding errors, until an iteration fails. The vectors after the last of k steps are those of row k % 2.
- * What is `left` of the change of a vector compounds over the steps. D psi is that along the curves of another method,
- * with values at `points` abscissae in each step. */
-int NAME(transport_errors)(long long steps, const real *t, const real *h, const real *q, const real *p,
+/* Samples of rounding errors along the saved states of a run, until an iteration fails. The vectors after the last of k
+ * steps are those of row k % 2. What is `left` of the change of a vector compounds over the steps. Their derivatives are
+ * those along the curves of another method, with values at `points` abscissae in each step. */
+int NAME(transport_roundings)(long long steps, const real *t, const real *h, const real *q, const real *p,
     const real *parameters, const solver_options *options, int points, const real *abscissae, const real *curves,
-    int count, double left, double rounding, unsigned long long seed, const real *defects, real *vectors,
-    long long stride, real *errors, real *deviations, solver_report *report, real *workspace)
+    int count, double left, double rounding, unsigned long long seed, real *vectors, long long stride, real *deviations,
+    solver_report *report, real *workspace)
 {
   lanes table[(points + 1) * GROUPS];
   const stored_curves stored = {points, curves, table};
-  error_vectors all = {count, STEP_INPUTS, rounding, seed, defects, stride, errors, deviations};
+  rounding_vectors all = {count, STEP_INPUTS, rounding, seed, stride, deviations};
   propagation over = {PROPAGATION_OF_ARGUMENTS, .accepted = left * left, .count = count, .errors = &all,
       .curves = &stored, .vectors = vectors};
   tabulate_points(points, abscissae, table);

@@ -4,7 +4,7 @@
  * parameters and time. Requires: POINT_INPUTS. */
 
 enum { INPUT_T = STEP_INPUTS - 2,
-  VECTORS_AT_ONCE = 4 }; /* which are iterated together, so that no product waits for the last one */
+  VECTORS_AT_ONCE = 3 }; /* which are iterated together, so that no product waits for the last one */
 
 #define MOVED_BY_ROUNDING (4.0 * DBL_EPSILON * DBL_EPSILON) /* squared: relative change that rounding alone may cause */
 

@@ -320,7 +320,7 @@ def _tell_error(trajectory: Any) -> None:
         error = trajectory.error
     except ScviCodegenError as unknown:
         raise CommandFailure(f"--error-bars: {unknown}") from unknown
-    numbers = {"relative": error.relative[-1], "signed": error.signed, "lost": error.lost, "reason": error.reason}
+    numbers = {"relative": error.relative[-1], "lost": error.lost, "reason": error.reason}
     tell(str(error), error=numbers | {"q": error.q[-1].tolist(), "p": error.p[-1].tolist()})
 
 
