@@ -199,7 +199,7 @@ def describe(
         momentum_names=tuple(momentum.name for momentum in system.momentum_symbols),
         time_transformation=None if g is None else str(g),
         exchange_names=program.quantities.work_and_impulses,
-        constraints=program.constraints.formulas if program.constraints else (),
+        constraints=program.constraints.formulas,
         masked=len(system.reactions),
         conserves_energy=not system.changes_energy and not system.inputs,
         dissipates=bool(system.reactions) and dissipates(system),

@@ -53,8 +53,7 @@ def discretised_form(system: MechanicalSystem, method: Method) -> MechanicalSyst
     """
     if not isinstance(system, LagrangianSystem) or not system.rotations or not method.symplectic:
         return system
-    plain = system.clock.plain if system.clock else system
-    if method.needs_regular or (form := hamiltonian_of_rotations(plain)) is None:
+    if method.needs_regular or (form := hamiltonian_of_rotations(system.in_time)) is None:
         return system
     form = replace(form, arrays=system.arrays) if system.arrays else form
     return reparametrise(form, system.clock.rate) if system.clock else form

@@ -1,6 +1,8 @@
 """Stage equations of explicit steps: forces and velocities in turn, from the statements of a method."""
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain, compress
 
 from sympy import Expr, S
 
@@ -98,9 +100,12 @@ def _carried_out(method: Method, split: KineticSplitting) -> _Step:
     """Return the forces and velocities of a step, in order."""
     explicit = method.explicit_step(split)
     assert explicit is not None  # of a method with these equations
-    holds = {"masses": not split.velocity, "bodies": bool(split.bodies), "action": _acts(split)}
-    features = [name for name, held in holds.items() if held]
-    run = Recurrence.of(explicit, read(explicit.statements, features), masses=not split.velocity)
+    holds = not split.velocity, split.bodies, _acts(split)
+    run = Recurrence.of(
+        explicit,
+        read(explicit.statements, [*compress(("masses", "bodies", "action"), holds)]),
+        masses=not split.velocity,
+    )
     if split.bodies and not run.turns:
         raise MethodError(f"{method.name} does not turn rigid bodies: use 'stoermer-verlet' or a composition")
     if split.velocity and any(x.argument.get(P) != {0: mp.one} for x in run.velocities):
@@ -108,16 +113,13 @@ def _carried_out(method: Method, split: KineticSplitting) -> _Step:
             f"{method.name} computes velocities M^-1 X of sums X other than momenta, for which H = T(p) + V(q, t) of "
             f"'{split.system.name}' has no constant masses: use a method of kicks and drifts"
         )
-    ends = {"q": {Q: {0: mp.one}, **run.values["q"]}, "p": {P: {0: mp.one}, **run.values["p"]}}
-    for name, end in ends.items():
-        own, added = ("q0", "V") if name == "q" else ("p0", "F")
-        if any(letter[0] not in (own, added) for letter in end) or (own, 0) in run.values[name]:
-            what = "velocities" if name == "q" else "forces"
+    for name, letter, what in (("q", "V", "velocities"), ("p", "F", "forces")):
+        if {kind for kind, _ in run.values[name]} - {letter}:
             raise MethodError(f"the increment {name}[i] of {method.name} is not a sum of {what}")
     for name, remedy in {"q": "q[i] += h * v[i] with v[i] = velocity(P, t)", "p": "p[i] += h * F[i]"}.items():
         if not run.values[name] and (name == "q" or any(split.force)):
             raise MethodError(f"the statements of {method.name} leave the increment {name}[i] 0: add {remedy}")
-    return _needed(run, ends["q"], ends["p"])
+    return _needed(run, {Q: {0: mp.one}, **run.values["q"]}, {P: {0: mp.one}, **run.values["p"]})
 
 
 def _needed(run: Recurrence, q: Sum, p: Sum) -> _Step:
@@ -163,8 +165,8 @@ def _rotating_group(split: KineticSplitting, durations: Vector) -> StageGroup:
     # Rows are drifts j. Columns of gathers are those of q0, V and P; columns of scatters the rows V, P and p1.
     zero_square, zero_column = Table.constant(len(drifts), len(drifts)), Table.constant(len(drifts), 1)
     earlier = Table.named("a", [[d if k < j else mp.zero for k, d in enumerate(durations)] for j in drifts])
-    own = Table.named("gamma", [[d if k == j else mp.zero for k in drifts] for j, d in enumerate(durations)])
-    minus_inverse = Table.named("r", [[-1 / d if k == j else mp.zero for k in drifts] for j, d in enumerate(durations)])
+    own = Table.named("gamma", _diagonal(durations))
+    minus_inverse = Table.named("r", _diagonal([-1 / d for d in durations]))
     to_later_and_p1 = Table.named(
         "s", [[1 / d if k > j else mp.zero for k in range(len(drifts) + 1)] for j, d in enumerate(durations)]
     )
@@ -189,6 +191,10 @@ def _rotating_group(split: KineticSplitting, durations: Vector) -> StageGroup:
     )
 
 
+def _diagonal(entries: Sequence[Number]) -> list[list[Number]]:
+    return [[entry if k == j else mp.zero for k in range(len(entries))] for j, entry in enumerate(entries)]
+
+
 def _kick_group(split: KineticSplitting, step: _Step) -> StageGroup:
     """Return the kicks: forces F_n = L_q at the positions u_n, which add to the momenta X_k of velocities and to p1.
 
@@ -196,28 +202,26 @@ def _kick_group(split: KineticSplitting, step: _Step) -> StageGroup:
 
     s_nk of a composition is w_n for the drifts after the kick, which has the weight w_n then.
     """
-    sums = [*(drift.forces for drift in step.drifts), step.p]
-    factors = [[use.get(letter, {}) for use in sums] for letter, _ in step.kicks]
-    weights = tuple(line[-1].get(1, mp.zero) for line in factors)
-    plain = [w != 0 and all(x in ({}, {1: w}) for x in line) for w, line in zip(weights, factors, strict=True)]
-    weights = tuple(w if alone else mp.one for w, alone in zip(weights, plain, strict=True))
+    sums, letters, kicks = [*(drift.forces for drift in step.drifts), step.p], *zip(*step.kicks, strict=True)
+    factors = [[use.get(letter, {}) for use in sums] for letter in letters]
+    weights = [*map(_weight_of, factors)]
+    divisors = tuple(weight or mp.one for weight in weights)
     # With rigid bodies gathers have further columns for the blocks P, and scatters for the rows V.
-    zeros = Table.constant(len(step.kicks), len(step.drifts) if split.bodies else 0)
-    positions = [[drift.factor(kick.argument) for drift in step.drifts] for _, kick in step.kicks]
-    ones = Table.constant(len(step.kicks), 1, 1)
+    zeros = Table.constant(len(kicks), len(step.drifts) if split.bodies else 0)
+    positions = [[drift.factor(kick.argument) for drift in step.drifts] for kick in kicks]
+    ones = Table.constant(len(kicks), 1, 1)
     scatters = []
-    for power in sorted({power for line in factors for x in line for power in x}):
-        table = [[x.get(power, mp.zero) / w for x in line] for w, line in zip(weights, factors, strict=True)]
+    for power in sorted(set[int]().union(*chain(*factors))):
+        table = [[x.get(power, mp.zero) / w for x in line] for w, line in zip(divisors, factors, strict=True)]
         momenta = Table.joined(zeros, Table.named("s", table))
         scatters.append(Scatter(results=split.force, table=momenta, power=power))
-    acts = _acts(split) and bool(step.action)
-    summed = tuple(step.action.get(("L", letter[1]), {}).get(0, mp.zero) for letter, _ in step.kicks)
+    acts, summed = _acts(split) and bool(step.action), _of_action(step, "L", [index for _, index in letters])
     return StageGroup(
         name="kick",
-        abscissae=tuple(kick.time for _, kick in step.kicks),
-        weights=weights,
+        abscissae=tuple(kick.time for kick in kicks),
+        weights=divisors,
         weight_names=tuple(
-            EntryName("w", kick.row) if alone else None for alone, (_, kick) in zip(plain, step.kicks, strict=True)
+            EntryName("w", kick.row) if weight else None for weight, kick in zip(weights, kicks, strict=True)
         ),
         gathers=(
             Gather(
@@ -228,9 +232,20 @@ def _kick_group(split: KineticSplitting, step: _Step) -> StageGroup:
         ),
         scatters=tuple(scatters),
         scalar=_potential_part(split.system) if acts else None,
-        scalar_weights=summed if acts and summed != weights else (),
+        scalar_weights=summed if acts and summed != divisors else (),
         in_action=acts,
     )
+
+
+def _weight_of(factors: Sequence[Mapping[int, Number]]) -> Number:
+    """Return the one factor w of h with which a force enters p1 and all momenta that it enters, else 0."""
+    weight = factors[-1].get(1, mp.zero)
+    return weight if all(x in ({}, {1: weight}) for x in factors) else mp.zero
+
+
+def _of_action(step: _Step, term: str, numbers: Iterable[int]) -> Vector:
+    """Return the factors of h L at kicks, or of h T at drifts, in the action."""
+    return tuple(step.action.get((term, number), {}).get(0, mp.zero) for number in numbers)
 
 
 def _acts(split: KineticSplitting) -> bool:
@@ -247,13 +262,12 @@ def _drift_group(split: KineticSplitting, step: _Step) -> StageGroup:
     system, acts, size = split.system, _acts(split) and bool(step.action), len(step.drifts)
     into = Table.joined(Table.constant(size, 1), Table.identity(size))
     back = Table.joined(Table.identity(size, -1), Table.constant(size, 1))
-    sums = tuple(step.action.get(("T", drift.letter[1]), {}).get(0, mp.zero) for drift in step.drifts)
     return StageGroup(
         name="drift",
         abscissae=tuple(drift.momentum.time for drift in step.drifts),
         gathers=(Gather(arguments=system.velocities, table=into, power=-1),),
         scatters=(Scatter(results=forms_of(system).momentum, table=back, power=0),),
         scalar=system.lagrangian - _potential_part(system) if acts else None,
-        scalar_weights=sums if acts else (),
+        scalar_weights=_of_action(step, "T", [drift.letter[1] for drift in step.drifts]) if acts else (),
         in_action=acts,
     )

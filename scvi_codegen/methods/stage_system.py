@@ -33,6 +33,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import count
+from sys import float_info
 from typing import Any
 
 import sympy
@@ -42,7 +43,6 @@ from scvi_codegen.methods.tables.quadrature import Quadrature
 from scvi_codegen.methods.tables.tableau import Tableau
 from scvi_codegen.systems.formulas.expressions import gradient
 
-DYADIC_BITS = 52
 _WORDS: ContextVar[int] = ContextVar("words of the entries of tables", default=1)
 ROUNDING = mp.mpf("1e-50")
 """Bound below which entries are set to 0: round-off of sums that are 0."""
@@ -380,7 +380,7 @@ def words_of_tables() -> int:
 
 def dyadic(entries: Sequence[Sequence[Number]]) -> Matrix:
     """Round to multiples of 2^-52, so that entries of size up to 1 and their differences are exact in binary64."""
-    unit = mp.ldexp(1, DYADIC_BITS * words_of_tables())
+    unit = mp.ldexp(1, (float_info.mant_dig - 1) * words_of_tables())
     return tuple(tuple(mp.nint(x * unit) / unit for x in line) for line in entries)
 
 

@@ -106,7 +106,7 @@ class StepperOfRunTimeSizes(Stepper):
                 if named.get(argument) not in (None, "double"):
                     require(self, operation)
         threads = named.pop("threads", None) if method in PER_STEP else None
-        stepper = self if named.get("events") is None else self.with_events(named.pop("events"))
+        stepper = self.with_events(named.pop("events", None))
         bound, state = stepper.bind(q, parameters, tables, threads)
         if len(arguments) == 1 and arguments[0] is None:  # p=None by position
             arguments = ()
@@ -133,8 +133,7 @@ class StepperOfRunTimeSizes(Stepper):
             else:
                 bound = self.with_sizes(problem.sizes, tables=problem.places)
             self._last = shapes, bound
-        if self.events:
-            bound = bound.with_events(self.events)
+        bound = bound.with_events(self.events)
         if (type(q) is np.ndarray and q.ndim == 1) or bound.interface.rotations or bound.interface.variables:
             return bound, q
         return bound, flat_state(bound.interface, q, "q")

@@ -221,7 +221,7 @@ class Stepper(OfSteppers, Integrator):
         if type(save_every) is not int or save_every != 1:
             save_every = checked_count(save_every, "save_every", least=1)
         stepper: Stepper = self if events is None and not action else self._for_run(events, action=action)
-        interface = self.interface
+        interface, inputs = self.interface, inputs or None
         noise = stepper._noise(seed, metropolis, inputs) if seed != 0 or metropolis else None
         if not (inputs is None and t_eval is None and observe is None and tables is None and threads is None):
             from scvi_codegen.runs.results.dense_output import check_has_end
@@ -284,11 +284,11 @@ class Stepper(OfSteppers, Integrator):
 
     def _for_run(self, events: EventLike | Sequence[EventLike] | None, *, action: bool) -> Self:
         """Return the stepper of runs with these events, ``None`` for its own, that sum the action if requested."""
-        stepper = self if events is None else self.with_events(events)
-        if action:
-            require(stepper, "action")
-            return stepper.acting
-        return stepper
+        stepper = self.with_events(events)
+        if not action:
+            return stepper
+        require(stepper, "action")
+        return stepper.acting
 
     def _at_tolerance(self, tolerance: float | None) -> Self:
         """Return the stepper of adaptive runs of a tolerance, whose degree follows it unless the method was named."""
@@ -298,9 +298,7 @@ class Stepper(OfSteppers, Integrator):
 
         if tolerance < LOOSE:
             return self
-        stepper = self._looser()
-        if self.events:
-            stepper = stepper.with_events(self.events)
+        stepper = self._looser().with_events(self.events)
         return stepper.acting if self.sums_action else stepper
 
     def _bounded(self, motion: BoundedMotion) -> Trajectory:
@@ -376,8 +374,6 @@ class Stepper(OfSteppers, Integrator):
             from scvi_codegen.runs.events.contacts import in_first_modes
 
             return in_first_modes(self, q, p, t, parameters, duration_of(plan, t))
-        if not self.interface.constraints:
-            return q, p
         return consistent(self, q, p, t, parameters)
 
     @property
@@ -590,6 +586,7 @@ class Stepper(OfSteppers, Integrator):
             MethodError: if the system has no constraints.
             StateError: if the iteration fails, or if the constraints are linearly dependent there.
         """
+        require(self, "project")
         momenta = self._initial_momenta(
             q, p, np.zeros(self.dimension) if p is velocity is None else velocity, t, parameters
         )

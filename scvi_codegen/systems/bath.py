@@ -19,7 +19,7 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError, closest
 from scvi_codegen.systems.derived_expressions import forms_of
-from scvi_codegen.systems.formulas.expressions import gradient_tuple, hessian
+from scvi_codegen.systems.formulas.expressions import gradient_tuple, hessian, jacobian
 
 FRICTION = ("damping", "dissipation")
 """Arguments of the friction, which is the bath's if there is a temperature."""
@@ -83,26 +83,31 @@ def check_bath(system: Any) -> None:
     bath, v, name = system.bath, system.velocities, system.name
     if bath is None:
         return
-    constants, still = {*system.parameters, system.time}, dict.fromkeys(v, sympy.S.Zero)
-    friction, reason = hessian(bath.dissipation, v), ""
-    if others := sorted(free.name for free in bath.temperature.free_symbols - constants):
-        reason = f"temperature={bath.temperature} depends on '{others[0]}': kT is a formula of parameters, inputs and t"
-    elif not bath.noise and bath.damping == 0 and not friction:
-        reason = "a temperature requires friction, by which heat is exchanged: give damping= or dissipation="
-    elif any(slope.xreplace(still) != 0 for slope in gradient_tuple(bath.dissipation, v)) or any(
-        entry.free_symbols & {*v} for entry in friction.values()
-    ):
-        reason = f"the dissipation {bath.dissipation} must be quadratic in velocities, v^T R(q) v/2, with a temperature"
-    elif any(entry.free_symbols & {*v} for entry in forms_of(system).mass.values()):
-        reason = "its masses depend on velocities: a temperature requires a kinetic energy quadratic in velocities"
-    elif any(sigma.free_symbols & {*v} for sigma in bath.noise):
-        reason = "its noise depends on velocities: its strengths are formulas of coordinates, parameters and t"
-    elif system.is_rolling:
-        reason = (
-            "it has nonholonomic constraints, for which no invariant measure is known: omit temperature= and noise="
-        )
-    elif system.contacts or system.reactions or system.clock:
-        kind = "a time transformation" if system.clock else "contacts"
-        reason = f"a heat bath with {kind} is not available: omit temperature= and noise="
-    if reason:
+    still, friction = dict.fromkeys(v, sympy.S.Zero), hessian(bath.dissipation, v)
+    others = sorted(map(str, bath.temperature.free_symbols - {*system.parameters, system.time}))
+    linear = any(slope.xreplace(still) for slope in gradient_tuple(bath.dissipation, v))
+    requirements = {
+        f"temperature={bath.temperature} depends on '{', '.join(others)}': kT is a formula of parameters, inputs "
+        "and t": not others,
+        "a temperature requires friction, by which heat is exchanged: give damping= or dissipation=": bath.noise
+        or bath.damping
+        or friction,
+        f"the dissipation {bath.dissipation} must be quadratic in velocities, v^T R(q) v/2, with a temperature": not (
+            linear or jacobian([*friction.values()], v)
+        ),
+        "its masses depend on velocities: a temperature requires a kinetic energy quadratic in velocities": not (
+            jacobian([*forms_of(system).mass.values()], v)
+        ),
+        "its noise depends on velocities: its strengths are formulas of coordinates, parameters and t": not (
+            jacobian(bath.noise, v)
+        ),
+        "it has nonholonomic constraints, for which no invariant measure is known: omit temperature= and noise=": not (
+            system.is_rolling
+        ),
+        "a heat bath with contacts is not available: omit temperature= and noise=": not (
+            system.contacts or system.reactions
+        ),
+        "a heat bath with a time transformation is not available: omit temperature= and noise=": not system.clock,
+    }
+    if reason := next((reason for reason, holds in requirements.items() if not holds), ""):
         raise SystemDefinitionError(f"'{name}': {reason}")

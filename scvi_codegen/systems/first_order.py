@@ -295,7 +295,7 @@ def first_order_form(form: OneForm) -> dict[str, Any]:
     placed = form.at(expressions := places(form))
     if not any(placed.integral(auxiliary) is not None for auxiliary in islice(placed.choices(), MOST_CHOICES)):
         placed = form.at(expressions := {symbol: symbol for symbol in z})
-    for auxiliary, _ in zip(placed.choices(), range(MOST_CHOICES), strict=False):
+    for auxiliary in islice(placed.choices(), MOST_CHOICES):
         integral = placed.integral(auxiliary)
         if integral is None:
             refused.append(auxiliary)

@@ -54,28 +54,17 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
     arguments = {switching_function(step.args[0])[0] for step in located}
     if not arguments or len(arguments) > MOST_KINKS or system.clock:
         return system, ()
-    from scvi_codegen.systems.contacts.modes import mapped
-
     taken = {free.name for formula in formulas for free in formula.free_symbols}
     taken |= {variable.name for variable in (*system.coordinates, *system.velocities, *system.parameters)}
     names = filterfalse(taken.__contains__, map("mode_{}".format, count(1)))
     modes = {u: Mode(name, real=True) for u, name in zip(sorted(arguments, key=str), names, strict=False)}
     rules = steps_on_sides(located, modes)
-    rules |= {power: rules[step] * power for power, step in powers.items() if step in rules}
+    factors = {power: step for power, step in powers.items() if step in rules}
+    rules |= {power: rules[step] * power for power, step in factors.items()}
     jumps = set(_jumps(system))
     jumps = arguments if jumps and len(arguments) > MOST_SURFACES else jumps
-    with_modes = copy.copy(system)  # not made anew, as it would be checked again
-    changes: dict[str, Any] = {name: _replaced(value, rules) for name, value in owned.items()}
-    changes["reactions"] = tuple(
-        replace(reaction, direction=_replaced(reaction.direction, rules)) for reaction in system.reactions
-    )
-    changes["contacts"] = tuple(mapped(item, lambda part, _: part.xreplace(rules)) for item in system.contacts)
-    changes["parameters"] = (*system.parameters, *modes.values())
-    changes["defaults"] = (*system.defaults, *(0.0 for _ in modes))
-    for name, value in (changes | {"_key": None, "_text": None}).items():
-        object.__setattr__(with_modes, name, value)
-    sides = {switching_function(step.args[0]) for step in powers.values() if step in rules}
-    return with_modes, tuple(
+    sides = {switching_function(step.args[0]) for step in factors.values()}
+    kinks = tuple(
         (Refraction if u in jumps else Kink)(
             system.text_of(u.xreplace(rules)),
             mode=mode.name,
@@ -84,6 +73,27 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
         )
         for u, mode in modes.items()
     )
+    return _on_sides(system, owned, rules, tuple(modes.values())), kinks
+
+
+def _on_sides(
+    system: MechanicalSystem, stated: Mapping[str, Any], rules: dict[Expr, Expr], modes: tuple[Mode, ...]
+) -> MechanicalSystem:
+    """Return the system with the formulas of the sides that the values of its modes choose."""
+    from scvi_codegen.systems.contacts.modes import mapped
+
+    changes = {name: _replaced(value, rules) for name, value in stated.items()} | {
+        "reactions": tuple(replace(r, direction=_replaced(r.direction, rules)) for r in system.reactions),
+        "contacts": tuple(mapped(item, lambda part, _: part.xreplace(rules)) for item in system.contacts),
+        "parameters": (*system.parameters, *modes),
+        "defaults": (*system.defaults, *(0.0 for _ in modes)),
+        "_key": None,
+        "_text": None,
+    }
+    with_modes = copy.copy(system)  # not made anew, as it would be checked again
+    for name, value in changes.items():
+        object.__setattr__(with_modes, name, value)
+    return with_modes
 
 
 def _parities(formulas: Iterable[Expr], system: MechanicalSystem) -> dict[Expr, Expr]:

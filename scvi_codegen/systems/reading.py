@@ -56,7 +56,7 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
             raise SystemDefinitionError("noise= of arrays is not supported: write their entries as coordinates")
         if arguments.get("point_forces"):
             raise SystemDefinitionError("point_forces of arrays are not supported: give torques and forces by index")
-        return _of_arrays(cls, arrays_from_text(arguments, bath_of), arguments.get("contacts", ())), True
+        return _of_arrays(cls, arrays_from_text(arguments), arguments.get("contacts", ())), True
     names = RotationNames.declared(*turning, momentum=of_momenta)
     coordinates, momenta = (*ordinary, *names.coordinates), arguments.get("momenta", ())
     momenta = default_momenta(ordinary) if momenta is None else tuple(momenta)

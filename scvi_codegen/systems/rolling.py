@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -70,31 +71,32 @@ def roll_sums(system: MechanicalSystem) -> RolledSums:
     _check_supported(system)
     mark = _mark({*map(str, system.constants), *system.inputs})
     inputs = input_formulas(system.inputs, system.time)
+    named = {formula: name for name, formula in inputs.items()}
     q, q_dot, p = (Array(f"{name}", (Size(f"N{mark}"),)) for name in (f"q{mark}", f"q{mark}{DOT}", f"p{mark}"))
     pairs = ((q, system.coordinates), (q_dot, system.velocities), (p, system.auxiliaries))
     indices = {variable: (array.name, k) for array, symbols in pairs for k, variable in enumerate(symbols)}
-    named = {formula: name for name, formula in inputs.items()}
     function, *forces = (formula.xreplace(named) for formula in (system.formula, *system.forces))
-    applied = [(term, (k,)) for k, force in enumerate(forces) if force != 0 for term in Add.make_args(force)]
     defaults = _defaults(system, (function, *forces))
     kinds = similar_terms(Add.make_args(function), indices, defaults)
-    force_kinds = similar_terms((term for term, _ in applied), indices, defaults, (target for _, target in applied))
+    applied = {(k,): Add.make_args(force) for k, force in enumerate(forces) if force != 0}
+    targets = (target for target, terms in applied.items() for _ in terms)
+    force_kinds = similar_terms(chain(*applied.values()), indices, defaults, targets)
     if not kinds or (applied and not force_kinds):
         raise SystemDefinitionError(
             f"the terms of '{system.name}' have more than {MAX_GROUPS} different structures: "
             "systems with so few repeated terms cannot be rolled into sums"
         )
-    arrays = {"": q, **{array.name: array for array, _ in pairs}}
+    arrays = {array.name: array for array, _ in pairs} | {"": q}
     parts = [_Rolled.of(kind, f"{mark}{k}", f"b{mark}", arrays) for k, kind in enumerate((*kinds, *force_kinds))]
-    used = {name for part in parts for name in part.group.formula.free_symbols}
+    used = set[Symbol]().union(*(part.group.formula.free_symbols for part in parts))
     constants = {parameter.name: value for parameter, value in defaults.items() if parameter in used}
     numbers = with_inputs(constants, system.inputs)
-    fields = {array: values for part in parts for array, values in part.fields(defaults)}
-    kind = ArrayHamiltonian if system.auxiliaries else ArrayLagrangian
-    rolled = kind(
+    fields = dict(chain.from_iterable(part.fields(defaults) for part in parts))
+    momenta = (p,) if system.auxiliaries else ()
+    rolled = (ArrayHamiltonian if momenta else ArrayLagrangian)(
         name=system.name,
         coordinates=(q,),
-        momenta=(p,) if system.auxiliaries else (),
+        momenta=momenta,
         time=system.time,
         parameters=tuple(map(symbol, numbers)),
         defaults=tuple(numbers.values()),

@@ -351,6 +351,11 @@ class MechanicalSystem(Deferred, ABC):
         return (self.clock.rate,) if self.clock else ()
 
     @property
+    def in_time(self) -> MechanicalSystem:
+        """The system in physical time: of one in transformed time that which was transformed, if it is known."""
+        return (self.clock and self.clock.plain) or self
+
+    @property
     def depends_on_time(self) -> bool:
         """True if time occurs in the function, a force or a constraint, so that energy is not conserved."""
         return any(self.time in formula.free_symbols for formula in (self.lagrangian, *self.forces, *self.constraints))

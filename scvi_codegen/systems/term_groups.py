@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from itertools import compress, groupby, repeat
+from itertools import chain, compress, filterfalse, groupby, repeat
 from typing import TypeVar
 
 from sympy import Add, Expr, Symbol, factor_terms
@@ -124,8 +124,8 @@ def roll_terms(system: MechanicalSystem) -> SplitSystem | None:
         for similar in kind.groups
     ]
     function = "hamiltonian" if system.auxiliaries else "lagrangian"
-    gathered = {term for kind in large for term in kind.terms}
-    rest = replace(system, **{function: Add(*(term for term in terms if term not in gathered))})
+    gathered = {*chain(*(kind.terms for kind in large))}
+    rest = replace(system, **{function: Add(*filterfalse(gathered.__contains__, terms))})
     return SplitSystem(rest, _merged(groups))
 
 

@@ -50,16 +50,18 @@ function addPanel(title, draw) {
   panels.push(panel);
   return panel;
 }
+// Signed numbers on an axis that is linear between -1 and 1, where orbits are stable, and logarithmic beyond.
+const SIGNED = { values: [-1, 1], to: (x) => (Math.abs(x) <= 1 ? x : Math.sign(x) * (1 + Math.log10(Math.abs(x)))), from: (u) => (Math.abs(u) <= 1 ? u : Math.sign(u) * 10 ** (Math.abs(u) - 1)) };
 // Curves over a family, with its bifurcations and the present orbit.
-const over = (title, heights, told) => addPanel(`${title} over ${spelled(family.value)}`, ({ canvas, output }) => {
+const over = (title, heights, told, axis) => addPanel(`${title} over ${spelled(family.value)}`, ({ canvas, output }) => {
   const { orbits } = family, columns = heights(orbits[0]).map((_, k) => [...orbits.map((orbit) => heights(orbit)[k]), NaN]);
-  const { px, py, pen } = plot(canvas, columns.flatMap(() => [...orbits.map((orbit) => orbit.value), NaN]), columns.flat(), colors.c0);
+  const { px, py, pen } = plot(canvas, columns.flatMap(() => [...orbits.map((orbit) => orbit.value), NaN]), columns.flat(), colors.c0, { axis });
   orbits.forEach((orbit, k) => { if (orbit.bifurcation || k === present) heights(orbit).forEach((y) => { pen.beginPath(); pen.arc(px(orbit.value), py(y), 3.5, 0, TAU); pen.fillStyle = k === present ? colors.c1 : colors.muted; pen.fill(); }); });
   output.textContent = told(orbits[present]);
 });
 if (family) over("Period", ({ period }) => [period], ({ period, value }) => `${short(period, 6)} at ${short(value, 6)}`);
 if (family && family.value !== "energy") over("Energy", ({ energy }) => [energy], ({ energy }) => short(energy, 6));
-if (family) over(`log₁₀ ${family.sizes}`, ({ sizes }) => sizes.map(Math.log10), ({ bifurcation, stability, sizes }) => [...sizes.slice(0, 3).map((x) => short(x, 4)), bifurcation || stability].join(", "));
+if (family) over(family.indices, ({ indices }) => indices.map(SIGNED.to), ({ bifurcation, stability, indices }) => [...indices.slice(0, 3).map((x) => short(x, 4)), bifurcation || stability].join(", "), SIGNED);
 const [solid] = shape.solids;
 const defaults = about.plots.length ? about.plots : [solid && m <= WHOLE && about.coordinates.length ? [`${solid.name}.y`, `${solid.name}.x`] : m <= WHOLE && about.coordinates.length ? ((k) => (k < 0 ? [about.coordinates[0], "t"] : [about.momenta[k] || "t", about.coordinates[k]]))(about.coordinates.findIndex((_, k) => !about.rotations.some(({ columns }) => columns.includes(k)))) : [`q.${probes[0]}`, "t"]];
 for (const [y, x] of defaults) {
@@ -99,27 +101,27 @@ function fitted(canvas) {
   return [pen, width, height];
 }
 
-/** Draws ys over xs; where a periodic variable jumps, points are not joined. */
-function plot(canvas, xs, ys, color, { symmetric = false, periods = [0, 0] } = {}) {
+/** Draws ys over xs; where a periodic variable jumps, points are not joined. An axis: values that it has, and what its marks mean. */
+function plot(canvas, xs, ys, color, { symmetric = false, periods = [0, 0], axis = { values: [], from: (y) => y } } = {}) {
   const [pen, width, height] = fitted(canvas), bottom = 17, top = 6, right = 8;
   const range = (list) => {
     let low = Infinity, high = -Infinity;
     for (const x of list) { if (x < low) low = x; if (x > high) high = x; }
     if (!(low <= high)) return [-1, 1];
-    const least = 1e-9 * Math.max(Math.abs(low), Math.abs(high)) || 1e-15;
+    const least = (high > low ? 1e-9 : 0.1) * Math.max(Math.abs(low), Math.abs(high)) || 1e-15; // of one value a tenth, of others rounding
     return high - low > least ? [low, high] : [low - least, low + least];
   };
-  let [x0, x1] = range(xs), [y0, y1] = range(ys);
+  let [x0, x1] = range(xs), [y0, y1] = range([...ys, ...axis.values]);
   if (symmetric) { y1 = Math.max(...ys.reduce(([a, b], y) => [Math.max(a, y), Math.max(b, -y)], [0, 0]), 2.3e-16); y0 = -y1; }
   const pad = 0.08 * (y1 - y0); y0 -= pad; y1 += pad;
   let left = 52;
   const px = (x) => left + ((width - left - right) * (x - x0)) / (x1 - x0), py = (y) => height - bottom - ((height - bottom - top) * (y - y0)) / (y1 - y0);
-  const marked = (low, high, wanted) => { // with digits in which they differ
+  const marked = (low, high, wanted, meaning = (x) => x) => { // with digits in which they differ
     const marks = ticks(low, high, wanted), digits = clamped(Math.ceil(Math.log10(Math.max(Math.abs(low), Math.abs(high)) / (marks[1] - marks[0]))) + 1 || 3, 3, 7);
-    return marks.map((mark) => [mark, short(mark, digits)]);
+    return marks.map((mark) => [mark, short(meaning(mark), digits)]);
   };
   pen.font = `11px ${colors.sans}`; pen.fillStyle = colors.muted; pen.textBaseline = "middle"; pen.textAlign = "right";
-  const levels = marked(y0, y1, 3);
+  const levels = marked(y0, y1, 3, axis.from);
   left = Math.max(left, ...levels.map(([, text]) => pen.measureText(text).width + 8));
   for (const [mark, text] of levels) { line(pen, [[left, py(mark)], [width - right, py(mark)]], colors.rule, 1); pen.fillText(text, left - 6, py(mark)); }
   pen.textBaseline = "top"; pen.textAlign = "center";

@@ -105,22 +105,31 @@ def test_a_page_computes_the_bits_of_python_and_asks_for_nothing(view, pages):
     assert "://" not in text
 
 
-LOADED_WHEN_RUN = """<script>
+LOADED_WHEN = """<script>
 const pending = document.body.appendChild(document.createElement('iframe')).contentDocument;
 pending.open();  // the page is loaded when this is closed
 const waiting = setInterval(() => {
-    if (globalThis.page?.state().steps === 100) { console.log("100 steps"); clearInterval(waiting); pending.close(); }
+    if (!(CONDITION)) return;
+    console.log("loaded");
+    clearInterval(waiting);
+    requestAnimationFrame(() => requestAnimationFrame(() => pending.close()));
 }, 20);
 </script></body>"""
 
 
+def seen_when(condition: str, page: Path, folder: Path, *more: Any, **options: Any) -> tuple[bytes, list[str]]:
+    """Return what Firefox shows of a page, which is loaded when a condition holds, and the messages."""
+    text = page.read_text(encoding="utf-8").replace("</body>", LOADED_WHEN.replace("CONDITION", condition))
+    (folder / "page.html").write_text(text, encoding="utf-8")
+    return seen_by_firefox(folder / "page.html", *more, **options)
+
+
 @pytest.mark.parametrize("name", ["figure_eight", "kinks", "robot"])
 def test_a_page_runs_in_firefox_without_a_message(pages, tmp_path, name):
-    text = pages[name].read_text(encoding="utf-8").replace("</body>", LOADED_WHEN_RUN)
-    (tmp_path / "page.html").write_text(text, encoding="utf-8")
-    picture, messages = seen_by_firefox(tmp_path / "page.html", address="#.n=100")
+    condition = "globalThis.page?.state().steps === 100"
+    picture, messages = seen_when(condition, pages[name], tmp_path, address="#.n=100")
     assert len(picture) > 10_000
-    assert messages == ['console.log: "100 steps"']
+    assert messages == ['console.log: "loaded"']
 
 
 def test_a_link_reproduces_the_bits_after_reversal_and_a_change_of_parameters(view, pages):
@@ -256,6 +265,30 @@ def test_a_slider_moves_along_a_family_whose_orbits_close(view, tmp_path):
     assert slider.get_attribute("aria-valuetext") == "3"
     assert f"{family[3].period:.6g} at" in view.inner_text("#plots")
     assert view.messages == []
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize("width", [390, 1280])
+def test_a_slow_machine_draws_the_whole_orbit_too(browser, tmp_path, width):
+    pytest.importorskip("ziglang", reason="pages are compiled by the extra compiler")
+    system, path = sc.problem("planar-pendulum").system, tmp_path / "family.html"
+    stepper = sc.compile_stepper(system, "svi:4")
+    family = sc.family(stepper, sc.equilibrium(stepper, [0.0]), amplitude=0.5, step=0.3, count=5)
+    sc.page(system, family=family, h=family[-1].period / 2000).save(path)
+    pictures, address = [], ""
+    for slower in (1, 6):
+        page = browser.new_page(viewport={"width": width, "height": 800}, reduced_motion="reduce")
+        page.context.new_cdp_session(page).send("Emulation.setCPUThrottlingRate", {"rate": slower})
+        opened(page, path, "")
+        page.locator("input[aria-label='Orbit']").press("End")
+        page.wait_for_timeout(500)
+        pictures.append(page.locator("#motion").screenshot())
+        address = page.evaluate("page.address()")
+        page.close()
+    assert pictures[0] == pictures[1]
+    drawn = "document.querySelector('#clock').textContent === 't = 0.00'"
+    pictures = [seen_when(drawn, path, tmp_path, 800, address, width=width, slower=slower)[0] for slower in (1, 6)]
+    assert pictures[0] == pictures[1]
 
 
 @pytest.mark.parametrize("width", [360, 800, 1600])

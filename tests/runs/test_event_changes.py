@@ -547,6 +547,30 @@ def test_derivatives_are_those_of_the_computed_run(event, method, e, tolerance):
         assert np.abs(matrix.T @ FORM @ matrix - FORM).max() < 1e-10 * size
 
 
+@pytest.mark.parametrize(
+    "seed", [0, pytest.param(1, marks=pytest.mark.rotated), pytest.param(2, marks=pytest.mark.full)]
+)
+def test_derivatives_of_maps_of_velocities_are_those_of_the_computed_run(seed):
+    """Masses depend on positions; the event, too, contains a velocity."""
+    c = np.random.default_rng(seed).uniform(0.1, 0.4, 4)
+    system = sc.LagrangianSystem.from_text(
+        "coupled", ["x", "y"], "(1 + x**2/3)*x_dot**2/2 + y_dot**2/2 + c*x_dot*y_dot*cos(y) - x**2/2 - y**2 + 0*e",
+        parameters={"c": c[0], "e": 0.8},
+    )  # fmt: skip
+    turn = sc.Event(f"y - {c[1]}*x_dot", then={"y_dot": f"e*y_dot + {c[2]}*x_dot", "x": f"x + {c[3]}*c*y_dot"})
+    stepper = sc.compile_stepper(system, "svi:4")
+
+    def run(z, parameters):
+        return stepper.integrate(z[:2], z[2:], h=0.1, t_end=6.0, events=turn, parameters=parameters)
+
+    z, values = np.array([0.7, 0.9, 0.2, 0.5]), {"c": float(c[0]), "e": 0.8}
+    motion = run(z, values)
+    assert len(motion.events[0]) >= 2
+    derivatives = motion.sensitivity()
+    computed = np.hstack([derivatives.state[-1], derivatives.parameters[-1]])
+    assert np.abs(computed - differences(run, z, values)).max() < 1e-9 * np.abs(computed).max()
+
+
 @pytest.mark.full
 def test_lyapunov_exponent_of_the_stadium_billiard(point):
     """Benettin & Strelcyn, Phys. Rev. A 17 (1978) 773: 0.43 for a = R = 1."""
@@ -574,8 +598,6 @@ def test_derivatives_are_refused_where_they_do_not_exist(point, ball):
         ball.integrate([1.0], [0.0], h=0.1, steps=20, save_every=5, events=BOUNCES["impact"]).tangent()
     with pytest.raises(sc.MethodError, match="hessian_product is not available with events"):
         corner.hessian_product(np.zeros((len(corner), 4)), np.eye(4))
-    with pytest.raises(sc.StateError, match="momenta instead of velocities"):
-        ball.integrate([1.0], [0.0], h=0.1, steps=20, events=BOUNCES["velocity"]).tangent()
 
 
 @pytest.mark.parametrize("depth", [1e-2, 1e-6, 1e-10])

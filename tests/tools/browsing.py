@@ -6,9 +6,11 @@ import importlib.util
 import os
 import re
 import shutil
+import signal
 import subprocess
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -108,17 +110,38 @@ def assert_nothing_sticks_out(view: Any) -> None:
     assert view.evaluate("innerWidth") == view.width
 
 
-def seen_by_firefox(page: Path, height: int = 900, address: str = "") -> tuple[bytes, list[str]]:
-    """The picture of a page in a Firefox of its own profile, and the messages of the page's scripts and policies."""
+def seen_by_firefox(
+    page: Path, height: int = 900, address: str = "", *, width: int = 1200, slower: int = 1
+) -> tuple[bytes, list[str]]:
+    """The picture of a page in a Firefox of its own profile, and the messages of the page's scripts and policies.
+
+    A processor that is ``slower`` times slower: all processes of the browser stand still for the rest of each 30 ms.
+    """
     needs("firefox")
     picture, profile = page.with_suffix(".png"), page.parent / "firefox"
     profile.mkdir(exist_ok=True)
-    prints = ("devtools.console.stdout.content", "browser.dom.window.dump.enabled")
-    (profile / "user.js").write_text("".join(f'user_pref("{name}", true);\n' for name in prints), encoding="utf-8")
-    options = ["--headless", "--profile", str(profile), f"--window-size=1200,{height}"]
+    values = {"devtools.console.stdout.content": "true", "browser.dom.window.dump.enabled": "true"}
+    values["ui.prefersReducedMotion"] = "1"
+    prefs = "".join(f'user_pref("{name}", {value});\n' for name, value in values.items())
+    (profile / "user.js").write_text(prefs, encoding="utf-8")
+    options = ["--headless", "--profile", str(profile), f"--window-size={width},{height}"]
     command = ["firefox", *options, "--screenshot", str(picture), page.as_uri() + address]
     environment = {**os.environ, "HOME": str(profile)}
-    shown = subprocess.run(command, check=True, capture_output=True, text=True, timeout=240, env=environment)
+    with (page.parent / "shown").open("w+", encoding="utf-8") as shown:
+        own = {"stdout": shown, "stderr": subprocess.STDOUT, "env": environment, "start_new_session": True}
+        browser, until = subprocess.Popen(command, **own), time.monotonic() + 240.0
+        while browser.poll() is None and time.monotonic() < until:
+            time.sleep(0.03 / slower)
+            with suppress(ProcessLookupError):  # ended meanwhile
+                if slower > 1:
+                    os.killpg(browser.pid, signal.SIGSTOP)
+                    time.sleep(0.03 - 0.03 / slower)
+                    os.killpg(browser.pid, signal.SIGCONT)
+        with suppress(ProcessLookupError):
+            os.killpg(browser.pid, signal.SIGKILL)
+        assert browser.wait() == 0
+        shown.seek(0)
+        text = shown.read()
     # Others are of Firefox itself, which also ends scripts when it quits.
-    own = r"^(?:console\.\w+: (?!services|Remote).*|JavaScript \w+: file:(?!.*terminated by timeout).*)$"
-    return picture.read_bytes(), re.findall(own, shown.stdout + shown.stderr, re.MULTILINE)
+    lines = r"^(?:console\.\w+: (?!services|Remote).*|JavaScript \w+: file:(?!.*terminated by timeout).*)$"
+    return picture.read_bytes(), re.findall(lines, text, re.MULTILINE)

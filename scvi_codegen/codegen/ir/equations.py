@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from enum import Enum, auto
 from typing import Literal, TypeAlias
 
-from scvi_codegen.codegen.ir.kernel import Kernel, Number, NumberTable, RolledKernel
+from scvi_codegen.codegen.ir.kernel import NO_KERNEL, Kernel, Number, NumberTable, RolledKernel
 from scvi_codegen.methods.recurrence import StepTables
 
 
@@ -108,6 +108,8 @@ class IterationTable:
 class Rattle:
     """Constrained steps on s + 1 Lobatto points, by an iteration for the multipliers alone; RATTLE for s = 1.
 
+    ``NO_RATTLE``, s = 0, are other steps, and false.
+
     Attributes:
         part: its header.
         kernels: of forces and momenta.
@@ -118,14 +120,17 @@ class Rattle:
         tables: named and described in the header.
     """
 
-    part: str
-    kernels: tuple[Kernel, ...]
-    macros: tuple[str, ...]
-    inverse_masses: tuple[tuple[int, int], ...]
-    mass_columns: tuple[int, ...]
+    part: str = ""
+    kernels: tuple[Kernel, ...] = ()
+    macros: tuple[str, ...] = ()
+    inverse_masses: tuple[tuple[int, int], ...] = ()
+    mass_columns: tuple[int, ...] = ()
     lower_masses: tuple[tuple[int, int], ...] = ()
-    points: int
-    tables: tuple[IterationTable, ...]
+    points: int = 0
+    tables: tuple[IterationTable, ...] = ()
+
+    def __bool__(self) -> bool:
+        return self.points > 0
 
     @property
     def lanes(self) -> int:
@@ -133,9 +138,12 @@ class Rattle:
         return 1 << (self.points - 1).bit_length()
 
 
+NO_RATTLE = Rattle()
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Constraints:
-    """Constraints g(q, t) = 0, ``count`` of them.
+    """Constraints g(q, t) = 0, ``count`` of them; ``NO_CONSTRAINTS`` are none, and false.
 
     Attributes:
         formulas: as text.
@@ -152,21 +160,33 @@ class Constraints:
         coefficient_rounding: bounds of their rounding errors, in units of the round-off.
     """
 
-    formulas: tuple[str, ...]
-    kernel: Kernel
-    entries: tuple[tuple[int, int], ...]
-    rounding: Kernel
-    motion: Kernel
+    formulas: tuple[str, ...] = ()
+    kernel: Kernel = NO_KERNEL
+    entries: tuple[tuple[int, int], ...] = ()
+    rounding: Kernel = NO_KERNEL
+    motion: Kernel = NO_KERNEL
     reactions: Kernel | None = None
     directions: tuple[tuple[int, int], ...] = ()
     masked: int = 0
     coefficients: Kernel | None = None
     coefficient_rounding: Kernel | None = None
 
+    def __len__(self) -> int:
+        return len(self.formulas)
+
     @property
     def count(self) -> int:
         """Number of constraints."""
         return len(self.formulas)
+
+    @property
+    def kernels(self) -> tuple[Kernel | None, ...]:
+        """Those that the constraints have, in the order of emission."""
+        reactions = self.reactions, self.coefficients, self.coefficient_rounding
+        return self.kernel, self.rounding, self.motion, *reactions
+
+
+NO_CONSTRAINTS = Constraints()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -125,6 +125,9 @@ class Kernel:
     tangents: Kernel | None = None
     entries: tuple[tuple[int, int, int], ...] = ()
 
+    def __bool__(self) -> bool:
+        return bool(self.name)
+
     def __hash__(self) -> int:
         """Return a hash of the name and the sizes: that of all expressions takes long."""
         return hash((self.name, self.arguments, len(self.temporaries), self.values))
@@ -183,6 +186,10 @@ class Kernel:
             for number in ready:
                 derivative = number >= self.values
                 yield "derivative" if derivative else "value", number - derivative * self.values, self.results[number]
+
+
+NO_KERNEL = Kernel(name="", arguments=0, temporaries=(), results=(), values=0)
+"""Kernel of what a system does not have; false."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -291,11 +298,16 @@ class CallsApart(NamedTuple):
 
 def calls_apart(kernel: Kernel, functions: Collection[str]) -> CallsApart | None:
     """Return a kernel with the calls of functions apart whose arguments are sums and products of u; else ``None``."""
-    expressions, moving = (*kernel.temporaries, *kernel.results), set[Load]()
+    moving = set[Load]()
+
+    def moves(expression: Expression) -> bool:
+        return any(load.source == "u" or load in moving for load in loads(expression))
+
     for k, expression in enumerate(kernel.temporaries):
-        moving |= {Load("w", k)} if any(load.source == "u" or load in moving for load in loads(expression)) else set()
-    of_functions = (x for x in subexpressions(*expressions) if isinstance(x, Operation) and x.operator in functions)
-    calls = [x for x in dict.fromkeys(of_functions) if any(load.source == "u" or load in moving for load in loads(x))]
+        if moves(expression):
+            moving.add(Load("w", k))
+    operations = dict.fromkeys(subexpressions(*kernel.temporaries, *kernel.results))
+    calls = [x for x in operations if isinstance(x, Operation) and x.operator in functions and moves(x)]
     values = {call: Load("u", kernel.arguments + k) for k, call in enumerate(calls)}
     named = replace(kernel, name=f"{kernel.name}_arguments", purpose="Arguments of its functions.")
     arguments = _with_results(named, kernel.temporaries, [call.operands[0] for call in calls])

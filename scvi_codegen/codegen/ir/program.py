@@ -11,6 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from scvi_codegen.codegen.ir.equations import (
+    NO_CONSTRAINTS,
+    NO_RATTLE,
     ConstrainedSteps,
     Constraints,
     FixedPointIteration,
@@ -270,7 +272,7 @@ class Program:
         newton: whether Newton's method for the stage equations is included.
         polynomial_curves: whether the leading coefficient of a curve is an error estimate.
         equations, quantities: of named coordinates.
-        constraints: their kernels, or ``None``.
+        constraints: their kernels.
         rattle: the iteration for the multipliers, which is tried before Newton's method if applicable.
         damping: the rate of a uniform damping, if there is one.
         mass_growth: of masses relative to velocities; ``None`` if they are constant in time and not damped.
@@ -291,8 +293,8 @@ class Program:
     polynomial_curves: bool = True
     equations: StageEquations = StageEquations()
     quantities: Quantities = Quantities()
-    constraints: Constraints | None = None
-    rattle: Rattle | None = None
+    constraints: Constraints = NO_CONSTRAINTS
+    rattle: Rattle = NO_RATTLE
     damping: Kernel | None = None
     mass_growth: MassGrowth | None = None
     has_unseen_growth: bool = False
@@ -328,7 +330,6 @@ class Program:
     def kernels(self) -> tuple[Kernel, ...]:
         """All kernels, in the order of emission."""
         stage_groups, quantities = self.equations.stage_groups, self.quantities
-        constraints, rattle, integrals = self.constraints, self.rattle, quantities.integrals
         kernels = (
             *(kernel for group in stage_groups for kernel in (group.value, group.derivative)),
             *(
@@ -338,24 +339,18 @@ class Program:
                 quantities.momentum_kernel,
             ),
             *(quantities.first_order_rates, quantities.inverse_legendre),
-            *(integrals.kernel if integrals else None, constraints and constraints.kernel),
-            *(
-                constraints and constraints.rounding,
-                constraints and constraints.motion,
-                constraints and constraints.reactions,
-                constraints and constraints.coefficients,
-                constraints and constraints.coefficient_rounding,
-                self.damping,
-                self.bath and self.bath.kernel,
-                *(rattle.kernels if rattle else ()),
-            ),
+            quantities.integrals and quantities.integrals.kernel,
+            *self.constraints.kernels,
+            self.damping,
+            self.bath and self.bath.kernel,
+            *self.rattle.kernels,
         )
         return tuple({kernel.name: kernel for kernel in kernels if kernel}.values())
 
     @property
     def masses_of_points(self) -> tuple[int, ...]:
         """Index of each entry of L_vv among those that the kernel of RATTLE computes; empty if its own is shorter."""
-        legendre, lower = self.quantities.legendre, self.rattle.lower_masses if self.rattle else ()
+        legendre, lower = self.quantities.legendre, self.rattle.lower_masses
         if not (legendre and lower and is_divided([legendre])):
             return ()
         indices = {pair: e for e, (i, j) in enumerate(lower) for pair in ((i, j), (j, i))}
@@ -373,10 +368,8 @@ class Program:
 
         They are terms of the entries of G M^-1 G^T at this distance below the diagonal, in the order of the positions.
         """
-        entries = self.constraints.entries if self.constraints else ()
-        inverse = self.rattle.inverse_masses if self.rattle else ()
-        indices = {pair: n for n, (i, j) in enumerate(inverse) for pair in ((i, j), (j, i))}
-        places = [(self.constraint_positions[k], i) for k, i in entries]
+        indices = {pair: n for n, (i, j) in enumerate(self.rattle.inverse_masses) for pair in ((i, j), (j, i))}
+        places = [(self.constraint_positions[k], i) for k, i in self.constraints.entries]
         return tuple(
             (e, f, row, row - column, indices[i, j])
             for e, (row, i) in enumerate(places)
@@ -392,7 +385,7 @@ class Program:
     @property
     def mass_reach(self) -> int:
         """Largest distance of coordinates that a mass matrix of points couples, in the order of their positions."""
-        order, entries = self.equations.mass_positions, self.rattle.lower_masses if self.rattle else ()
+        order, entries = self.equations.mass_positions, self.rattle.lower_masses
         return max((abs(order[i] - order[j]) for i, j in entries), default=0)
 
     @property

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import sympy
-from sympy import Expr
+from sympy import Add, Expr
 
 from scvi_codegen.codegen.ir.program import HeatBath
 from scvi_codegen.codegen.lowering.stage_groups import system_kernel
@@ -29,15 +29,11 @@ def heat_bath_of(system: MechanicalSystem) -> HeatBath | None:
     bath, forms, v = system.bath, forms_of(system), system.velocities
     if bath is None:
         return None
-    masses = forms.legendre_jacobian or forms.mass
-    mass = {(i, j): entry for (i, j), entry in masses.items() if i >= j}
-    rayleigh = {(i, j): entry for (i, j), entry in hessian(bath.dissipation, v).items() if i >= j}
+    mass, rayleigh = map(_lower, (forms.legendre_jacobian or forms.mass, hessian(bath.dissipation, v)))
     friction = {place: bath.damping * entry for place, entry in mass.items() if bath.damping != 0}
     friction |= {place: friction.get(place, sympy.S.Zero) + entry for place, entry in rayleigh.items()}
-    normals = dict(jacobian(system.constraints, system.coordinates))
-    for row, member in enumerate(system.rotations, len(system.constraints)):
-        lengths = map(symbol, member.coordinates)
-        normals |= {(row, system.coordinates.index(q)): q for q in lengths}
+    lengths = [Add(*(symbol(q) ** 2 for q in member.coordinates)) / 2 for member in system.rotations]
+    normals = jacobian((*system.constraints, *lengths), system.coordinates)
     first: dict[int, int] = {}
     rows = [(first.setdefault(row, i), i) for row, i in normals]
     blocks = coupled_blocks(dict.fromkeys([*mass, *friction, *rows], sympy.S.One), system.dimension)
@@ -51,10 +47,10 @@ def heat_bath_of(system: MechanicalSystem) -> HeatBath | None:
     terms = (bath.temperature, *momenta, *mass.values(), *friction.values(), *normals.values(), *bath.noise)
     block_of = {i: (b, k) for b, block in enumerate(blocks) for k, i in enumerate(block)}
     entries = {
-        "BATH_MASS": [(*block_of[i], block_of[j][1]) for i, j in mass],
-        "BATH_FRICTION": [(*block_of[i], block_of[j][1]) for i, j in friction],
-        "BATH_NORMAL": [(block_of[i][0], row, block_of[i][1]) for row, i in normals],
+        name: [(*block_of[i], block_of[j][1]) for i, j in matrix]
+        for name, matrix in (("BATH_MASS", mass), ("BATH_FRICTION", friction))
     }
+    entries["BATH_NORMAL"] = [(block_of[i][0], row, block_of[i][1]) for row, i in normals]
     return HeatBath(
         temperature=system.text_of(bath.temperature),
         friction=_friction_of(system, bath, rayleigh),
@@ -63,13 +59,18 @@ def heat_bath_of(system: MechanicalSystem) -> HeatBath | None:
         blocks=tuple(map(tuple, blocks)),
         sizes={
             **{f"{name}_ENTRIES": len(places) for name, places in entries.items()},
-            "NORMAL_ROWS": 1 + max((row for row, _ in normals), default=-1),
+            "NORMAL_ROWS": len(system.constraints) + len(lengths),
             "STRENGTHS": len(bath.noise),
             "BATH_FACTORS": sum(len(block) ** 2 for block in blocks),
             "BATH_TERMS": len(terms),
         },
         entries={name: tuple(places) or ((0, 0, 0),) for name, places in entries.items()},
     )
+
+
+def _lower(matrix: Mapping[tuple[int, int], Expr]) -> dict[tuple[int, int], Expr]:
+    """Return the entries of the lower triangle."""
+    return {(i, j): entry for (i, j), entry in matrix.items() if i >= j}
 
 
 def _friction_of(

@@ -40,7 +40,14 @@ from typing import Any, TypeAlias
 from sympy import Symbol
 from sympy.utilities.iterables import connected_components
 
-from scvi_codegen.codegen.ir.equations import ConstrainedSteps, Constraints, IterationTable, Rattle
+from scvi_codegen.codegen.ir.equations import (
+    NO_CONSTRAINTS,
+    NO_RATTLE,
+    ConstrainedSteps,
+    Constraints,
+    IterationTable,
+    Rattle,
+)
 from scvi_codegen.codegen.ir.kernel import Kernel, NumberTable, RolledKernel, lower_matrix, lower_vector
 from scvi_codegen.codegen.lowering.solvers.tables import VelocityTables, velocity_tables
 from scvi_codegen.codegen.lowering.stage_groups import rolled_kernel, system_kernel
@@ -74,16 +81,18 @@ MOST_COUPLED_MASSES = 48
 """Coordinates that masses couple; with more, whose M^-1 exceeds the cache, Newton's method solves for all unknowns."""
 
 
-def rattle_of(system: MechanicalSystem, stages: StageSystem, predictor: NumberTable) -> Rattle | None:
-    """Return the iteration for multipliers with (2 (s + 1), s + 1) tables as predictor; ``None`` if not applicable."""
+def rattle_of(system: MechanicalSystem, stages: StageSystem, predictor: NumberTable) -> Rattle:
+    """Return the iteration for multipliers with (2 (s + 1), s + 1) tables as predictor; false if not applicable."""
+    if not system.constraints or system.reactions:
+        return NO_RATTLE
     forms, tables = forms_of(system), velocity_tables(stages.shape)
-    if system.reactions or any(velocity_conditions(system)) or tables is None or not forms.has_quadratic_energy:
-        return None
+    if any(velocity_conditions(system)) or tables is None or not forms.has_quadratic_energy:
+        return NO_RATTLE
     if forms.regular_legendre is not forms.legendre:  # massless coordinates: M has no inverse
-        return None
+        return NO_RATTLE
     groups = connected_components((range(system.dimension), list(forms.lower_mass)))  # that masses couple
     if max(map(len, groups)) > MOST_COUPLED_MASSES:
-        return None
+        return NO_RATTLE
     points = len(tables.blocks)
     velocities = tuple(row[:-1] for row in predictor[: points + 1])
     added = _for_constant_masses if forms.has_constant_mass_matrix else _for_masses_of_points
@@ -244,7 +253,8 @@ def _kernels(system: ArraySystem) -> Iterator[tuple[RolledKernel, RolledKernel]]
 
 def lowered_constraints(system: MechanicalSystem) -> Constraints:
     """Return the kernels of the constraints of a system."""
-    assert isinstance(system, LagrangianSystem)  # others have no constraints
+    if not isinstance(system, LagrangianSystem) or not system.constraints:
+        return NO_CONSTRAINTS
     partials, rates = constraint_jacobian(system), constraint_rates(system)
     regular = replace(system, lagrangian=system.lagrangian + system.gauge) if system.gauge != 0 else system
     return Constraints(

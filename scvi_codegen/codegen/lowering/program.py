@@ -12,7 +12,7 @@ from typing import Any
 
 import sympy
 
-from scvi_codegen.codegen.ir.equations import FixedPointIteration, Splitting
+from scvi_codegen.codegen.ir.equations import NO_RATTLE, FixedPointIteration, Splitting
 from scvi_codegen.codegen.ir.kernel import Kernel, lower_matrix, lower_vector
 from scvi_codegen.codegen.ir.program import (
     FEW_UNKNOWNS,
@@ -217,8 +217,8 @@ def lower(
         polynomial_curves=polynomial,
         equations=equations,
         quantities=_quantities(system, method, stages, symmetries, in_lanes=in_lanes),
-        constraints=lowered_constraints(system) if system.constraints else None,
-        rattle=rattle_of(system, stages, equations.extrapolation) if system.constraints and solver == "auto" else None,
+        constraints=lowered_constraints(system),
+        rattle=rattle_of(system, stages, equations.extrapolation) if solver == "auto" else NO_RATTLE,
         damping=damping_kernel(system),
         mass_growth=_mass_growth(system, stages),
         has_unseen_growth=isinstance(stages.shape, Accelerations | ShotCurve | PrintedCurve)

@@ -163,7 +163,7 @@ def _declared(text: Sequence[str], macros: Mapping[str, Macro]) -> Iterator[str]
         yield from text[2:3] if macro.parameters[:1] == ("name",) else ()
         return
     text = [*_without_attributes([*macro.body, *text])]
-    end = min((text.index(token) for token in "{=" if token in text), default=len(text))
+    end = _first_of("{=", text)
     head = text[:end]
     if head[0] == "enum":
         yield from (name for before, name in pairwise(text[end:]) if before in "{," and is_name(name))
@@ -184,8 +184,12 @@ def _declared(text: Sequence[str], macros: Mapping[str, Macro]) -> Iterator[str]
 
 def _name(head: Sequence[str]) -> str:
     """Return the name of a function or variable: the last one before its arguments or size."""
-    end = min((head.index(token) for token in ("(", "[", ";") if token in head), default=len(head))
-    return head[end - 1]
+    return head[_first_of("([;", head) - 1]
+
+
+def _first_of(marks: str, text: Sequence[str]) -> int:
+    """Return the place of the first of some tokens; the end if there is none."""
+    return next((place for place, token in enumerate(text) if token in marks), len(text))
 
 
 def _declarators(text: Sequence[str]) -> Iterator[str]:

@@ -21,10 +21,10 @@ involve.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from itertools import accumulate
+from itertools import accumulate, chain
 from typing import Any, Protocol, TypeAlias, cast
 
 import numpy as np
@@ -130,19 +130,7 @@ class EventFormulas:
         taken = {*self.q, *self.v, symbol(TIME), *self.parameters}
         self.p = [sympy.Dummy() if symbol(name) in taken else symbol(name) for name in interface.momenta]
         self.multipliers = [symbol(name) for name in multiplier_names(interface) if symbol(name) not in taken]
-        self.functions = [self._read(event.function, f"event function '{event.function}'") for event in self.events]
-        pairs = [*zip(self.events, self.functions, strict=True)]
-        sides = {u: symbol(event.mode) for event, u in pairs if isinstance(event, Kink)}
-        for k, (event, function) in enumerate(pairs):
-            if isinstance(event, Transition):  # with coefficients of the mode of a step
-                steps = parts_of_type(unit_step, function)
-                self.functions[k] = function.xreplace(steps_on_sides(steps, sides))
-            elif isinstance(event, Kink):
-                self.functions[k] += self._read(event.held, f"masks of '{event.function}'")
-            if interface.variables and event.restitution is not None:
-                raise EventError(f"'{interface.system}' is a first-order system without impacts: write them in then=")
-            moving = sorted(free.name for free in function.free_symbols & {*self.p, *self.v, *self.multipliers})
-            event.check_function(moving, constant=not function.free_symbols)
+        self.functions = [*self._functions()]
         self.guards = [
             (number, self._read(condition, f"condition where='{condition}'"))
             for number, event in enumerate(self.events)
@@ -156,6 +144,24 @@ class EventFormulas:
                 f"'{interface.energy_parameter}': compile the original system with time_transformation=.., or use "
                 "adaptive steps (t_end)"
             )
+
+    def _functions(self) -> Iterator[Expr]:
+        """Yield g of each event, with coefficients of the mode of a step for transitions, and with masks for kinks."""
+        functions = [self._read(event.function, f"event function '{event.function}'") for event in self.events]
+        pairs = [*zip(self.events, functions, strict=True)]
+        sides = {u: symbol(event.mode) for event, u in pairs if isinstance(event, Kink)}
+        for event, function in pairs:
+            if self.interface.variables and event.restitution is not None:
+                name = self.interface.system
+                raise EventError(f"'{name}' is a first-order system without impacts: write them in then=")
+            moving = sorted(free.name for free in function.free_symbols & {*self.p, *self.v, *self.multipliers})
+            event.check_function(moving, constant=not function.free_symbols)
+            if isinstance(event, Transition):
+                yield function.xreplace(steps_on_sides(parts_of_type(unit_step, function), sides))
+            elif isinstance(event, Kink):
+                yield function + self._read(event.held, f"masks of '{event.function}'")
+            else:
+                yield function
 
     @property
     def arguments(self) -> tuple[Symbol, ...]:
@@ -218,16 +224,15 @@ class EventFormulas:
             for name, value in event.changes
         }
         self._set_rates_of_rotations(new)
-        indices = [named.get(name, -1) for name in new]
-        for index, (name, value) in zip(indices, new.items(), strict=True):
-            if index < 0:
-                rotations = self._turning.rotations
-                names = [str(rate) for rotation in rotations for rate in (*rotation.rates, *rotation.momenta)]
-                names += [*named, *(name for name in self.interface.own_parameters if name not in named)]
-                raise EventError(
-                    f"then={{'{name}': '{value}'}} of the event '{event.function}': '{name}' is not a coordinate, a "
-                    f"momentum, a velocity or a parameter{closest(name, names)} An event can set: {', '.join(names)}"
-                )
+        if unknown := [name for name in new if name not in named]:
+            name, rotations = unknown[0], self._turning.rotations
+            rates = chain(*((*rotation.rates, *rotation.momenta) for rotation in rotations))
+            names = [*dict.fromkeys((*map(str, rates), *named, *self.interface.own_parameters))]
+            raise EventError(
+                f"then={{'{name}': '{new[name]}'}} of the event '{event.function}': '{name}' is not a coordinate, a "
+                f"momentum, a velocity or a parameter{closest(name, names)} An event can set: {', '.join(names)}"
+            )
+        indices = [*map(named.__getitem__, new)]
         if {min(index // len(self.q), 3) for index in indices} >= {1, 2}:
             raise EventError(f"the event '{event.function}' sets momenta and velocities: set one or the other")
         return indices, [*new.values()]
@@ -360,24 +365,26 @@ def _formula_part(interface: Interface, events: Sequence[SearchedEvent]) -> dict
     timed = [0 if interface.in_tau else _kind_in_time(g, formulas.arguments) for g in formulas.functions]
     bounds = [
         reaches(g, symbol(TIME), formulas.q[0]) if kind else (sympy.S.Zero,) * 3
-        for g, kind in zip(formulas.functions, timed, strict=True)
+        for g, kind in zip(formulas.functions if any(timed) else (), timed, strict=False)
     ]
-    of_kernel = {
+    indices, values = [*zip(*formulas.changes, strict=True)] or ((), ())
+    guarded, guards = [*zip(*formulas.guards, strict=True)] or ((), ())
+    of_kernel: dict[str, list[Expr]] = {
         "event_functions": formulas.functions,
-        "event_guards": [guard for _, guard in formulas.guards],
-        "event_changes": [value for _, values in formulas.changes for value in values],
-        "event_reaches": [bound for pair in bounds for bound in pair] if any(timed) else [],
+        "event_guards": [*guards],
+        "event_changes": [*chain(*values)],
+        "event_reaches": [*chain(*bounds)],
     }
-    variables = {symbol for values in of_kernel.values() for value in values for symbol in value.free_symbols}
+    variables = set[Symbol]().union(*(value.free_symbols for value in chain(*of_kernel.values())))
     return {
         "elements": tuple(formulas.elements),
         "timed": tuple(timed[first] for first in (0, *accumulate(formulas.elements[:-1]))),
-        "guarded": tuple(number for number, _ in formulas.guards),
+        "guarded": guarded,
         "kernels": tuple(formulas.kernel(name, values) for name, values in of_kernel.items() if values),
         "uses_velocity": not variables.isdisjoint(formulas.v),
         "multipliers": 0 if variables.isdisjoint(formulas.multipliers) else len(formulas.multipliers),
-        "changed": tuple(index for indices, _ in formulas.changes for index in indices),
-        "first_values": (0, *accumulate(len(values) for _, values in formulas.changes)),
+        "changed": tuple(chain(*indices)),
+        "first_values": (0, *accumulate(map(len, values))),
         "parameters": len(interface.parameters),
         "modes": tuple(map(interface.parameters.index, formulas.modes)),
         "contacts": tuple(_places(formulas.modes, contact) for contact in interface.contacts),

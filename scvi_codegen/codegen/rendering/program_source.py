@@ -417,17 +417,17 @@ def _render_mixed_newton(program: Program, correction: PointDerivatives | None, 
         *(quantities.energy, quantities.inverse_legendre, quantities.momentum_kernel),
         *(quantities.first_order_rates, program.damping),
         quantities.integrals and quantities.integrals.kernel,
-        constraints and constraints.motion,
+        constraints.motion,
     )
-    with_partials = quantities.legendre, constraints and constraints.kernel
+    with_partials = quantities.legendre, constraints.kernel
     kernels = (
         *(kernel for kernel in of_states if kernel),
         *(replace(kernel, values=len(kernel.results)) for kernel in with_partials if kernel),
     )
     rattle, vectors = program.rattle, tuple[Kernel, ...]()
     plain = not (program.damping or quantities.integrals)
-    of_forces = rattle and rattle.part == "rattle" and not rattle.macros  # of constant masses and forces of positions
-    if rattle and constraints and rattle.points > 1 and plain and of_forces:
+    of_forces = rattle.part == "rattle" and not rattle.macros  # of constant masses and forces of positions
+    if rattle.points > 1 and plain and of_forces:
         kernels = *kernels, *rattle.kernels
         of_points = *rattle.kernels, replace(constraints.kernel, values=len(constraints.kernel.results))
         vectors = tuple(replace(kernel, name=f"{kernel.name}_of_points") for kernel in of_points)
@@ -512,14 +512,14 @@ def _contents_of_step(context: Mapping[str, Any]) -> dict[str, Any]:
     shooting = program.fixed_point is not None and SHOOTING in program.fixed_point.parts
     return {
         "rolled": not (by_newton or shooting),
-        "points_in_loops": program.rattle is not None,
+        "points_in_loops": bool(program.rattle),
         "sizes": Sizes(
             coordinates=program.dimension,
             parameters=len(program.layout.parameters),
             unknowns=program.equations.unknowns,
             workspace=context["workspace"],
             maps=len(program.momentum_maps),
-            constraints=program.constraints.count if program.constraints else 0,
+            constraints=program.constraints.count,
             sums=program.sums,
         ),
     }
@@ -579,24 +579,23 @@ def render_ensemble(
         precision: of the lanes.
     """
     fixed_point, split, headers = program.fixed_point, program.splitting, dict[str, str]()
-    bath, target = program.bath, TARGETS[precision]
+    bath, target, of_observer = program.bath, TARGETS[precision], (observed,) if observed else ()
     if program.quantities.integrals or (bath and bath.sizes["BATH_FACTORS"] > LARGEST_BATH_IN_LANES):
         return None
     if split is not None:
         kernels, points, source = split.kernels, 1, splitting_source(split, observed, target)
         headers = _leap(split, lanes=True, action=program.acts_along)
-    elif program.rattle and program.constraints and not program.damping:
+    elif program.rattle and not program.damping:
         kernels, points = program.rattle.kernels, program.rattle.points + 1
         source = constrained_source(program.rattle, program.constraints)
     elif fixed_point is not None and fixed_point.serves_many:
         kernels, points = fixed_point.kernels, len(fixed_point.guess.abscissae)
-        of_steps = *kernels, *((observed,) if observed else ())
-        source = iteration_source(fixed_point, TRAJECTORIES, kernels=of_steps, number=target)
+        source = iteration_source(fixed_point, TRAJECTORIES, kernels=(*kernels, *of_observer), number=target)
     else:
         return None
     if precision == "single":
         target.check(chain.from_iterable(map(constants, source.kernels)))
-    prefix, by_masses = f"{program.prefix}_ensemble", bool(program.rattle and program.rattle.lower_masses)
+    prefix, by_masses = f"{program.prefix}_ensemble", bool(program.rattle.lower_masses)
     velocities = by_masses or (fixed_point is not None and fixed_point.kept is StoredValues.VELOCITIES)
     quantities = program.quantities
     between = bath.kernel if bath else None, quantities.legendre, quantities.inverse_legendre, quantities.energy
@@ -609,7 +608,7 @@ def render_ensemble(
         "observed": observed.values if observed else 0,
         "counts": counts,
         "tangents": tangents,
-        "cut": is_divided((*kernels, *((observed,) if observed else ()))),
+        "cut": is_divided((*kernels, *of_observer)),
         "diagonal_masses": _diagonal_masses(program),
         "metropolis": bool(bath and split and not any(bath.kernel.formulas[1 : 1 + program.dimension])),  # L is even
         "needs_velocities": velocities and not bath,
@@ -740,8 +739,8 @@ def _diagonal_masses(program: Program) -> Literal["exact", "rounded"] | None:
 
 def _kernels_of_points(program: Program) -> tuple[Kernel, ...]:
     """Return the kernels that are evaluated in loops over the points of a constrained step."""
-    rattle, constraints = program.rattle, program.constraints
-    return (*rattle.kernels, constraints.kernel) if rattle and constraints and rattle.lanes > 1 else ()
+    rattle = program.rattle
+    return (*rattle.kernels, program.constraints.kernel) if rattle.points > 1 else ()
 
 
 def _scalar_kernels(

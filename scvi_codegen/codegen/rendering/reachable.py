@@ -114,22 +114,20 @@ def readable(code: str) -> dict[str, str]:
 
 def _without_aliases(code: str) -> str:
     """Return a source with other names in place of macros that are nothing else, and arguments of those that are it."""
-    mentions, names = Counter[str](), dict[str, str]()
+    mentions = Counter[str]()
     for line in code.split("\n"):
         if line.startswith("#"):
             _, word, *rest = tokens(line)
             mentions.update({*rest[:1]} if word == "define" else {*rest})
     commented = {name for name, line in definitions(code) if line.endswith("*/")}
-    for name, macro in macros_of(code).items():
-        if (
-            mentions[name] == 1
-            and macro.parameters is None
-            and name not in commented
-            and macro.body
-            and all(map(str.isidentifier, macro.body))
-        ):
-            names[name] = " ".join(macro.body)
-        elif mentions[name] == 1 and macro.parameters == macro.body:
+    once = {name: macro for name, macro in macros_of(code).items() if mentions[name] == 1}
+    names = {
+        name: " ".join(macro.body)
+        for name, macro in once.items()
+        if macro.parameters is None and name not in commented and macro.body and all(map(str.isidentifier, macro.body))
+    }
+    for name, macro in once.items():
+        if macro.parameters == macro.body:
             code = _without_calls(code, name)
 
     while named := [name for name, text in names.items() if any(word in names for word in text.split())]:

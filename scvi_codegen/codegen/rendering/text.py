@@ -1,11 +1,12 @@
 """Text of C: tables, statements, comments and prototypes in lines of at most 120 characters."""
 
 import re
+import sys
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-TOLERANCE = 2.0**-52
+TOLERANCE = sys.float_info.epsilon
 """Default relative update below which an iteration has converged: the round-off unit of binary64."""
 
 MAX_ITERATIONS = 50

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum, auto
+from itertools import chain
 
 from scvi_codegen.codegen.statements.arithmetic import Value, combine, high_word, negated
 from scvi_codegen.common.errors import MethodError
@@ -188,7 +189,7 @@ class Printer:
     def _place(self, blocks: Sequence[Sequence[Statement]], summed: Collection[str]) -> None:
         """Find places and words of the local quantities; a block is the body of a loop over points."""
         loops = [list(_loops(block)) for block in blocks]
-        for statement in (statement for block in loops for loop in block for statement in loop):
+        for statement in chain.from_iterable(chain.from_iterable(loops)):
             name, index = target_name(statement), statement.target.at if statement.target else None
             if name is None or index is None or name in self.quantities or name in self.locals:
                 continue

@@ -59,8 +59,7 @@ def _text(system: ArraySystem) -> Iterator[str]:
         yield f"  {system.constraint_text(term)}"
         pushed = system.derivatives(term, system.coordinates)
         yield from (f"    on {access}: lambda*({derivative})" for access, derivative in pushed)
-    energy = () if system.changes_energy else ("energy",)
-    conserved = (*energy, *(symmetry.name for symmetry in symmetries(system)))
+    conserved = [*["energy"] * (not system.changes_energy), *(symmetry.name for symmetry in symmetries(system))]
     yield f"Conserved: {', '.join(conserved) or 'nothing that is known'}"
 
 

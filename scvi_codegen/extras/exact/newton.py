@@ -21,6 +21,7 @@ MAX_NEWTON_ITERATIONS = 60
 STALE = 1e-3
 """Convergence factor of the updates above which the Jacobian is recomputed."""
 MIN_FRACTION = 1e-4
+"""Part of a Newton step below which damping has failed, after 13 halvings."""
 
 
 class NotConvergedError(ArithmeticError):

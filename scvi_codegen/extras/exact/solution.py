@@ -29,6 +29,7 @@ MAX_PROJECTIONS = 6
 """Number of Newton projections onto constraints; each doubles the correct digits of a state given in doubles."""
 MAX_COLUMNS, MAX_HALVINGS = 24, 12
 DIGITS = 45
+"""Digits to which equations are solved, of 60."""
 ACCURACY = mp.mpf(10) ** -DIGITS
 
 

@@ -23,10 +23,8 @@ from scvi_codegen.api.methods import Discretisation, Method, StageSystem
 from scvi_codegen.api.systems import MechanicalSystem
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.extras.exact.newton import NotConvergedError, Solve, newton
-from scvi_codegen.extras.exact.solution import Numbers, exact_motion, numbers
+from scvi_codegen.extras.exact.solution import DIGITS, Numbers, exact_motion, numbers
 
-DIGITS = 45
-"""Digits to which the equations are solved."""
 WIDTH = mp.mpf(10) ** -30
 """Relative width of the finite differences, which are correct to 30 digits."""
 REFINEMENTS = 4

@@ -370,20 +370,19 @@ class Assembly:
 
             return total(f"a{axis}", count, part) if cells.table else Add(*map(part, range(count)))
         system = self.system
-        for axis in [axis for axis in node if cells_of[axis].edge]:
+        within = [axis for axis in node if not cells_of[axis].edge]
+        for axis in [axis for axis in node if axis not in within]:
             term = self.at_jumps(axis, cells_of[axis], term)
         values = {symbol(u): self.combined(u, {}, cells_of, node) for u in self.names_in(term, system.variables)}
         for name in self.names_in(term, system.derivatives):
             field, orders = system.derivatives[name]
             values[symbol(name)] = self.derivative(field, orders, cells_of, node)
-        weights = [
-            self.quadrature_weight(axis, cells_of[axis], k) for axis, k in node.items() if not cells_of[axis].edge
-        ]
+        weights = [self.quadrature_weight(axis, cells_of[axis], node[axis]) for axis in within]
         jumps = self.system.jumps_in(term)
         inner = {
             symbol(axis): self.in_cells(axis, cells_of[axis], node[axis], inside=True)
-            for axis in node
-            if self.axes[axis].one_sided and not cells_of[axis].edge and any(self.names_in(f, [axis]) for f in jumps)
+            for axis in within
+            if self.axes[axis].one_sided and any(self.names_in(f, [axis]) for f in jumps)
         }
         term = term.xreplace({jump: jump.xreplace(inner) for jump in jumps}) if inner else term
         for axis in self.names_in(term, [*others, *node]):

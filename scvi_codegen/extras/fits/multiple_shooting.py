@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 
 from scvi_codegen.api.states import Array
 from scvi_codegen.common.errors import EventError, FitError, StepFailedError
+from scvi_codegen.extras.exact.newton import MIN_FRACTION
 from scvi_codegen.extras.fits.measurements import Measurements
 
 LOOSE, TIGHT = 0.1, 1e-9
 """Jumps, relative to the size of states, that weigh as much as a measurement residual: initially, and finally."""
 MOST = 100
 """Largest number of Gauss-Newton iterations."""
-LEAST_STEP_LENGTH = 1e-4
-"""Smallest step length of the line search."""
 ARMIJO = 1e-4
-"""Fraction of the predicted descent that a step must attain (Armijo condition)."""
+"""Fraction of the predicted descent that a step must attain (L. Armijo, Pac. J. Math. 16 (1966) 1; J. Nocedal,
+S. J. Wright, Numerical Optimization, 2006, 3.1)."""
 JOINED, SETTLED, ROUNDING_LEVEL = 1e-10, 1e-9, 1e-12
 """Convergence: largest jump, largest relative change of the residuals, and rounding level of the measurements."""
 NEAR = 1e-5
@@ -286,7 +286,7 @@ def _step_length(chain: Chain, x: Array, update: Array, weight: float) -> float:
     descent = residuals[:rows] @ jacobian[:rows] @ update - weight * np.abs(residuals[rows:]).sum()
     while not _merit(chain.residuals(x + part * update), rows, weight) <= before + ARMIJO * part * descent:
         part /= 2.0
-        if part < LEAST_STEP_LENGTH:
+        if part < MIN_FRACTION:
             raise FitError(
                 "the segments do not join, as no step reduces the residuals: give a better initial guess or more "
                 "segments, or treat poorly determined parameters as known"

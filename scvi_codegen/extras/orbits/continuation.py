@@ -38,10 +38,8 @@ from scvi_codegen.common.errors import EventError, OrbitError, StepFailedError
 from scvi_codegen.extras.orbits.equilibrium import Equilibrium
 from scvi_codegen.extras.orbits.solver import (
     CONSERVED,
-    DIFFERENCE_INCREMENT,
     EASY,
     ERROR,
-    SAME,
     TOLERANCES,
     ClosingEquations,
     OrbitSearch,
@@ -49,26 +47,25 @@ from scvi_codegen.extras.orbits.solver import (
     block_diagonal,
 )
 from scvi_codegen.extras.orbits.step_sequence import StepSequence
-from scvi_codegen.extras.paths.size import ROUNDOFF
+from scvi_codegen.extras.paths.size import INCREMENT, ROUNDOFF, SAME_MOTION
 
 MOST_CORRECTIONS, FEW_CORRECTIONS, CONTRACTION = 10, 4, 0.7
 """Newton iterations after which a prediction was too far, those up to which the next one may be farther, and the factor
 by which each must be shorter."""
 FIRST, GROWTH = 0.25, 1.5
 """First step relative to the largest one, and factor between steps."""
-SETTLED, STAGNANT = 1e-12, 1e-8
-"""Newton step in units of the motion below which an orbit is corrected, and one that may cease to decrease."""
+SETTLED = 1e-12
+"""Newton step in units of the motion below which an orbit is corrected. One whose square is rounding may cease to
+decrease, since Newton's method converges quadratically."""
 LARGEST_TURN = math.radians(30)
 """Angle between successive tangents above which the step is halved."""
 SMALLEST_STEP = 2.0**-12
 """Step along the family, relative to the largest one, below which the family ends."""
-NULL = 1e-7
-"""Singular values of the closing equations, relative to the largest one, that count as zero."""
 LOCATED = 1e-10
 """Accuracy of the location of a bifurcation between two orbits, relative to their distance."""
 BRANCHES = 1e-6
-"""Singular values of the closing equations below which another family crosses: between a bifurcation that is located to
-1e-10, where it is the error of the derivatives, 1e-9, and the next orbit, where it is the step."""
+"""Singular values of the closing equations that count as zero, so that another family crosses: between a bifurcation
+that is located to 1e-10, where it is the error of the derivatives, 1e-9, and the next orbit, where it is the step."""
 FLAT = 1e-6
 """Square of the change of period and parameter along a family below which they are stationary: that of the energy, in
 units of the motion, has the error 1e-9 of the orbit."""
@@ -196,13 +193,13 @@ class FamilyPoint:
         """Return a test function, or by how much the real index of a rank is beyond 1 or -1, -1 for complex ones."""
         if rank is None:
             return self.tests[kind]
-        real = np.abs(self.others.imag) <= SAME
+        real = np.abs(self.others.imag) <= SAME_MOTION
         return float(np.sort(np.where(real, BEYOND[kind] * self.others.real - 1.0, -1.0))[-1 - rank])
 
     def crossings(self, after: FamilyPoint) -> Iterator[tuple[str, int | None]]:
         """Yield kind and rank of the test functions that change their sign between this orbit and the next one."""
         changed = {kind for kind, value in self.tests.items() if value * after.tests.get(kind, value) < 0.0}
-        values = [point.others[np.abs(point.others.imag) > SAME] for point in (self, after)]  # complex ones
+        values = [point.others[np.abs(point.others.imag) > SAME_MOTION] for point in (self, after)]  # complex ones
         counts = {"Krein collision": {len(part) for part in values}}
         counts["torus"] = {int(np.count_nonzero(np.abs(part) > 1.0)) for part in values}
         changed -= {kind for kind, numbers in counts.items() if len(numbers) == 1}
@@ -251,7 +248,7 @@ class Continuation:
                 raise
             raise OrbitError(f"no orbit has this amplitude= beside the equilibrium; reduce it ({error})") from error
         sizes = np.linalg.svd(point.jacobian, compute_uv=False)
-        rank = int(np.count_nonzero(sizes > NULL * sizes[0]))
+        rank = int(np.count_nonzero(sizes > BRANCHES * sizes[0]))
         freedom = len(point.units) - rank - point.same.shape[1]
         if freedom != 1:
             raise OrbitError(self._freedom_message(freedom, point.orbit))
@@ -494,7 +491,7 @@ class Continuation:
                 jacobian = np.vstack([jacobian, columns * linear.units])
             change = np.linalg.pinv(jacobian, ERROR) @ defects
             length = float(np.linalg.norm(change))
-            if length <= SETTLED or (length <= STAGNANT and length > last / 2.0):
+            if length <= SETTLED or (length <= math.sqrt(ROUNDOFF) and length > last / 2.0):
                 return np.append(y[:size], y[-tail:]), count
             if not length < CONTRACTION * last:
                 break
@@ -557,7 +554,7 @@ class Continuation:
 
     def _energy_by_parameter(self, search: OrbitSearch, start: Array, shift: Array, parameter: int) -> float:
         """Return the derivative of the energy of a state, with its shift, by a parameter, by central differences."""
-        width = DIFFERENCE_INCREMENT * self.parameter_unit
+        width = INCREMENT * self.parameter_unit
         changed = np.repeat(search.parameters[np.newaxis], 2, axis=0)
         changed[:, parameter] += -width, width
         q, p = np.split(start + width * np.outer([-1.0, 1.0], shift), 2, axis=1)

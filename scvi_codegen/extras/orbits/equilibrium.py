@@ -21,8 +21,8 @@ from scvi_codegen.api.text import summary
 from scvi_codegen.common.errors import OrbitError, StateError, StepFailedError
 from scvi_codegen.extras.fits.fixed_steps import tangents_along
 from scvi_codegen.extras.orbits.constraint_manifold import reduction_of
-from scvi_codegen.extras.orbits.solver import MOST_ITERATIONS, SAME, SETTLED
-from scvi_codegen.extras.paths.size import ROUNDOFF
+from scvi_codegen.extras.orbits.solver import MOST_ITERATIONS, SETTLED
+from scvi_codegen.extras.paths.size import ROUNDOFF, SAME_MOTION
 from scvi_codegen.runs.stepper import Stepper
 
 LEAST_CHANGE = 0.1
@@ -62,7 +62,7 @@ class Equilibrium:
     @property
     def _oscillations(self) -> NDArray[np.bool_]:
         values, sizes = self.eigenvalues, np.abs(self.eigenvalues)
-        return np.asarray((values.imag > SAME * sizes.max()) & (np.abs(values.real) <= SAME * sizes))
+        return np.asarray((values.imag > SAME_MOTION * sizes.max()) & (np.abs(values.real) <= SAME_MOTION * sizes))
 
     @property
     def frequencies(self) -> Array:
@@ -77,7 +77,7 @@ class Equilibrium:
     @property
     def stable(self) -> bool:
         """Return whether no eigenvalue has a positive real part, up to rounding."""
-        return bool((self.eigenvalues.real <= SAME * np.abs(self.eigenvalues).max()).all())
+        return bool((self.eigenvalues.real <= SAME_MOTION * np.abs(self.eigenvalues).max()).all())
 
 
 @checks_arguments(StateError, stepper=Stepper.KIND)
@@ -114,12 +114,12 @@ def equilibrium(stepper: Stepper, q: ArrayLike, *, t: float = 0.0, parameters: P
         force = np.abs(balanced @ (change / units) + defect / units).max()  # in directions in which the system is free
         largest = max(largest, np.abs(defect / units).max())
         sizes = np.abs(reduction.outward(*np.split(state, 2))) @ np.abs(state) / units
-        at_rest = force <= max(SAME * largest, Products.RESOLVED * ROUNDOFF * sizes.max())
+        at_rest = force <= max(SAME_MOTION * largest, Products.RESOLVED * ROUNDOFF * sizes.max())
         state = np.ravel(reduction.normalised(*np.split(state + reduction.inward(*np.split(state, 2)) @ change, 2)))
         # The derivative of the step, which the change of the state hardly changes, gives the scale of a small change.
         strength = np.abs(factors - 1).max()
         begun = begun or strength
-        converged = np.abs(np.sort(factors) - np.sort(former)).max() <= SAME * strength
+        converged = np.abs(np.sort(factors) - np.sort(former)).max() <= SAME_MOTION * strength
         if converged and at_rest and strength >= FLAT * begun:
             stepper.products.check_sides(np.array([guess, state]), (t, t), motion.h, values)
             return motion.at_rest(state)

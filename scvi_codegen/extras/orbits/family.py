@@ -32,7 +32,6 @@ from scvi_codegen.extras.orbits.continuation import Continuation, FamilyPoint, F
 from scvi_codegen.extras.orbits.equilibrium import Equilibrium
 from scvi_codegen.extras.orbits.reversor import Reversor
 from scvi_codegen.extras.orbits.solver import (
-    SAME,
     ErrorsOfOrbit,
     OrbitSearch,
     PeriodicOrbit,
@@ -42,6 +41,7 @@ from scvi_codegen.extras.orbits.solver import (
     indices_of,
 )
 from scvi_codegen.extras.orbits.step_sequence import StepSequence
+from scvi_codegen.extras.paths.size import SAME_MOTION
 from scvi_codegen.runs.stepper import Stepper
 
 OTHERS = ("stepper", "sequence", "options", "errors")
@@ -257,7 +257,7 @@ class Family:
             first, last, *others = (
                 replace(continuation, search=own).corrected(*point) for own, point in zip(searches, points, strict=True)
             )
-            same = np.abs(first.y - points[0, 0]).max() <= SAME * np.abs(first.y).max()
+            same = np.abs(first.y - points[0, 0]).max() <= SAME_MOTION * np.abs(first.y).max()
         except OrbitError:
             same = False
         if not same:

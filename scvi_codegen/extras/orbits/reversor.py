@@ -18,10 +18,8 @@ import numpy as np
 from scvi_codegen.api.formulas import Tape, mp, parse_expression, symbol
 from scvi_codegen.api.states import Array
 from scvi_codegen.common.errors import ScviCodegenError, StateError
+from scvi_codegen.extras.paths.size import SAME_MOTION
 
-AT_ZERO = 1e-6
-"""Positions and momenta, relative to the largest ones, below which they are those of a crossing of the fixed set, by
-the digits of printed states. A candidate too many costs a trial only: steps verify each."""
 MOST_CANDIDATES = 256
 
 
@@ -54,8 +52,11 @@ class Reversor:
 
     @classmethod
     def fitting(cls, state: Array) -> Iterator[Reversor]:
-        """Yield changes of signs of coordinates that leave a state where it is, those of few coordinates first."""
-        q, p = (np.abs(part) <= AT_ZERO * np.abs(part).max() for part in np.split(state, 2))
+        """Yield changes of signs of coordinates that leave a state where it is, those of few coordinates first.
+
+        A candidate too many costs a trial only: steps verify each.
+        """
+        q, p = (np.abs(part) <= SAME_MOTION * np.abs(part).max() for part in np.split(state, 2))
         signs = [[1.0] * at_rest + [-1.0] * at_zero for at_zero, at_rest in zip(q.tolist(), p.tolist(), strict=True)]
         for choice in sorted(islice(product(*signs), MOST_CANDIDATES), key=sum, reverse=True):
             yield cls(np.diag(choice), np.zeros(len(choice)))

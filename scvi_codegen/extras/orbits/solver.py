@@ -49,14 +49,10 @@ from scvi_codegen.extras.fits.measurements import state_names
 from scvi_codegen.extras.orbits.constraint_manifold import reduction_of
 from scvi_codegen.extras.orbits.reversor import Reversor
 from scvi_codegen.extras.orbits.step_sequence import StepSequence
-from scvi_codegen.extras.paths.size import ROUNDOFF, SizeOfMotion
+from scvi_codegen.extras.paths.size import INCREMENT, ROUNDOFF, SAME_MOTION, SizeOfMotion
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.trajectory import Trajectory
 
-SAME = 1e-6
-"""Relative difference below which states, motions and eigenvalues are the same: rounding errors of monodromy matrices
-move double eigenvalues, stability indices of 1, by so much, and equilibria move less over a period, relative to their
-distance from the guess."""
 ERROR, ERROR_OF_EQUAL_STEPS = 1e-9, 1e-6
 """Default bounds of the discretisation error, of adaptive steps and of those that the user chose. The first also bounds
 defects of symplecticity and reversal, and singular values that count as zero: defects of symmetric steps are 1e-16 to
@@ -146,7 +142,7 @@ class PeriodicOrbit:
         Raises:
             MethodError: if the stepper has no finer method (it was loaded without its system).
         """
-        finer = self.stepper.products.finer.with_events(self.stepper.events if self.stepper.changes_states else ())
+        finer = self.stepper.products.finer.with_events(self.stepper.changing_events)
         rest: dict[str, Any] = {"sequence": self.sequence, "fixed_indices": (), "energy": None, "options": self.options}
         exact = np.concatenate([self.q, self.p, [self.period]]) - np.nan_to_num(self.errors.signed)
         z, none = exact[:-1], np.zeros(len(self.q))
@@ -238,9 +234,9 @@ class PeriodicOrbit:
     def stable(self) -> bool:
         """Return whether no multiplier exceeds 1 in modulus, up to rounding."""
         if self.symplectic_error > ERROR:
-            return bool(np.abs(self.multipliers).max() <= 1.0 + SAME)
+            return bool(np.abs(self.multipliers).max() <= 1.0 + SAME_MOTION)
         indices = self.stability_indices
-        return bool((np.abs(indices.real) <= 1.0 + SAME).all() and (np.abs(indices.imag) <= SAME).all())
+        return bool((np.abs(indices.real) <= 1.0 + SAME_MOTION).all() and (np.abs(indices.imag) <= SAME_MOTION).all())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -307,9 +303,6 @@ IMPLIED = 10.0
 """Least strength of conserved directions relative to the closing error: equations are then implied up to a tenth."""
 CONSERVED = 1e-3
 """Relative error of the transported gradient of an integral up to which the integral counts as conserved."""
-DIFFERENCE_INCREMENT = 1e-6
-"""Increment of the finite differences of integrals, relative to the size of the motion, or of the flow, relative to
-the period."""
 SETTLED = 1e-13
 """Newton step, relative to the motion and the period, below which the iteration ends."""
 MOST_INCREASE = 10.0
@@ -662,7 +655,7 @@ class OrbitSearch:
             sizes.reshape(2, m).max(axis=1) for sizes in (np.ptp(motion.states, axis=0), abs(z - guess)[:-1])
         )
         rounding = Products.RESOLVED * ROUNDOFF * np.abs(z[:m]).max()
-        at_rest = (ranges < SAME * distances).any() and not self.gain.any()  # momenta may be constant
+        at_rest = (ranges < SAME_MOTION * distances).any() and not self.gain.any()  # momenta may be constant
         if at_rest or ranges[0] <= rounding:
             raise OrbitError(
                 f"the iteration converged to an equilibrium, q = {_listed(z[:m])}, p = {_listed(z[m:-1])}: fix an "
@@ -1041,7 +1034,9 @@ class OrbitSearch:
         up to O(e^2/s), where s is small next to motions along a symmetry (grad H = w grad L of a conical pendulum).
         """
         conserved_masks, units = [], self.reduced_sizes(sizes)
-        accepted = CONSERVED if self.stepper.interface.conserves_energy else SAME  # weak damping is no conservation
+        accepted = (
+            CONSERVED if self.stepper.interface.conserves_energy else SAME_MOTION
+        )  # weak damping is no conservation
         times = [segment.start_time for segment in segments]
         gradients = [self.integral_gradients(*at, sizes) for at in zip(starts, times, strict=True)]
         begins = [gradient @ part.inward * units for gradient, part in zip(gradients, segments, strict=True)]
@@ -1070,7 +1065,7 @@ class OrbitSearch:
         motion.
         """
         size = len(state)
-        for widths in (DIFFERENCE_INCREMENT * sizes, sizes):
+        for widths in (INCREMENT * sizes, sizes):
             states = np.vstack([state + np.diag(widths), state - np.diag(widths)])
             values = self._integrals(states, np.full(2 * size, t))
             differences = values[:size] - values[size:]

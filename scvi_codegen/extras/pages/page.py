@@ -144,7 +144,7 @@ def sections_of(model: Model) -> Mapping[str, Any]:
     """Return the sections of a model file with the density, or with L or H as the system was read from."""
     if model.system.mesh is not None:
         return {"field": model.system.mesh.to_section()}
-    system = model.system.clock.plain if model.system.clock and model.system.clock.plain else model.system
+    system = model.system.in_time
     kind = "hamiltonian" if system.auxiliaries else "lagrangian"
     return {"system": {kind: system.definition.get(kind) or system.text_of(system.formula)}}
 
@@ -223,17 +223,17 @@ def _orbits(family: Family, *, from_momenta: bool) -> dict[str, Any]:
     _, kinds, orbits = zip(*sorted(places, key=lambda place: place[0]), strict=True)  # stable
     name, indices = indices_of(orbits)
 
-    def entry(kind: str, orbit: PeriodicOrbit, moduli: Any) -> dict[str, Any]:
+    def entry(kind: str, orbit: PeriodicOrbit, signed: Any) -> dict[str, Any]:
         q, p, names, parameters = orbit.q, orbit.p, orbit.stepper.parameters, orbit.parameters
         v = p if from_momenta else np.asarray(orbit.stepper.velocity(q, p, orbit.t, parameters))
         return {
             "q": q.tolist(), "p": p.tolist(), "v": v.tolist(), "value": family.value_of(orbit), "period": orbit.period,
             "energy": orbit.energy, "parameters": dict(zip(names, parameters.tolist(), strict=False)),
-            "sizes": moduli.tolist(), "stability": "stable" if orbit.stable else "unstable", "bifurcation": kind,
+            "indices": signed.tolist(), "stability": "stable" if orbit.stable else "unstable", "bifurcation": kind,
         }  # fmt: skip
 
-    entries = [*map(entry, kinds, orbits, np.abs(indices))]
-    return {"value": family.parameter or "energy", "sizes": f"|{name}|", "orbits": entries}
+    entries = [*map(entry, kinds, orbits, indices.real)]
+    return {"value": family.parameter or "energy", "indices": f"Real part of the {name}", "orbits": entries}
 
 
 def _check(model: Model, ranges: Mapping[str, tuple[float, float]]) -> None:
@@ -428,23 +428,14 @@ def _drawn_system(model: Model, interface: Interface) -> DrawnSystem:
 def _description(shown: Page, interface: Interface, *, initial: bool) -> dict[str, Any]:
     """Return what the scripts of the page read."""
     model, adaptive = shown.model, shown.adaptive
-    ranges = model.page.get("ranges", {})
     orbits = None if shown.family is None else _orbits(shown.family, from_momenta=starts_from_momenta(model))
     q, v = (orbits["orbits"][0][name] for name in "qv") if orbits else (_flat(model.q), _rates(model))
     system = _drawn_system(model, interface)
     shape = (shape_of_picture(system, model.picture) if model.picture else shape_of(system)).to_data()
     span = abs(float(model.end - model.t))
     speed = model.page.get("speed", 1.0 if 0.3 < span / SECONDS < 4 else float(f"{span / SECONDS:.0e}"))
-    limits = [2 * max([1.0, *map(abs, numbers)]) for numbers in (q, v)]
-    if len(shape["angles"]) == len(q):
-        limits = [math.pi, 12.0]
-    names = interface.coordinates or [""] * len(q)
-    rates = interface.momentum_names if starts_from_momenta(model) else [f"{name}_dot" for name in names]
-    sliders = {
-        kind: [ranges.get(name, [-limit, limit]) for name in names_of_kind]
-        for kind, names_of_kind, limit in zip("qv", (names, rates or names), limits, strict=True)
-    }
-    conserved = not interface.contacts and all(e.restitution == 1.0 for e in model.events if e.changes_state)
+    changes = {event.restitution for event in model.events if event.changes_state}
+    conserved = interface.conserves_energy and not interface.contacts and changes <= {1.0}
     variables = _variables(interface, shape, len(q))
     plots = [[_variable(name, variables) for name in reversed(pair)] for pair in model.page.get("plots", ())]
     return {
@@ -452,14 +443,28 @@ def _description(shown: Page, interface: Interface, *, initial: bool) -> dict[st
         "coordinates": interface.coordinates, "rotations": _rotations(interface),
         "momenta": interface.momentum_names, "parameters": _parameter_sliders(model, interface),
         "quantities": interface.map_names,
-        "energy": {"label": "Energy", "conserved": bool(interface.conserves_energy) and conserved}, "plots": plots,
+        "energy": {"label": "Energy", "conserved": bool(conserved)}, "plots": plots,
         "causes": CAUSES, "events": [str(event.function) for event in interface.searched(model.events)],
         "from_momenta": starts_from_momenta(model), "values": len(interface.parameters),
         "initial": initial, "whole": WHOLE, "family": orbits,
         "step": {"adaptive": adaptive or model.has_time_transformation, **_step_slider(model)},
         "speed": {"value": speed, "low": speed / 50, "high": speed * 20},
-        "ranges": sliders, "shape": shape,
+        "ranges": _start_sliders(model, interface, q, v, are_angles=len(shape["angles"]) == len(q)), "shape": shape,
     }  # fmt: skip
+
+
+def _start_sliders(
+    model: Model, interface: Interface, q: list[float], v: list[float], *, are_angles: bool
+) -> dict[str, Any]:
+    """Return the ranges of the sliders of the initial positions and of the velocities or momenta."""
+    ranges = model.page.get("ranges", {})
+    limits = [math.pi, 12.0] if are_angles else [2 * max([1.0, *map(abs, numbers)]) for numbers in (q, v)]
+    names = interface.coordinates or [""] * len(q)
+    rates = interface.momentum_names if starts_from_momenta(model) else [f"{name}_dot" for name in names]
+    return {
+        kind: [ranges.get(name, [-limit, limit]) for name in names_of_kind]
+        for kind, names_of_kind, limit in zip("qv", (names, rates or names), limits, strict=True)
+    }
 
 
 def _parameter_sliders(model: Model, interface: Interface) -> list[dict[str, Any]]:

@@ -297,9 +297,8 @@ def _step_checks(study: Study, curves: Sequence[ErrorCurve]) -> Iterator[Compari
     """Yield the checks over h: powers and constants of the legend, or that SVI falls faster if there is none."""
     for quantity in study.quantities:
         mine, printed = [c for c in curves if c.what == quantity], study.powers.get(quantity)
-        powers = [f"{c.law.base:.1f}" if c.law else "none" for c in mine]
         measured = ", ".join(
-            f"{power} ({c.scheme}, N = {c.n}, {c.case.title})" for power, c in zip(powers, mine, strict=True)
+            f"{f'{c.law.base:.1f}' if c.law else 'none'} ({c.scheme}, N = {c.n}, {c.case.title})" for c in mine
         )
         if printed is None:
             pairs = zip(mine[::2], mine[1::2], strict=True)
@@ -314,8 +313,8 @@ def _step_checks(study: Study, curves: Sequence[ErrorCurve]) -> Iterator[Compari
             f"Powers: {measured}. Missing: {', '.join(f'h^{power}' for power in missing) or 'none'}.",
             *(power not in missing for power in printed),
         )
-        both = [(law.constant, printed[round(law.base)]) for law in laws if round(law.base) in printed]
-        off = [max(a / b, b / a) for a, b in both]
+        parts = [law.constant / printed[round(law.base)] for law in laws if round(law.base) in printed]
+        off = [max(part, 1 / part) for part in parts]
         yield comparison(
             f"The lines run along the errors of {quantity}.",
             f"The constants of {len(off)} curves whose power is printed are off by factors of {min(off):.1f} to "

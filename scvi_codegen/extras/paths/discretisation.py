@@ -18,9 +18,11 @@ from scvi_codegen.api.runs import Products
 from scvi_codegen.api.states import Array
 from scvi_codegen.common.errors import MethodError, StepFailedError
 from scvi_codegen.extras.paths.intervals import Intervals
-from scvi_codegen.extras.paths.size import ROUNDOFF
+from scvi_codegen.extras.paths.size import INCREMENT, ROUNDOFF
 from scvi_codegen.extras.paths.solver import Solution
 
+NEGATIVE = 1e-4
+"""Least negative part of the largest mass that is no rounding."""
 ENERGY_OF_NO_MOTION = 0.5
 """Relative change of a conserved energy from node to node, from which a stationary point of
 the discrete action is no path of the system, as one that passes through an attractive singularity."""
@@ -110,19 +112,15 @@ def kinetic_energy_is_positive(intervals: Intervals, q: Array, p: Array) -> bool
     stepper: Any = intervals.stepper
     m = q.shape[1]
     for k in (0, len(q) // 2, len(q) - 1):
-        width = DIFFERENCE_INCREMENT * (float(np.abs(p).max()) or 1.0)
+        width = INCREMENT * (float(np.abs(p).max()) or 1.0)
         momenta = p[k] + width * np.vstack([np.eye(m), -np.eye(m)])
         t = float(intervals.t[0]) + k * float(intervals.h[0])
         at = np.tile(q[k], (2 * m, 1)), momenta, np.full(2 * m, t), intervals.parameters_at_start
         velocities = np.asarray(stepper.velocity(*at))
         inverse = (velocities[:m] - velocities[m:]) / (2.0 * width)
-        masses = np.array([intervals.tangent(k, row) for row in np.linalg.pinv(inverse, DIFFERENCE_INCREMENT)])
+        masses = np.array([intervals.tangent(k, row) for row in np.linalg.pinv(inverse, INCREMENT)])
         masses = np.array([intervals.tangent(k, row) for row in masses.T])
         values = np.linalg.eigvalsh((masses + masses.T) / 2.0)
         if values[0] < -NEGATIVE * np.abs(values).max():
             return False
     return True
-
-
-DIFFERENCE_INCREMENT, NEGATIVE = 1e-6, 1e-4
-"""Increment of momenta relative to the largest one, and least negative part of the largest mass that is no rounding."""

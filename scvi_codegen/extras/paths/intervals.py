@@ -17,12 +17,10 @@ import numpy as np
 from scvi_codegen.api.states import Array, Starts
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import PathError, StateError
-from scvi_codegen.extras.paths.size import size_for_updates
+from scvi_codegen.extras.paths.size import INCREMENT, size_for_updates
 
 CONVERGED, MOST_ITERATIONS = 1e-13, 20
 """Largest miss, relative to the range of the path, of a step that is solved by shooting, and most Newton iterations."""
-SMALL_PART = 1e-5
-"""Part of a step by which it is lengthened for its derivative."""
 PROBED = 1e-5
 """Derivatives below this part of the largest are not computed for many coordinates; they change the rate of Newton's
 iteration, not its result."""
@@ -367,10 +365,10 @@ class ReducedIntervals(Intervals):
         h = step["h"]
         (q_less, p_less), (q_more, p_more) = (
             self.stepper.step(q, p, options=self.options, **step | {"h": h * (1.0 + x)})
-            for x in (-SMALL_PART, SMALL_PART)
+            for x in (-INCREMENT, INCREMENT)
         )
         along, kicked = (
-            Z1.T @ (more - less) / (2.0 * SMALL_PART * h) for less, more in ((q_less, q_more), (p_less, p_more))
+            Z1.T @ (more - less) / (2.0 * INCREMENT * h) for less, more in ((q_less, q_more), (p_less, p_more))
         )
         return -Z0.T @ W @ inverse @ along, kicked - D @ inverse @ along
 

@@ -21,7 +21,7 @@ from scvi_codegen.extras.paths import solver
 from scvi_codegen.extras.paths.discretisation import Discretisation, discretisation_of, kinetic_energy_is_positive
 from scvi_codegen.extras.paths.equations import Band, condensed_hessian, hessian_blocks, negative_pivots
 from scvi_codegen.extras.paths.intervals import Intervals, ManyCoordinates, ReducedIntervals
-from scvi_codegen.extras.paths.size import SAME, largest_range, size_for_updates
+from scvi_codegen.extras.paths.size import SAME, SAME_MOTION, largest_range, size_for_updates
 from scvi_codegen.extras.paths.starts import curves_around, curves_at_random
 
 if TYPE_CHECKING:
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
 MANY_COORDINATES = 48
 """Number of coordinates from which derivatives are computed as sparse matrices."""
-RANDOM_STARTS, FEW_ITERATIONS, SAME_PATH, MOST_REVOLUTIONS = 10, 25, 1e-6, 10**6
-"""Number of starts at random and of their iterations, relative distance of equal paths, and most revolutions."""
+RANDOM_STARTS, MOST_REVOLUTIONS = 10, 10**6
+"""Number of starts at random, and most revolutions."""
 MOST_REPETITIONS = 1000
 """Longest period of a closed path in multiples of T."""
 TOLERABLE_ERROR = 1e-3
@@ -190,7 +190,7 @@ def path_of(
     h = np.full(count, duration / count)
     times = begin + np.arange(count) * h
     intervals = kind(stepper, times, h, _parameters_of_steps(stepper, parameters, inputs, times + h / 2.0), options)
-    arguments = {"parameters": parameters, "options": options, **({"inputs": inputs} if inputs is not None else {})}
+    arguments = {"parameters": parameters, "options": options, "inputs": inputs}
     nodes = _nodes_of_start(states, start, begin, duration, count)
     start_energy = None if energy is None else checked_number(energy, "energy")
     energies = partial(_energies_and_velocities, stepper, begin, intervals.parameters)
@@ -282,7 +282,7 @@ def different_paths(
             reason = reason or error
             continue
         distances = (np.abs(other.q - path.q).max() + abs(other.t[-1] - path.t[-1]) for other in paths)
-        if all(distance > SAME_PATH * size_for_updates(path.q, SAME_PATH) for distance in distances):
+        if all(distance > SAME_MOTION * size_for_updates(path.q, SAME_MOTION) for distance in distances):
             paths.append(path)
     if not paths:
         raise PathError(
@@ -414,7 +414,7 @@ def _checked(solution: solver.Solution) -> Discretisation:
 def _from(intervals: Intervals, start: Array) -> solver.Solution:
     """Return the path near a start, whose inner nodes are moved to the manifold."""
     start[1:-1] = intervals.on_manifold_all(start)[1:-1]
-    return solver.solved(intervals, start, FEW_ITERATIONS)
+    return solver.solved(intervals, start, solver.FEW_ITERATIONS)
 
 
 def _described(

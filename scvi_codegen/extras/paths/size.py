@@ -10,6 +10,13 @@ ROUNDOFF = float(np.finfo(float).eps) / 2.0
 """Largest relative rounding error of a number."""
 SAME = 1e-9
 """Relative difference, far above rounding, below which matrices of symmetries are equal and positions at rest."""
+SAME_MOTION = 1e-6
+"""Relative difference below which states, motions and eigenvalues are the same: rounding errors of monodromy matrices
+move double eigenvalues, stability indices of 1, by so much, and equilibria move less over a period, relative to their
+distance from the guess."""
+INCREMENT = float(np.cbrt(ROUNDOFF))
+"""Increment of central differences relative to the size of the motion or to a step: their truncation, its square, and
+their rounding, ROUNDOFF over it, are equal then."""
 UPDATE_ROUNDING = 4.0
 """Newton updates of so many roundings of the largest value cannot be reduced."""
 

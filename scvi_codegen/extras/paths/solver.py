@@ -16,28 +16,32 @@ import numpy as np
 from scvi_codegen.api.runs import Products
 from scvi_codegen.api.states import Array
 from scvi_codegen.common.errors import PathError, StateError, StepFailedError
+from scvi_codegen.extras.exact.newton import MIN_FRACTION
+from scvi_codegen.extras.fits.multiple_shooting import ARMIJO
 from scvi_codegen.extras.paths.equations import Bordered, BorderedClosed, Closed, closed_residual, factors_of
 from scvi_codegen.extras.paths.intervals import Intervals, Linearised
 from scvi_codegen.extras.paths.size import ROUNDOFF, SAME, SizeOfMotion, largest_range, size_for_updates
 
 TOLERANCE = 1e-11
 """Newton correction, relative to the range of the path, at which the iteration ends."""
-ROUNDING, ILL_CONDITIONED = 1e-14, 1e-7
-"""Residual, relative to the momenta, that is rounding, and the correction that then ends the iteration."""
+ROUNDING = 1e-14
+"""Residual, relative to the momenta, that is rounding; a correction below its root then ends the iteration, since what
+Newton's method leaves is of the order of its square."""
 GAUGED = 1.2
 """Ratio of momenta to those of velocities from which on the latter are their size."""
-MOST_ITERATIONS, LEAST_STEP = 60, 1e-4
-FIRST_PART, MOST_GROWTH, LEAST_GROWTH, CONTINUED_ITERATIONS = 16, 2.0, 1.005, 15
-"""Continuation: part of the duration it starts from, factors of the duration, and iterations of each."""
+MOST_ITERATIONS = 60
+FEW_ITERATIONS = 25
+"""Largest number of iterations from one of several starts, and of a part of a continuation."""
+FIRST_PART, MOST_GROWTH, LEAST_GROWTH = 16, 2.0, 1.005
+"""Continuation: part of the duration it starts from, and factors of the duration."""
 DURATIONS = 2.0 ** np.linspace(-3.0, 3.0, 25)
 """Parts of the duration in one of which a curve may be nearly a motion."""
 UNSOLVED = PathError, StepFailedError, StateError, ArithmeticError, np.linalg.LinAlgError
-MINIMISER_ITERATIONS, NEAR_CLOSED = 100, 0.01
-"""Iterations of the minimiser, and relative Newton correction below which a closed path is not minimised first."""
-FIRST_SHIFT, MOST_SHIFT, LEAST_SHIFT, MOST_DESCENTS = 1e-2, 1e3, 1e-10, 60
-"""Shifts of the Hessian relative to its largest entry, and most iterations of the descent."""
-LEAST_DECREASE, NEAR = 1e-4, 1e-3
-"""Part of the predicted decrease of the action that is required (Armijo), and the correction that ends the descent."""
+MINIMISER_ITERATIONS = 100
+NEAR = 0.01
+"""Newton correction, relative to the range of the path, below which Newton's method alone finds it: a descent ends."""
+FIRST_SHIFT, MOST_SHIFT = 1e-2, 1e3
+"""Shifts of the Hessian relative to its largest entry."""
 
 States = Callable[[Array, Array], tuple[Array, Array]]
 """Type of a function of (n, m) positions and momenta that returns (n,) energies and (n, m) velocities."""
@@ -110,7 +114,7 @@ def newton(
         if not np.isfinite(size):
             break
         rounding = float(np.abs(r).max(initial=0.0)) <= ROUNDING * float(np.abs(at.p0).max() + np.abs(at.p1).max())
-        if relative(q, correction) <= (ILL_CONDITIONED if rounding else TOLERANCE):
+        if relative(q, correction) <= (math.sqrt(ROUNDING) if rounding else TOLERANCE):
             return move(q, correction), at, factors, iteration
         damping = min(1.0, 2.0 * damping)
         while True:
@@ -120,7 +124,7 @@ def newton(
                 if simplified < (1.0 - damping / 4.0) * size:
                     break
             damping /= 2.0
-            if damping < LEAST_STEP:
+            if damping < MIN_FRACTION:
                 raise PathError("Newton's method made no progress")
         q = trial
     raise PathError(f"Newton's method did not converge in {most} iterations")
@@ -158,7 +162,7 @@ def continued(intervals: Intervals, q: Array, duration: float, first: float | No
         if abs(math.log(reached / duration)) > math.log(growth):
             trial = reached * growth ** math.copysign(1.0, math.log(duration / reached))
         try:
-            solution = solved(intervals.lasting(trial), solution.q, CONTINUED_ITERATIONS)
+            solution = solved(intervals.lasting(trial), solution.q, FEW_ITERATIONS)
             total, reached, growth = total + solution.iterations, trial, min(MOST_GROWTH, growth**1.5)
         except UNSOLVED as error:
             growth **= 0.5
@@ -190,10 +194,10 @@ def descended(intervals: Intervals, q: Array) -> Solution:
     at = intervals.linearised(q)
     scale = float(np.abs(at.blocks[3]).max())
     shift, iterations = FIRST_SHIFT, 0
-    while shift >= LEAST_SHIFT:
+    while True:
         iterations += 1
         factors = factors_of(at, intervals, shift * scale)
-        if iterations > MOST_DESCENTS or shift > MOST_SHIFT:
+        if iterations > MOST_ITERATIONS or shift > MOST_SHIFT:
             raise PathError("no minimum of the action was found")
         correction = -factors.solve(at.residual)
         decrease = float(np.sum(correction * at.residual))
@@ -202,7 +206,7 @@ def descended(intervals: Intervals, q: Array) -> Solution:
                 raise PathError("no direction of descent")
             trial = intervals.moved(q, correction)
             there = intervals.linearised(trial)
-            if not there.actions.sum() <= at.actions.sum() + LEAST_DECREASE * decrease:
+            if not there.actions.sum() <= at.actions.sum() + ARMIJO * decrease:
                 raise PathError("no decrease of the action")
         except UNSOLVED:
             shift *= 4.0
@@ -323,7 +327,7 @@ def closed(
         return _relative(intervals, whole(nodes), correction)
 
     at, r = evaluate(q, True)
-    if minimise and relative(q, factorise(at).solve(r)) >= NEAR_CLOSED:
+    if minimise and relative(q, factorise(at).solve(r)) >= NEAR:
         q = _minimised(evaluate, q)
     q, at, factors, iterations = newton(evaluate, factorise, moved, relative, q, MOST_ITERATIONS)
     if energy is not None:

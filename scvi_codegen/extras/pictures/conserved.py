@@ -10,7 +10,7 @@ import numpy as np
 
 from scvi_codegen.api.checks import Kind, checks_arguments
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.extras.pictures.canvas import MOTIONS, Array, Motions, color, panel, plain, several
+from scvi_codegen.extras.pictures.canvas import MOTIONS, Array, Motions, color, panel, plain, several, smooth
 from scvi_codegen.runs.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -55,8 +55,8 @@ LOWEST = 1e-16
 def plot_energy(trajectories: Motions, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
     """Draw the energy error ``|H - H_0| / |H_0|`` over time (absolute if H_0 = 0), a colour a trajectory.
 
-    Where forces, damping or impacts change the energy it is that of the balance E - E0 - W, if W is known; otherwise
-    the change of the energy is drawn. The title says which.
+    Where forces, damping or contacts change the energy of the exact motion, the change E - E0 is drawn on a linear
+    axis. The title says which, and how well the balance with the work W closes if W is known.
 
     Args:
         trajectories: one or several trajectories, also of array systems.
@@ -66,10 +66,8 @@ def plot_energy(trajectories: Motions, path: str | os.PathLike[str] | None = Non
         StateError, PlotError: as :func:`~scvi_codegen.extras.pictures.overview.plot_motion`.
     """
     with panel(path, ax) as axes:
-        draw_energy_error(axes, several(trajectories)[0])
-        for number, motion in enumerate(several(trajectories)[1:], 1):
-            account = motion.energy_account(limited=True)
-            _draw_error(axes, motion.t, np.abs(account.values) / account.scale, number)
+        for number, motion in enumerate(several(trajectories)):
+            draw_energy_error(axes, motion, number)
     return axes
 
 
@@ -101,11 +99,19 @@ def plot_momentum_maps(
     return axes
 
 
-def draw_energy_error(axes: Axes, motion: Trajectory) -> None:
-    """Draw the energy error, balance or change of one trajectory, with the title."""
+def draw_energy_error(axes: Axes, motion: Trajectory, number: int = 0) -> None:
+    """Draw the error of a conserved energy or the change of another, with the title of the first trajectory."""
     account = motion.energy_account(limited=True)
-    _draw_error(axes, motion.t, np.abs(account.values) / account.scale, 0)
-    axes.set(xlabel="t", title=account.title)
+    if account.reason is None:
+        _draw_error(axes, motion.t, np.abs(account.values) / account.scale, number)
+    else:
+        between = smooth(motion)
+        energy = np.asarray(between.energy())
+        axes.plot(between.t, energy - energy[0], color=color(number), linewidth=0.9)
+    if number == 0:
+        balance = f"\n{np.abs(account.values).max():.0e} beside the work" if account.work is not None else ""
+        change = f"energy change E - E0: {account.reason}{balance}"
+        axes.set(xlabel="t", title=change if account.reason else account.title)
 
 
 def _draw_error(axes: Axes, t: Array, error: Array, number: int, label: str | None = None) -> None:

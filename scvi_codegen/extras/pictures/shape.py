@@ -223,13 +223,7 @@ def shape_of_picture(system: DrawnSystem, picture: Mapping[str, Any], where: str
                 f"{where}: fields chooses what is drawn of a field on a mesh, without other keys: omit it"
             )
         return _chosen_fields(system, _listed(picture, "fields", where), f"{where} fields")
-    if not isinstance(picture, Mapping) or not isinstance(picture.get("points"), Mapping) or not picture["points"]:
-        raise ModelFileError(
-            f'{where} must have points, {{ bob = ["l*sin(q)", "-l*cos(q)"] }}, not {picture!r:.60}: give points'
-        )
-    for key in picture:
-        if key not in ("points", *MARKS):
-            raise ModelFileError(f"{where}: unknown key {key!r}{closest(key, MARKS)} Known: points, {', '.join(MARKS)}")
+    _check_keys(picture, where)
     reader, program = _reader(system), PointProgram(system.names)
     points = _single_points(picture["points"], where)
     names = [*points]
@@ -237,19 +231,30 @@ def shape_of_picture(system: DrawnSystem, picture: Mapping[str, Any], where: str
     if len({*map(len, formulas)}) > 1:
         raise ModelFileError(f"{where} points must all have two components, in the plane, or all three, in space")
     state = {symbol(name) for name in system.names[: len(system.names) - len(system.parameters)]}
-    moving = [name for name, point in zip(names, formulas, strict=True) if any(x.free_symbols & state for x in point)]
-    marks = list(_lines_of_picture(picture, names, where))
-    fixed = {k for mark in marks for k in mark["points"] if mark["kind"] == "wall"}
-    free = [name for k, name in enumerate(names) if name in moving and k not in fixed]
+    moving = {k for k, point in enumerate(formulas) if any(x.free_symbols & state for x in point)}
+    lines = list(_lines_of_picture(picture, names, where))
+    walls = {k for line in lines if line["kind"] == "wall" for k in line["points"]}
+    free = [names[k] for k in sorted(moving - walls)]
     shown = _numbers(_listed(picture, "bodies", where, free), names, f"{where} bodies")
-    pivots = {mark["points"][0] for mark in marks if mark["kind"] != "wall" and names[mark["points"][0]] not in moving}
-    marks += [{"kind": "pivot", "points": [k]} for k in sorted(pivots - {*shown})]
+    held = {line["points"][0] for line in lines if line["kind"] != "wall"} - moving
+    marks = lines + [{"kind": "pivot", "points": [k]} for k in sorted(held - {*shown})]
     marks += [{"kind": "body", "points": [k], "mass": system.parameter(("m",), names[k])} for k in shown]
     trails = _numbers(_listed(picture, "trails", where, [names[k] for k in shown]), names, f"{where} trails")
     return MovingShape(
         dimension=len(formulas[0]), points=[program.point(point) for point in formulas], program=program.entries,
-        marks=marks, trails=trails, movable=[k for k in shown if names[k] in moving],
+        marks=marks, trails=trails, movable=[k for k in shown if k in moving],
     )  # fmt: skip
+
+
+def _check_keys(picture: Any, where: str) -> None:
+    """Raise :class:`ModelFileError` for a picture without points, and for keys that pictures do not have."""
+    if not isinstance(picture, Mapping) or not isinstance(picture.get("points"), Mapping) or not picture["points"]:
+        raise ModelFileError(
+            f'{where} must have points, {{ bob = ["l*sin(q)", "-l*cos(q)"] }}, not {picture!r:.60}: give points'
+        )
+    for key in picture:
+        if key not in ("points", *MARKS):
+            raise ModelFileError(f"{where}: unknown key {key!r}{closest(key, MARKS)} Known: points, {', '.join(MARKS)}")
 
 
 def _lines_of_picture(picture: Mapping[str, Any], names: Sequence[str], where: str) -> Iterator[dict[str, Any]]:

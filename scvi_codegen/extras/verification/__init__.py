@@ -156,8 +156,7 @@ def _certificate(
     newton = _newton(stated if stepper.interface.modes else single, method, steps, solver, flags)  # locates kinks once
     tested = SystemUnderTest(single, method, steps, newton, start)
     variable = steps is not stepper or tolerance is not None
-    in_time = system.clock.plain if system.clock and system.clock.plain else system
-    runs = VariableSteps(tested, stepper, in_time, system, tolerance)
+    runs = VariableSteps(tested, stepper, system.in_time, system, tolerance)
     checks = (
         *(transition_checks(tested, run) if run else ()),
         *(variable_step_checks(runs) if variable else ()),

@@ -16,18 +16,14 @@ from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
 from scvi_codegen.runs.recording import RecordedRun
 from scvi_codegen.runs.results.energy import EnergyAccount
 from scvi_codegen.runs.states.words import low_words
-from scvi_codegen.runs.stepping.step_plan import FixedSteps, InTau
+from scvi_codegen.runs.stepping.step_plan import FixedSteps
 from scvi_codegen.runs.trajectory import Trajectory
 
 
 def _step_size(model: Model, run: Any) -> float | None:
     """Return the fixed step size, or step of tau; ``None`` for adaptive steps."""
-    match run.plan:
-        case FixedSteps():
-            return run.h if model.h is None else model.h
-        case InTau(tau=tau):
-            return tau
-    return None
+    size: float | None = run.plan.size
+    return size if model.h is None or not isinstance(run.plan, FixedSteps) else model.h
 
 
 def run_numbers(

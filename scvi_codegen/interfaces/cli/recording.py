@@ -175,8 +175,7 @@ def describe_progress(recorded: RecordedRun) -> str:
     manifest = recorded.manifest
     done = counted(recorded.steps, "step")
     if not isinstance(manifest.plan, Fixed):
-        how = f"of {manifest.plan.tau:g} in tau" if isinstance(manifest.plan, InTau) else "of adaptive size"
-        progress_text = f"{done} {how} from t = {manifest.t:g} to t = {recorded.t[-1]:g}"
+        progress_text = f"{done} {manifest.plan.sizes} from t = {manifest.t:g} to t = {recorded.t[-1]:g}"
         progress_text += "" if recorded.finished else f" (of {manifest.plan.t_end:g})"
     else:
         h, t = manifest.plan.h, manifest.t + recorded.steps * manifest.plan.h

@@ -171,7 +171,7 @@ def describe_step_size(model: Model, run: Run) -> str:
     if model.in_transformed_time:
         return f"of {run.h:g} in tau"
     if isinstance(run.plan, InTau):
-        return f"of {run.plan.tau:g} in tau by the {model.controller or 'reversible'} controller"
+        return f"{run.plan.sizes} by the {model.controller or 'reversible'} controller"
     adaptive = isinstance(run.plan, Adaptive) or model.h is None
     return f"of adaptive size ({run.rejected_steps} rejected)" if adaptive else f"of {model.h:g}"
 

@@ -354,7 +354,7 @@ class Model(TimeSpan):
 
             require(stepper, "action")
             stepper = stepper.acting
-        return stepper.with_events(self.events) if self.events else stepper
+        return stepper.with_events(self.events)
 
     def momenta(self, stepper: Stepper) -> Array:
         """Return the (m,) initial momenta: ``p``, or the Legendre transform of the velocities."""
@@ -479,8 +479,7 @@ class Model(TimeSpan):
         A run with it is bitwise equal to the one that was confirmed.
         """
         arguments = {**self.initial_state(stepper), **self._common(options, threads), "parameters": self.parameters}
-        if self.system.inputs:
-            arguments["inputs"] = self.all_inputs()
+        arguments["inputs"] = self.all_inputs()
         span = {"t_end": self.t + self.covered, "error": self.error, **self._control}
         trajectory: Trajectory = stepper.integrate(**arguments, **span)
         assert trajectory.confirmation is not None  # by construction
@@ -491,11 +490,7 @@ class Model(TimeSpan):
         self._check_alone()
         stepper, arguments = self.stepper(), self._run_arguments()
         if self.h is None and self.has_time_transformation and self.error is None:
-            from scvi_codegen.runs.stepping.step_plan import InTau  # not needed for reading a model
-
-            run = self.start(stepper)
-            plan = run.plan
-            arguments |= {"h": plan.tau if isinstance(plan, InTau) else run.h, "tolerance": None}
+            arguments |= {"h": self.start(stepper).plan.size, "tolerance": None}
         arguments |= {**self.initial_state(stepper), **self._common(None, threads), "parameters": self.parameters}
         trajectory: Trajectory = stepper.integrate(**arguments, progress=progress)
         return trajectory
@@ -508,8 +503,7 @@ class Model(TimeSpan):
             for option in RUN_FIELDS
             if option.field not in others and not option.solver_option
         }
-        if self.system.inputs:
-            arguments["inputs"] = self.all_inputs()
+        arguments["inputs"] = self.all_inputs()
         if self.ends_at_time or self.has_shorter_last_step or (self.system.inputs and self.span is not None):
             if self.h is not None and self.time_transformation is not None:
                 arguments["h"] = abs(self.h)  # the end determines the direction

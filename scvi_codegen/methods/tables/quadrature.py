@@ -15,6 +15,7 @@ from scvi_codegen.common.errors import MethodError
 from scvi_codegen.common.precision import DIGITS, Matrix, Number, Vector, mp
 from scvi_codegen.common.representation import summary
 from scvi_codegen.methods.tables.nodes import (
+    GUARD,
     ascending_points,
     cached_family,
     chebyshev_gauss_points,
@@ -30,7 +31,6 @@ from scvi_codegen.methods.tables.nodes import (
     to_unit,
 )
 
-GUARD = 20
 COMPUTED_TOLERANCE = mp.mpf("1e-12")
 
 CLAIMED_TOLERANCE = mp.mpf("1e-8")

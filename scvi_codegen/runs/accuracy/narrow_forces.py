@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.runs.results.saved_states import times_of_changes
+from scvi_codegen.runs.states.times import number_until
 
 Array = NDArray[np.float64]
 
@@ -41,7 +42,7 @@ def differences_in_pieces(run: Any, size: float, part: float) -> Array:
     for piece in run.pieces or (run,):
         spans, changes = np.diff(piece.t), times_of_changes(piece)
         rows = np.flatnonzero(np.abs(spans) > LONG * size)
-        modes = np.searchsorted(piece.forward * changes, piece.forward * piece.t[rows], side="right")
+        modes = number_until(changes, piece.t[rows], piece.forward)
         for mode in {*modes.tolist()}:
             apart = _apart(piece, rows[modes == mode], spans, size, changes, options)
             np.fmax(largest, apart, out=largest)

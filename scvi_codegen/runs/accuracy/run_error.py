@@ -218,7 +218,7 @@ def error_of(run: Any) -> RunError:
     finer = finer_of(stepper)
     if _is_compared(stepper, finer):
         return _compared(run, finer)
-    finer = finer.with_events(stepper.events if stepper.changes_states else ())
+    finer = finer.with_events(stepper.changing_events)
     return _Replay(run, finer).error()
 
 
@@ -562,7 +562,7 @@ def _compared(run: Any, finer: Any) -> RunError:
     Rounding errors are estimated by the difference of a second one whose initial state is rounded differently, once for
     each step of the run as independent ones.
     """
-    finer = finer.with_events(run.stepper.events if run.stepper.changes_states else ())
+    finer = finer.with_events(run.stepper.changing_events)
     exact, rounded = _states_of(run, finer, np.asarray), _states_of(run, finer, neighbouring)
     growth = math.sqrt(max(1.0, run.steps))
     errors = [np.abs(np.asarray(x - y)).T for x, y in zip((run.q, run.p), exact, strict=True)]
@@ -602,8 +602,7 @@ def corrected_states(run: Any, error: RunError) -> CorrectedStates:
     velocity = np.full_like(q, np.nan)
     for k in np.flatnonzero(np.isfinite(q).all(axis=1)).tolist():
         parameters = run.parameters_on_sides(float(run.t[k]))
-        if stepper.interface.constraints:
-            q[k], p[k], _ = projected(stepper, q[k], p[k], float(run.t[k]), parameters)
+        q[k], p[k], _ = projected(stepper, q[k], p[k], float(run.t[k]), parameters)
         velocity[k] = stepper.velocity(q[k], p[k], float(run.t[k]), parameters)
     return CorrectedStates(
         t=np.asarray(run.t), q=stepper.named(q), p=stepper.named(p), velocity=stepper.named(velocity)

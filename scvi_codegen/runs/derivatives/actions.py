@@ -13,7 +13,7 @@ from scvi_codegen.codegen.native.options import SolverOptions, step_failure
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.runs.derivatives.gradients import pieces, starts_of
 from scvi_codegen.runs.results.joining import compensated_sums
-from scvi_codegen.runs.results.recomputation import changes_by_events, check_recomputed
+from scvi_codegen.runs.results.recomputation import check_recomputed, ends_of_steps
 from scvi_codegen.runs.results.saved_states import SavedStates
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.features import require
@@ -33,7 +33,7 @@ def actions_of_steps(
     report = binding.new("report *")
     status = binding.function("actions")(
         count,
-        *map(binding.pointer, (starts.t, starts.h, starts.q, starts.p, parameters)),
+        *map(binding.pointer, (*starts.arrays, parameters)),
         0,
         binding.options(options),
         *map(binding.pointer, (q1, p1, actions)),
@@ -51,9 +51,7 @@ def actions_between(states: SavedStates) -> Array:
     """Return the (n - 1,) actions from each saved state to the next."""
     require(states.stepper, "action")
     result = np.zeros(len(states) - 1)
-    ends = np.concatenate([states.q, states.p], axis=1)
-    for crossings, rows in changes_by_events(states):
-        ends[rows] = np.concatenate([crossings.q, crossings.p], axis=1)
+    ends = ends_of_steps(states)
     for first, last in pieces(states):
         starts, _ = starts_of(states, first, last)
         actions, reached = actions_of_steps(states.stepper, starts, states.parameters, states.options)

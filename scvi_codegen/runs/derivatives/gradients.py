@@ -134,14 +134,20 @@ def forward(states: SavedStates, tangents: Array) -> tuple[Array, Array]:
     result = np.empty((len(states), len(outputs), len(now)))
     result[0] = now[:, outputs].T
     for first, last in pieces(states):
-        starts, numbers = starts_of(states, first, last)
-        vectors = np.zeros((len(numbers), *now.shape))
-        vectors[0] = now
-        propagate(states, starts, numbers, vectors, back=False)
+        _, numbers, vectors = tangents_from(states, first, last, now)
         saved = np.flatnonzero(numbers[1:] > 0) + 1
         result[numbers[saved]] = vectors[saved][:, :, outputs].transpose(0, 2, 1)
         now = vectors[-1]
     return time.final_tangents(result, now, tangents)
+
+
+def tangents_from(states: SavedStates, first: int, last: int, start: Array) -> tuple[Starts, NDArray[np.intp], Array]:
+    """Return the steps of :func:`starts_of`, and the images of tangent vectors at their start."""
+    starts, numbers = starts_of(states, first, last)
+    vectors = np.zeros((len(numbers), *start.shape))
+    vectors[0] = start
+    propagate(states, starts, numbers, vectors, back=False)
+    return starts, numbers, vectors
 
 
 def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], vectors: Array, *, back: bool) -> None:

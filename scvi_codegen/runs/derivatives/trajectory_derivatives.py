@@ -26,6 +26,7 @@ from scvi_codegen.runs.derivatives.gradients import (
     seeds_of,
     sensitivity,
     starts_of,
+    tangents_from,
     tangents_from_directions,
 )
 from scvi_codegen.runs.results.recomputation import changes_by_events
@@ -65,10 +66,7 @@ def second_order_adjoints(
     between = list(pieces(states))
     at_starts = _tangents_at_starts(states, between, tangents)
     for (first, last), start in zip(reversed(between), reversed(at_starts), strict=True):
-        starts, numbers = starts_of(states, first, last)
-        moved = np.zeros((len(numbers), *tangents.shape))
-        moved[0] = start
-        propagate(states, starts, numbers, moved, back=False)
+        starts, numbers, moved = tangents_from(states, first, last, start)
         vectors = np.zeros((len(numbers), 2, *tangents.shape))
         saved = np.flatnonzero(numbers[1:] > 0) + 1
         vectors[saved] = _seeds(derivatives[numbers[saved]], hessian_blocks[numbers[saved]], moved[saved])
@@ -81,11 +79,7 @@ def second_order_adjoints(
 def _tangents_at_starts(states: SavedStates, between: list[tuple[int, int]], tangents: Array) -> list[Array]:
     tangents_at = [tangents]
     for first, last in between[:-1]:
-        starts, numbers = starts_of(states, first, last)
-        moved = np.zeros((len(numbers), *tangents.shape))
-        moved[0] = tangents_at[-1]
-        propagate(states, starts, numbers, moved, back=False)
-        tangents_at.append(moved[-1])
+        tangents_at.append(tangents_from(states, first, last, tangents_at[-1])[2][-1])
     return tangents_at if between else []
 
 

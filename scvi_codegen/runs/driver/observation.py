@@ -23,7 +23,7 @@ from scvi_codegen.runs.events.refinement import search_of
 from scvi_codegen.runs.results.dense_output import states_and_steps_at, step_sizes_at, stepped_to
 from scvi_codegen.runs.results.output import Output
 from scvi_codegen.runs.results.time_transformation import part_of_step
-from scvi_codegen.runs.states.times import WHOLE
+from scvi_codegen.runs.states.times import WHOLE, number_until
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.states.words import Words, fraction_of, stacked
 from scvi_codegen.runs.stepping.chunks import drive
@@ -180,7 +180,7 @@ class AtTimes(Saver):
         after = forward * self.times >= left if chunk.is_first else forward * self.times > left
         times = self.times[after & (forward * self.times <= right)]
         q, p, stepped = states_and_steps_at(part, times)
-        before = np.searchsorted(forward * part.t, forward * times, side="right") - 1
+        before = number_until(part.t, times, forward) - 1
         unknown = np.full(len(times), np.nan)
         self.rows.append((times, q, p, step_sizes_at(part, times), stepped, chunk.iterations[before], unknown))
 
@@ -316,9 +316,13 @@ class Observation:
         watch = None if isinstance(plan, Adaptive | Fixed) else ProgressWatch(run.stepper, plan.t_end)
         take = self._take_with_changes if self.search is not None and self.search.changes else self._take
 
+        begin, first = run.t, run.steps
+
         def advance(size: int) -> int:
             before, number = run.t, run.steps
-            part, numbers, failure = take(int(min(size, self.saver.most_steps(run))))
+            part, numbers, failure = take(
+                int(min(size, self.saver.most_steps(run), self._steps_before_end(begin, first)))
+            )
             self._pass_on(part, numbers)
             self.saver.check_room(run)
             if isinstance(failure, EventError):
@@ -347,6 +351,16 @@ class Observation:
         if type(self.saver) is not AtTimes and not self.ended:
             run.iterations = self.iterations - int(trajectory.iterations.sum())
         return trajectory
+
+    def _steps_before_end(self, begin: float, first: int) -> float:
+        """Return a number of steps that hardly passes the final time, by the mean size of those after step ``first``.
+
+        A chunk that passes it is taken again up to there, so the last one is short.
+        """
+        passed = self.run.t - begin
+        if self.end is None or passed == 0.0:
+            return math.inf
+        return max(FIRST_STEPS, (self.run.steps - first) * (self.end - self.run.t) / passed - FIRST_STEPS)
 
     def _take(self, size: int) -> Taken:
         """Advance by one chunk and search it for events; a failure after a terminal event is ignored."""

@@ -141,6 +141,7 @@ class EnsembleSettings:
 
     def check(self, stepper: Any) -> None:
         """Raise an error for arguments that exclude each other, or that the stepper excludes."""
+        self.inputs = self.inputs or None
         if self.precision != "double":
             self._check_precision(stepper)
         if self.observe is not None:
@@ -330,7 +331,7 @@ class Ensemble:
     def settings_of(self, part: slice) -> EnsembleSettings:
         """Return the arguments, besides the initial states, of the ensemble of a slice of the trajectories."""
         in_bath, inputs = self.stepper.interface.temperature is not None, inputs_of_slice(self.inputs, part)
-        of_part: dict[str, Any] = {"parameters": self.parameters[part], "inputs": inputs or None}
+        of_part: dict[str, Any] = {"parameters": self.parameters[part], "inputs": inputs}
         if self.fixed is None:
             of_part["t_end"] = self.ends[part]
         seed = self.settings.seed if in_bath else 0  # the inputs are values

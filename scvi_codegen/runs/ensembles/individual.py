@@ -31,7 +31,7 @@ from scvi_codegen.runs.ensembles.observation import EnsembleObservation
 from scvi_codegen.runs.ensembles.result import EVENT_FAILED, INTERRUPTED, OK, EnsembleTrajectory, Span
 from scvi_codegen.runs.ensembles.schedule import CommonSteps
 from scvi_codegen.runs.results.saved_states import ModeHistory
-from scvi_codegen.runs.states.times import WHOLE
+from scvi_codegen.runs.states.times import WHOLE, number_until
 from scvi_codegen.runs.states.validation import Array, columns_of_inputs
 from scvi_codegen.runs.states.words import unnamed
 from scvi_codegen.runs.stepping.step_plan import Adaptive, AdaptivePlans
@@ -184,7 +184,7 @@ class IndividualRuns:
             steps = ensemble.fixed.arguments
         return steps | {
             "parameters": parameters,
-            "inputs": inputs_of_slice(ensemble.inputs, j) or None,
+            "inputs": inputs_of_slice(ensemble.inputs, j),
             "t": ensemble.t0,
             "save_every": 1 if ensemble.inputs and self.t_eval is not None else ensemble.save_every,
             "options": ensemble.settings.options,
@@ -316,7 +316,7 @@ class IndividualRuns:
             times = t if t.ndim == 1 else t[:, j]
             forward = -1.0 if end_of_run < t0 else 1.0
             ends = breakpoints_until(t0, end_of_run, self.ensemble.inputs) or [end_of_run]
-            last = np.searchsorted(forward * times[np.isfinite(times)], forward * np.array(ends), side="right").tolist()
+            last = number_until(times[np.isfinite(times)], ends, forward).tolist()
             for (start, end), (first, until) in zip(pairwise([t0, *ends]), pairwise([0, *last]), strict=True):
                 yield slice(first, until), slice(j, j + 1), partial(self.ensemble.values_at, (start + end) / 2)
 

@@ -29,6 +29,7 @@ from scvi_codegen.runs.results.recorded import NotRecordedError, OfMethod, chang
 from scvi_codegen.runs.results.saved_states import ModeHistory, checked_row
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.rotation_quantities import named_quantities
+from scvi_codegen.runs.states.times import number_until
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.states.words import TwoWords, Words, check_keeps_words
 from scvi_codegen.runs.stepping.integrator import Integrator
@@ -325,7 +326,7 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, OfEnsembles, TwoWor
                 continue
             t = self.times[self._reached(j), j]
             forward = np.copysign(1.0, t[-1] - t[0])
-            changes = np.searchsorted(forward * history.t, forward * self.times[good, j], side="right")
+            changes = number_until(history.t, self.times[good, j], forward)
             for number in np.unique(changes):
                 values = parameters.copy()
                 values[columns] = history.values[number]

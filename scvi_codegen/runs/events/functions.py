@@ -128,9 +128,7 @@ class EventFunctions:
         if by_velocity:
             state[1] = stepper.momentum(state[0], state[2], word_of(at.t), parameters)
         q, p, _ = state
-        if stepper.constraints:
-            q, p, _ = projected(stepper, q, p, word_of(at.t), parameters)
-        return TimedState(at.t, q, p)
+        return TimedState(at.t, *projected(stepper, q, p, word_of(at.t), parameters)[:2])
 
     def _impact(self, at: TimedState, parameters: Array, values: list[Any], forward: bool) -> Array:
         """Return the momenta after an impact; the same array if the wall is not approached.
@@ -146,7 +144,7 @@ class EventFunctions:
             moved = [x + impulse * n for x, n in zip(momenta_before, normal, strict=True)]
             high = [float(x) for x in moved]
             words: Array = with_low(np.array(high), np.array([float(x - y) for x, y in zip(moved, high, strict=True)]))
-            return projected(stepper, at.q, words, word_of(at.t), parameters)[1] if stepper.constraints else words
+            return projected(stepper, at.q, words, word_of(at.t), parameters)[1]
 
         def terms(impulse: Any) -> list[Any]:
             moved = at._replace(p=momenta(impulse)) if impulse else at

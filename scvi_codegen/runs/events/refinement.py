@@ -22,7 +22,7 @@ from scvi_codegen.common.errors import EventError, StateError, StepFailedError
 from scvi_codegen.runs.events.detection import CrossingSearch
 from scvi_codegen.runs.events.functions import TimedState
 from scvi_codegen.runs.results.dense_output import stepped_to
-from scvi_codegen.runs.states.times import WHOLE
+from scvi_codegen.runs.states.times import WHOLE, number_until
 from scvi_codegen.runs.states.words import Word, block_of, fraction_of, stacked, with_low, word_of
 from scvi_codegen.runs.stepping.memory import Memory
 from scvi_codegen.runs.stepping.step_plan import Fixed, FixedSteps, Until
@@ -80,8 +80,8 @@ class RefinedSearch(CrossingSearch):
         return reached
 
     def _refined(self, part: SavedStates, record: Any) -> RefinedCrossing:
-        t, forward = float(record["t"]), part.forward
-        k = max(0, int(np.searchsorted(forward * np.asarray(part.t), forward * t, side="right")) - 1)
+        t = float(record["t"])
+        k = max(0, int(number_until(part.t, t, part.forward)) - 1)
         start, h = TimedState(fraction_of(part.t[k]), part.q[k], part.p[k]), float(part.step_sizes[k])
         if self.precise.in_tau:
             h *= float(self.precise.rates(start.q, start.p, part.parameters)[0])

@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -316,11 +316,10 @@ def _jump(
     # a start moved along the flow has the same end: Phi(z + X+ s, t + s, h - s) = Phi(z, t, h), hence
     # Phi_z X+ = Phi_h - Phi_t, solved for X+ = departure + basis y
     step = products(after, h, t, np.eye(size))
-    departure, basis = np.zeros(2 * m), np.eye(2 * m)
-    if stepper.constraints:  # tangent vectors are admissible: departure + the range of the derivative of the projection
-        onto = _projection(later._replace(all_inputs=False), after)[1]
-        directions, sizes, _ = np.linalg.svd(onto[:, : 2 * m])
-        departure, basis = onto[:, -1], directions[:, sizes > ADMISSIBLE]
+    # tangent vectors are admissible: departure + the range of the derivative of the projection
+    onto = _projection(later._replace(all_inputs=False), after)[1]
+    directions, sizes, _ = np.linalg.svd(onto[:, : 2 * m])
+    departure, basis = onto[:, -1], directions[:, sizes > ADMISSIBLE]
     moved = step[:, -1] - step[:, -2] - step[:, : 2 * m] @ departure
     departure = departure + basis @ np.linalg.lstsq(step[:, : 2 * m] @ basis, moved)[0]
     # dh of a divided step is added to both of its parts, but lengthens only the second: without that of the first,
@@ -382,7 +381,7 @@ def _crossing(
     states, t = here.states, here.t
     if values is None:
         formulas = _derivatives(states.stepper.known.interface, event)
-        values = formulas(ends[0], t, here.parameters) if formulas else _at_kink_of_velocities(here, event, ends[0])
+        values = formulas(ends[0], t, here.parameters) if formulas else _of_velocities(here, event, ends[0])
     rate = values.gradient[:size] @ arrival + values.gradient[-1]
     steepest, least = np.linalg.norm(values.gradient[:size]) * np.linalg.norm(arrival), GRAZING
     if isinstance(event, Transition) and not _rises(here, event, ends[0]):
@@ -404,7 +403,7 @@ def _rises(here: Place, event: Transition, state: Array) -> bool:
 
 @lru_cache(maxsize=64)
 def _derivatives(interface: Interface, event: Event) -> Callable[[Array, float, Array], Values] | None:
-    """Return a function of (q, p), t and parameters, derivatives of an event; ``None`` for kinks of velocities."""
+    """Return a function of (q, p), t and parameters, derivatives of an event; ``None`` where it contains velocities."""
     import sympy  # here: slow to import, with the modules that use it
 
     from scvi_codegen.codegen.rendering.events import EventFormulas
@@ -415,16 +414,11 @@ def _derivatives(interface: Interface, event: Event) -> Callable[[Array, float, 
     z, time = (*formulas.q, *formulas.p), symbol(TIME)
     variables = (*z, *formulas.parameters, time)
     new = dict(zip(indices, values, strict=True))
-    others = {*formulas.v, *formulas.multipliers}
-    if isinstance(event, Kink) and formulas.functions[0].free_symbols & others:
+    symbols = set[Any]().union(*(formula.free_symbols for formula in (*formulas.functions, *values)))
+    if symbols & {*formulas.multipliers}:
+        raise StateError(f"derivatives through the event {event.title} require formulas without multipliers")
+    if symbols & {*formulas.v} or any(index >= len(z) for index in indices):
         return None
-    if any(index >= len(z) for index in indices) or any(
-        formula.free_symbols & others for formula in (*formulas.functions, *values)
-    ):
-        raise StateError(
-            f"derivatives through the event {event.title} require momenta instead of velocities in its formulas, "
-            "and no multipliers"
-        )
     mapped = list(values) if event.is_wall else [new.get(k, unchanged) for k, unchanged in enumerate(z)]
     entries = [formulas.functions[0].diff(x) for x in variables]
     entries += [value.diff(x) for value in mapped for x in variables]
@@ -475,12 +469,42 @@ def _number(stepper: Integrator, event: Event) -> int:
     return entries + stepper.searched.index(event)
 
 
-def _at_kink_of_velocities(here: Place, kink: Event, before: Array) -> Values:
-    """Return the derivatives of a kink of velocities, by differences of sixth order."""
-    stepper = here.states.stepper
-    number = _number(stepper, kink)
-    (gradient,) = _differences(lambda *x: _event_values(stepper, *x)[[number]], here, *np.split(before, 2))
-    return Values(gradient, np.eye(len(before), len(gradient)), before)
+@lru_cache(maxsize=64)
+def _formulas(interface: Interface, event: Event) -> tuple[Callable[..., list[float]], list[int]]:
+    """Return a function of (q, p, v), parameters and t, [g, new values], and the places of these in (q, p, v)."""
+    import sympy
+
+    from scvi_codegen.codegen.rendering.events import EventFormulas
+    from scvi_codegen.systems.formulas.symbols import TIME, symbol
+
+    formulas = EventFormulas(interface, (event,))
+    ((indices, values),) = formulas.changes
+    variables = (*formulas.q, *formulas.p, *formulas.v, *formulas.parameters, symbol(TIME))
+    return sympy.lambdify((variables,), [formulas.functions[0], *values], cse=True), list(indices)
+
+
+def _of_velocities(here: Place, event: Event, before: Array) -> Values:
+    """Return the derivatives of an event whose formulas contain velocities, by differences of sixth order.
+
+    A new velocity sets the momenta to those of the new position and of all velocities, the others unchanged.
+    """
+    stepper, m = here.states.stepper, len(before) // 2
+    function, indices = _formulas(stepper.known.interface, event)
+
+    def mapped(q: Array, p: Array, t: float, parameters: Array) -> Array:
+        """Return g and the new state; of an impact g, g_q, g_t and e."""
+        state = np.concatenate([q, p, np.asarray(stepper.velocity(q, p, t, parameters))])
+        g, *new = function([*state, *parameters, t])
+        if event.is_wall:
+            return np.array([g, *new])
+        state[indices] = new
+        if max(indices, default=0) >= 2 * m:
+            state[m : 2 * m] = stepper.momentum(state[:m], state[2 * m :], t, parameters)
+        return np.append(g, state[: 2 * m])
+
+    q, p = np.split(before, 2)
+    by, value = _differences(mapped, here, q, p), mapped(q, p, here.t, here.parameters)
+    return Values(by[0], by[1:], value[1:])
 
 
 def _impact(here: Place, later: Place, values: Values, before: Array, after: Array) -> Array:

@@ -31,7 +31,7 @@ from scvi_codegen.runs.states.words import Words, low_words, with_low
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.runs.stepping.integrator import Integrator
-from scvi_codegen.runs.stepping.step_plan import Adaptive, Fixed, InTau, plan_from_record, plan_to_record
+from scvi_codegen.runs.stepping.step_plan import Adaptive, Fixed, InTau, plan_from_record
 from scvi_codegen.systems.event import Event
 from scvi_codegen.version import __version__
 
@@ -307,7 +307,7 @@ class Manifest:
             "format": FORMAT,
             **{field: getattr(self, field) for field in PLAIN},
             "options": None if self.options is None else asdict(self.options),
-            "plan": plan_to_record(self.plan),
+            "plan": self.plan.record,
             "builds": [asdict(build) for build in self.builds],
             "interface": self.interface.to_record(),
             "source": self.source.to_record(),

@@ -28,7 +28,7 @@ from scvi_codegen.runs.states.rotation_quantities import named_quantities
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.words import check_keeps_words, low_words, scalar
 from scvi_codegen.runs.stepper import Stepper
-from scvi_codegen.runs.stepping.step_plan import Adaptive, ErrorControl, Fixed, InTau
+from scvi_codegen.runs.stepping.step_plan import Fixed
 from scvi_codegen.runs.trajectory import Trajectory
 from scvi_codegen.systems.event import Crossings
 
@@ -160,13 +160,8 @@ class RecordedRun(AttitudeHistory, OfMethod):
             BuildError: if there is no C compiler.
         """
         manifest, plan, memory = self.manifest, self.manifest.plan, self._last.memory
-        steps: dict[str, Any] = {}
-        match plan:
-            case InTau(t_end=t_end, tau=tau):
-                steps = {"t_end": t_end, "h": tau}
-            case Adaptive(t_end=t_end):
-                steps = {"t_end": t_end}
-                steps |= {name: value for name, value in ErrorControl.of(plan).named.items() if name != "first_step"}
+        steps = {} if isinstance(plan, Fixed) else {"h": plan.size, **plan.record}
+        steps = {name: value for name, value in steps.items() if name not in ("tau", "first_step")}
         return self.stepper.from_checkpoint(memory, **steps, parameters=manifest.values, options=manifest.options)
 
     @cached_property

@@ -24,6 +24,7 @@ from scvi_codegen.common.errors import StateError
 from scvi_codegen.runs.results.output import Output
 from scvi_codegen.runs.results.saved_states import ROUNDINGS, SavedStates
 from scvi_codegen.runs.results.time_transformation import part_of_step, states_in_transformed_time
+from scvi_codegen.runs.states.times import number_until
 from scvi_codegen.runs.states.words import Words, fraction_of, low_words, split, with_low
 from scvi_codegen.runs.stepping.features import require
 from scvi_codegen.runs.stepping.memory import Memory
@@ -45,7 +46,7 @@ def states_and_steps_at(states: SavedStates, times: Array) -> tuple[Array, Array
     if states.tau is not None:
         _check_on_grid(states)
         return states_in_transformed_time(states, times)
-    left = np.searchsorted(states.forward * states.t, states.forward * times, side="right") - 1
+    left = number_until(states.t, times, states.forward) - 1
     lengths, fixed, several = states.step_sizes[:-1], isinstance(states.plan, FixedSteps), False
     if states.stepper.divides_steps:
         several = not (np.abs(np.diff(states.t)) < 1.5 * np.abs(lengths) + states.grid_tolerance[:-1]).all()
@@ -210,7 +211,7 @@ def within(times: Array, first: float, last: float) -> Array:
 
 def step_sizes_at(states: SavedStates, times: Array) -> Array:
     """Return (n,) sizes of the steps that begin at the given times; NaN at times between two steps."""
-    before = np.searchsorted(states.forward * states.t, states.forward * times, side="right") - 1
+    before = number_until(states.t, times, states.forward) - 1
     after = np.minimum(before + 1, len(states) - 1)
     nearest = np.where(np.abs(states.t[after] - times) < np.abs(times - states.t[before]), after, before)
     off = np.abs(times - states.t[nearest]) > states.grid_tolerance[nearest]

@@ -59,7 +59,7 @@ class EnergyAccount(NamedTuple):
 
     @property
     def title(self) -> str:
-        """Title of a plot of ``abs(values) / scale``."""
+        """Name of ``abs(values) / scale``."""
         if not self.is_error:
             return f"energy change |E - E0|: {self.reason}"
         if self.work is not None:

@@ -16,7 +16,7 @@ from scvi_codegen.runs.states.rotation_quantities import values_by_name
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.memory import Memory
-from scvi_codegen.runs.stepping.step_plan import FixedSteps, InTau, StepPlan
+from scvi_codegen.runs.stepping.step_plan import FixedSteps, StepPlan
 
 
 def describe_run(run: Memory) -> str:
@@ -44,7 +44,7 @@ def describe_step_size(h: float, plan: StepPlan, *, tau: bool) -> str:
     """Describe the step size of a run."""
     if isinstance(plan, FixedSteps):
         return f" of {h:g} in tau" if tau else f" of {h:g}"
-    return f" of {plan.tau:g} in tau" if isinstance(plan, InTau) else " of adaptive size"
+    return f" {plan.sizes}"
 
 
 def quantities(stepper: Integrator, parameters: Array, t: Array, q: Array, p: Array) -> dict[str, Array]:

@@ -31,9 +31,7 @@ def work_and_impulses_until(states: SavedStates) -> Array:
     """Return (n, 1 + k) work of the forces from the first state to each, and their impulses on the momentum maps."""
     stepper = states.stepper
     values = [np.zeros(1)]  # of the first state; the number of impulses of arrays is known after a step
-    ends = np.concatenate([states.q, states.p], axis=1)
-    for crossings, rows in changes_by_events(states):
-        ends[rows] = np.concatenate([crossings.q, crossings.p], axis=1)
+    ends = ends_of_steps(states)
     spans = steps_after(states, 0, len(states) - 1).tolist()
     for k, (start, length, span) in enumerate(
         zip(states.t[:-1].tolist(), states.step_sizes[:-1].tolist(), spans, strict=True)
@@ -49,6 +47,14 @@ def work_and_impulses_until(states: SavedStates) -> Array:
         check_recomputed(states, states.t[k : k + 1], recomputed, ends[k + 1 : k + 2], ends[k : k + 1])
     values[0] = np.zeros_like(values[-1])
     return np.array(values)
+
+
+def ends_of_steps(states: SavedStates) -> Array:
+    """Return (n, 2m) saved states, those after changes by events as they were before."""
+    ends = np.concatenate([states.q, states.p], axis=1)
+    for crossings, rows in changes_by_events(states):
+        ends[rows] = np.concatenate([crossings.q, crossings.p], axis=1)
+    return ends
 
 
 def changes_by_events(states: SavedStates) -> Iterator[tuple[Crossings, NDArray[np.intp]]]:

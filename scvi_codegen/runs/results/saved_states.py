@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import MethodError
+from scvi_codegen.runs.states.times import number_until
 from scvi_codegen.runs.states.words import scalar
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.memory import Memory
@@ -117,7 +118,7 @@ class ModeHistory:
 
     def at(self, t: float, forward: float) -> Array:
         """Return (modes,) values after time t; ``forward`` is -1 for a run backward in time."""
-        changes = int(np.searchsorted(forward * self.t, forward * t, side="right"))
+        changes = int(number_until(self.t, t, forward))
         return np.asarray(self.values[changes])
 
     def between(self, low: float, high: float) -> ModeHistory:
@@ -153,7 +154,7 @@ def in_modes(states: SavedStates, quantity: Callable[[Any, Any, Any, Array], Arr
     modes = getattr(states, "modes", None)
     if modes is None or not len(modes.t):
         return quantity(states.q, states.p, states.t, states.parameters_on_sides(float(states.t[-1])))
-    rows = np.searchsorted(states.forward * modes.t, states.forward * states.t, side="right")
+    rows = number_until(modes.t, states.t, states.forward)
     parts = [np.flatnonzero(rows == number) for number in np.unique(rows)]
     values = [
         quantity(states.q[part], states.p[part], states.t[part], states.parameters_on_sides(float(states.t[part[0]])))

@@ -10,6 +10,7 @@ import numpy as np
 
 from scvi_codegen.codegen.native.options import step_failure
 from scvi_codegen.runs.results.saved_states import SavedStates
+from scvi_codegen.runs.states.times import number_until
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.states.words import block_of, fraction_of
 from scvi_codegen.runs.stepping.memory import Memory
@@ -82,12 +83,12 @@ def _part_of_two_words(
 def states_in_transformed_time(states: SavedStates, times: Array) -> tuple[Array, Array, Array]:
     """Return (n, m) positions and momenta, and (n,) tau, at (n,) times within the range of the saved states."""
     assert states.tau is not None
-    left = np.searchsorted(states.forward * states.t, states.forward * times, side="right") - 1
+    left = number_until(states.t, times, states.forward) - 1
     q, p, tau = states.q[left], states.p[left], np.empty(len(times))
     for saved in np.unique(left):
         t_near, q_near, p_near, h = _steps_from(states, int(saved))
         for k in np.flatnonzero(left == saved):
-            j = int(np.searchsorted(states.forward * t_near, states.forward * times[k], side="right")) - 1
+            j = int(number_until(t_near, times[k], states.forward)) - 1
             q[k], p[k], part = q_near[j], p_near[j], 0.0
             if t_near[j] - times[k] != 0.0:
                 q[k], p[k], part = part_of_step(states, t_near[j], h, times[k], q[k], p[k])

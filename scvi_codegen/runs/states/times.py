@@ -29,6 +29,11 @@ def times_after(t: float | Array, h: float | Array, steps: ArrayLike) -> tuple[A
         return time, rest - (time - total)
 
 
+def number_until(t: ArrayLike, ends: ArrayLike, forward: float) -> NDArray[np.intp]:
+    """Return the number of times t, in the order of a run, up to each end; ``forward``: -1 of a run back in time."""
+    return np.searchsorted(forward * np.asarray(t), forward * np.asarray(ends), side="right")
+
+
 def steps_within(spans: ArrayLike, h: float) -> NDArray[np.intp]:
     """Return the number of equal steps not longer than |h| in each span > 0; raise ``StateError`` if too large."""
     with np.errstate(over="ignore"):

@@ -68,9 +68,7 @@ def _envelope(layout: ArrayLayout, arrays: RunSizes) -> Envelope | None:
     if pairs is None:
         return None
     order, apart = _order(shapes, pairs)
-    n, position = len(order), np.empty(len(order), np.int64)
-    position[order] = np.arange(n)
-    ends = np.sort(position[pairs], axis=0)
+    n, ends = len(order), _places(order, pairs)
     codes = np.unique(np.concatenate([ends[0] * n + ends[1], np.arange(n) * (n + 1)]))
     column, row = codes // n, codes % n
     first = np.arange(n)
@@ -159,9 +157,11 @@ def _order(shapes: list[tuple[int, ...]], pairs: NDArray[np.int64]) -> tuple[NDA
     along = np.concatenate([(np.arange(max(1, int(np.prod(s)))) + 0.5) / max(1, int(np.prod(s))) for s in shapes])
     single = np.concatenate([np.full(max(1, int(np.prod(shape))), not shape) for shape in shapes])
     order = np.argsort(along + single, kind="stable")
-    n, position = len(order), np.empty(len(order), np.int64)
-    position[order] = np.arange(n)
-    ends = np.sort(position[pairs], axis=0)
-    last = single[order]
-    last[ends[0][ends[1] - ends[0] > FAR * n]] = True
+    ends, last = _places(order, pairs), single[order]
+    last[ends[0][ends[1] - ends[0] > FAR * len(order)]] = True
     return np.concatenate([order[~last], order[last]]), int(last.sum())
+
+
+def _places(order: NDArray[np.int64], pairs: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the positions of pairs of coordinates in an order, the smaller ones first."""
+    return np.sort(np.argsort(order)[pairs], axis=0)

@@ -88,6 +88,7 @@ class CompiledMethod:
         mode_columns: their indices among the values of parameters.
         divides_steps: whether steps end at zeros: of events that change the state, transitions and kinks.
         changes_states: whether an event changes the states of runs.
+        changing_events: the events if one of them does, without which the motion is another.
         in_tau: whether the system is one in transformed time, whose steps are steps of tau.
         run_time_sizes: whether the sizes of its arrays are those of each call; the stepper is bound to them, or
             compiled with them if an integrator of run-time sizes is impossible.
@@ -116,6 +117,7 @@ class CompiledMethod:
         self.modes = modes_of(events, interface.parameters, interface.mode_names)
         self.mode_columns = [*map(interface.parameters.index, self.modes)]
         self.changes_states = any(event.changes_state for event in events)
+        self.changing_events = events if self.changes_states else ()
         self.divides_steps = self.changes_states or bool(interface.mode_names)
         self.origin, self.problem, self._of_sizes, self._reason = origin, problem, of_sizes, reason
         self._variants, self._looser = Variants() if variants is None else variants, looser
@@ -323,7 +325,7 @@ class CompiledMethod:
             ensemble: the variant for many trajectories at once.
             events: the formulas that later calls pass as ``events=``, all those of one call together.
         """
-        for stepper in (self,) if events is None else (self, self.with_events(events)):
+        for stepper in dict.fromkeys((self, self.with_events(events))):
             stepper._compile()
         if self._looser is not None:
             self._looser().prepare(tangent=tangent, second=second, ensemble=ensemble, events=events)
@@ -433,9 +435,9 @@ class CompiledMethod:
         check_features(feature, *together)
         return Support(str(refusal_of(self, feature, *together) or ""))
 
-    def with_events(self, events: EventLike | Sequence[EventLike]) -> Self:
-        """Return the integrator with these events in place of its own."""
-        events_of_runs = as_events(events)
+    def with_events(self, events: EventLike | Sequence[EventLike] | None) -> Self:
+        """Return the integrator with these events in place of its own, which ``None`` leaves."""
+        events_of_runs = self.events if events is None else as_events(events)
         if events_of_runs == self.events:
             return self
         if events_of_runs not in self._event_variants:

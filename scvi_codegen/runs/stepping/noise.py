@@ -124,7 +124,7 @@ class Noise(NamedTuple):
     ) -> Noise:
         """Return the stream of these arguments of a run; raise an error for those that the stepper excludes."""
         interface = stepper.interface
-        coloured = inputs is not None and any(isinstance(value, ColouredNoise) for value in inputs.values())
+        coloured = any(isinstance(value, ColouredNoise) for value in (inputs or {}).values())
         if interface.temperature is None and ((seed != 0 and not coloured) or metropolis):
             raise StateError(f"{OPTION['metropolis' if metropolis else 'seed']} {NO_BATH} '{interface.system}'")
         if metropolis and interface.layout.sizes:

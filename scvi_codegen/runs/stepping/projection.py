@@ -9,7 +9,7 @@ at generic points.
 import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -52,9 +52,11 @@ def projected(
     """Return the nearest state on the constraints, and (2,) its relative distance in q and in p.
 
     Distances are in the metric of the mass matrix at the projected state, hence independent of coordinate units.
+    Without constraints it is the state.
     """
     q0, p0 = stepper._states.pair(q, p)
-    _of_constrained(stepper, q0, p0, t)
+    if not stepper.constraints:
+        return q0, p0, np.zeros(2)
     binding, (q1, p1) = stepper.binding, np.empty((2, len(q0) * stepper.interface.words))
     block = stepper._states.block
     before, values = (block(q0), block(p0)), block(stepper._parameters(parameters))
@@ -73,13 +75,17 @@ def projected(
 
 def consistent(
     stepper: Integrator, q: States, p: States, t: float, parameters: Parameters, *, check_rank: bool = True
-) -> tuple[Array, Array]:
+) -> tuple[Any, Any]:
     """Return an initial state projected onto the constraints; warn unless rounding explains the distance.
+
+    Without constraints it is the state as it is.
 
     Raises:
         StateError: if the state is far from the constraints, if these are linearly dependent there
             (``check_rank``), or if an input that occurs in a constraint is not set.
     """
+    if not stepper.constraints:
+        return q, p
     for name in inputs_not_given(stepper.interface, parameters):
         if any(re.search(rf"\b{name}\b", formula) for formula in stepper.constraints):
             raise missing_input(name)
@@ -153,8 +159,7 @@ def check_reachable(stepper: Integrator, q: Array, p: Array, t: float, parameter
 
     Rates may jump: an impulse along the constraint gradients then changes the momenta. Positions cannot jump.
     """
-    moved = projected(stepper, q, p, t, parameters)[2][0]
-    if moved > INPUT_PRECISION:
+    if projected(stepper, q, p, t, parameters)[2][0] > INPUT_PRECISION:
         g = constraint_values(stepper, q, p, t, parameters)[0, 0]
         k = int(np.abs(g).argmax())
         raise StateError(
@@ -325,14 +330,11 @@ def rank_deficiency(names: Sequence[str], q: Array, at: Jacobian, *, nearest: bo
 
     ``nearest``: first minimise the constraint residual by Gauss-Newton iteration.
     """
-    for _ in range(ITERATIONS if nearest else 0):
+    for left in range(ITERATIONS if nearest else 0, -1, -1):
         g, jacobian = at(q)
         if not (np.isfinite(g).all() and np.isfinite(jacobian).all()):
             return None
-        q = q - np.linalg.lstsq(jacobian, g, rcond=DEPENDENT)[0]
-    g, jacobian = at(q)
-    if not (np.isfinite(g).all() and np.isfinite(jacobian).all()):
-        return None
+        q = q - np.linalg.lstsq(jacobian, g, rcond=DEPENDENT)[0] if left else q
     free = tangent_space(jacobian)
     rows = np.flatnonzero(np.abs(free.conditions).max(axis=1, initial=0.0) > NAMED_SHARE).tolist()
     if not rows:

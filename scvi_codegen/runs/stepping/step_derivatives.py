@@ -87,6 +87,11 @@ class Starts:
         states[:, 0] = q, p
         return cls(np.ascontiguousarray(t), np.ascontiguousarray(h), states[0], states[1], chained=True)
 
+    @property
+    def arrays(self) -> tuple[Array, ...]:
+        """Times, step sizes, positions and momenta, as C takes them."""
+        return self.t, self.h, self.q, self.p
+
     def part(self, first: int, last: int) -> Starts:
         """Return a view of the steps ``first`` to ``last`` - 1."""
         steps, states = slice(first, last), slice(first, last + 1)
@@ -301,7 +306,7 @@ class LinearisedMethod(StateFunctions):
         q1, p1 = (starts.q[1:], starts.p[1:]) if chained else np.empty((2, len(starts.h), m))
         status = binding.function("linearise")(
             len(starts.h),
-            *map(binding.pointer, (starts.t, starts.h, starts.q, starts.p, parameters)),
+            *map(binding.pointer, (*starts.arrays, parameters)),
             binding.options(options),
             int(transpose),
             vectors.shape[1],
@@ -331,7 +336,7 @@ class LinearisedMethod(StateFunctions):
         count, m, abscissae = len(starts.h), self.dimension, self._abscissae
         curves = np.empty((count, m, len(abscissae)))
         defects = Defects(np.empty((count, 2 * m)), np.empty(count, np.int32), curves, abscissae)
-        arrays = starts.t, starts.h, starts.q, starts.p, sizes, limits, defects.curves, defects.misfits
+        arrays = *starts.arrays, sizes, limits, defects.curves, defects.misfits
         pointers = map(self.binding.pointer, arrays)
         into = self.binding.pointer(defects.parts)
         status, report = self._call_steps("defects", parameters, None, count, *pointers, into)
@@ -368,8 +373,7 @@ class LinearisedMethod(StateFunctions):
         if self.interface.constraints:
             sizes = np.repeat(sizes.reshape(2, -1).max(axis=1), self.dimension)
         pointer, after = self.binding.pointer, np.empty_like(vectors)
-        steps = starts.t, starts.h, starts.q, starts.p
-        given = (*map(pointer, (*steps, sizes, defects.misfits)), pointer(defects.parts))
+        given = (*map(pointer, (*starts.arrays, sizes, defects.misfits)), pointer(defects.parts))
         settings = len(vectors), rounding, seed, pointer(vectors), pointer(after)
         status, report = self._call_steps(
             "differences", parameters, None, len(starts.h), *given, *settings, *self._columns(self.binding, results)
@@ -426,7 +430,7 @@ class LinearisedMethod(StateFunctions):
         ends[0, :, :size] = vectors
         status = binding.function("transport_errors")(
             len(starts.h),
-            *map(binding.pointer, (starts.t, starts.h, starts.q, starts.p, parameters)),
+            *map(binding.pointer, (*starts.arrays, parameters)),
             binding.null,
             len(defects.abscissae),
             *map(binding.pointer, (defects.abscissae, defects.curves)),
@@ -462,7 +466,7 @@ class LinearisedMethod(StateFunctions):
         report = binding.new("report *")
         status = binding.function("second_order")(
             len(starts.h),
-            *map(binding.pointer, (starts.t, starts.h, starts.q, starts.p, parameters)),
+            *map(binding.pointer, (*starts.arrays, parameters)),
             binding.options(options),
             vectors.shape[2],
             *map(binding.pointer, (changes, vectors)),

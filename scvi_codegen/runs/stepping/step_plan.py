@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any, NamedTuple, Self, TypeAlias
+from typing import Any, ClassVar, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,6 +36,16 @@ class FixedSteps:
 
     SAME = 1e-9  # relative difference of step sizes that rounding explains
     h: float
+
+    @property
+    def size(self) -> float:
+        """Step size."""
+        return self.h
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """Numbers by name for files."""
+        return {"h": self.h}
 
     def times(self, t: float, numbers: ArrayLike) -> NDArray[np.float64]:
         """Return the times after these numbers of steps from t, correctly rounded."""
@@ -83,6 +93,14 @@ class Adaptive:
     first_step: float | None = None
     absolute_tolerance: AbsoluteTolerance = ()
 
+    sizes: ClassVar[str] = "of adaptive size"
+    size: ClassVar[None] = None
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """Numbers by name for files; also arguments for users."""
+        return {"t_end": self.t_end} | ErrorControl.of(self).named
+
     @property
     def admissible_error(self) -> float:
         """Admissible relative error of a step in C, where errors below round-off count as round-off."""
@@ -95,6 +113,21 @@ class InTau:
 
     t_end: float
     tau: float
+
+    @property
+    def size(self) -> float:
+        """Step size in tau."""
+        return self.tau
+
+    @property
+    def sizes(self) -> str:
+        """Step sizes in words."""
+        return f"of {self.tau:g} in tau"
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """Numbers by name for files."""
+        return {"t_end": self.t_end, "tau": self.tau}
 
 
 StepPlan: TypeAlias = Fixed | Until | Adaptive | InTau
@@ -190,17 +223,8 @@ class ErrorControl(NamedTuple):
         return fields
 
 
-def plan_to_record(plan: Fixed | Adaptive | InTau) -> dict[str, Any]:
-    """Return a step plan as numbers by name for files."""
-    if isinstance(plan, Fixed):
-        return {"h": plan.h}
-    if isinstance(plan, InTau):
-        return {"t_end": plan.t_end, "tau": plan.tau}
-    return {"t_end": plan.t_end} | ErrorControl.of(plan).named
-
-
 def plan_from_record(*, h: Any = None, tau: Any = None, **control: Any) -> Fixed | Adaptive | InTau:
-    """Return the step plan of :func:`plan_to_record`; StateError or TypeError for other names and numbers."""
+    """Return the step plan of its ``record``; StateError or TypeError for other names and numbers."""
     if h is not None:
         if control or tau is not None:
             raise StateError("steps of one size have neither a target time nor a tolerance")

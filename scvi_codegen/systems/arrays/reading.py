@@ -1,6 +1,6 @@
 """Systems of arrays read from text or from SymPy expressions."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import chain
 from typing import Any, NamedTuple
@@ -18,6 +18,7 @@ from scvi_codegen.systems.arrays.system import (
     substituted,
     table_of,
 )
+from scvi_codegen.systems.bath import bath_of, friction_without_bath
 from scvi_codegen.systems.constraints import constraint_sides
 from scvi_codegen.systems.contact import names_in
 from scvi_codegen.systems.forces import damping_rate
@@ -59,8 +60,8 @@ def definition_of(arguments: Mapping[str, Any]) -> dict[str, Any]:
     return {key: list(value) if key in LISTED else value for key, value in defining.items()}
 
 
-def arrays_from_text(arguments: Mapping[str, Any], bath_of: Callable[..., Any] | None = None) -> ArraySystem:
-    """Return the system of the arguments of ``from_text`` of a Lagrangian or a Hamiltonian, in the bath of ``bath_of``.
+def arrays_from_text(arguments: Mapping[str, Any]) -> ArraySystem:
+    """Return the system of the arguments of ``from_text`` of a Lagrangian or a Hamiltonian.
 
     >>> print(arrays_from_text({
     ...     "name": "chain", "coordinates": ["q[N]"], "parameters": {"k": 2},
@@ -89,19 +90,16 @@ def arrays_from_text(arguments: Mapping[str, Any], bath_of: Callable[..., Any] |
     )
     lengths = {key: names.symbols[key] for key in scalars}
     neighbours = parse_neighbours(given["neighbours"], coordinates, lengths)
-    heated = bath_of is not None and arguments.get("temperature") is not None
-    damping, dissipation = (arguments.get(key) for key in ("damping", "dissipation"))
-    dissipated = () if dissipation is None else parse_sums(dissipation, *names, neighbours)
+    damping, _ = friction_without_bath(given)
+    dissipated = parse_sums(given["dissipation"], *names, neighbours) if "dissipation" in given else ()
+    resisting, of_bath = ((), dissipated) if "temperature" in given else (dissipated, ())
     rates = chain(_pairs(velocities, coordinates), *(_pairs(of.rates, of.torques()) for of in rotations))
-    forces = (*_forces(given, coordinates, rotations, names), *friction(() if heated else dissipated, dict(rates)))
-    terms = parse_sums(str(lagrangian if hamiltonian is None else hamiltonian), *names, neighbours)
+    forces = (*_forces(given, coordinates, rotations, names), *friction(resisting, dict(rates)))
+    kind, function = (ArrayLagrangian, lagrangian) if hamiltonian is None else (ArrayHamiltonian, hamiltonian)
     of_inputs = input_formulas(inputs, names.symbols[TIME])
+    driven = partial(substituted, rule=of_inputs)
     constant_or_moving = dict.fromkeys(fields.values()) | dict(_pairs(coordinates, velocities))
-    constraints = [
-        parse_constraint(constraint, *names, split=constraint_sides, velocities=constant_or_moving)
-        for constraint in given["constraints"]
-    ]
-    kind = ArrayLagrangian if hamiltonian is None else ArrayHamiltonian
+    condition = partial(parse_constraint, split=constraint_sides, velocities=constant_or_moving)
 
     def read(formula: Any) -> Expr:
         return parse_expression(str(formula), names.symbols).xreplace(of_inputs)
@@ -117,14 +115,14 @@ def arrays_from_text(arguments: Mapping[str, Any], bath_of: Callable[..., Any] |
         field_defaults=tuple(values[key] for key in fields),
         tables=names.tables,
         neighbours=neighbours,
-        terms=tuple(substituted(term, of_inputs) for term in terms),
-        forces=tuple(substituted(force, of_inputs) for force in forces),
+        terms=tuple(map(driven, parse_sums(str(function), *names, neighbours))),
+        forces=tuple(map(driven, forces)),
         functions=functions,
         inputs=tuple(inputs),
-        constraints=tuple(constraints),
-        damping=damping_rate(None if heated else damping, read),
-        bath=bath_of({**arguments, "dissipation": None}, read, read, ()) if bath_of and heated else None,
-        friction=dissipated if heated else (),
+        constraints=tuple(condition(text, *names) for text in given["constraints"]),
+        damping=damping_rate(damping, read),
+        bath=bath_of({**given, "dissipation": None}, read, read, ()),
+        friction=of_bath,
         rotations=rotations,
         definition=definition_of(arguments),
         data={parse_array(key).name: value for key, value in data.items()},

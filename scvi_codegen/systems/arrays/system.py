@@ -332,14 +332,12 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
         object.__setattr__(self, "arrays", arrays)
         object.__setattr__(self, "lengths", tuple(length for near in self.neighbours for length in near.lengths))
         self._check_names()
-        for term in self.terms:
-            if problem := unsupported_part(term.formula):
-                raise SystemDefinitionError(f"in the {self.function} of '{self.name}': {problem}")
+        formulas = [(f"the {self.function}", term.formula) for term in self.terms]
+        formulas += [(f"the force on {access}", formula) for force in self.forces for access, formula in force.targets]
+        for where, formula in formulas:
+            if problem := unsupported_part(formula):
+                raise SystemDefinitionError(f"in {where} of '{self.name}': {problem}")
         self._check_continuity()
-        for force in self.forces:
-            for access, formula in force.targets:
-                if problem := unsupported_part(formula):
-                    raise SystemDefinitionError(f"in the force on {access} of '{self.name}': {problem}")
         if self.constraints and self.momenta:
             raise SystemDefinitionError(
                 f"'{self.name}' is a Hamiltonian with constraints, which are supported for Lagrangians only: write the "
@@ -617,22 +615,18 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
 
     def warn_of_mistakes(self, others: Iterable[Symbol] = ()) -> None:
         """Warn of parameters and inputs that occur in no formula and not among ``others``, and of negative masses."""
-        terms = [*self.terms, *self.constraints]
-        formulas = [term.formula for term in terms] + [f for force in self.forces for _, f in force.targets]
-        formulas += [self.damping, *(term.formula for term in self.friction)]
-        used = (self.bath.symbols if self.bath else set()) | {
-            symbol(access.array.name) for access, _ in self.accesses
-        }.union(
-            *(f.free_symbols for f in formulas),
-            (symbol(convolution.coefficients.name) for sums in self.sums for convolution in sums),
-            others,
-        )
+        formulas = [term.formula for term in (*self.terms, *self.constraints, *self.friction)]
+        formulas += [self.damping, *(formula for force in self.forces for _, formula in force.targets)]
+        arrays = [access.array for access, _ in self.accesses]
+        arrays += [convolution.coefficients for sums in self.sums for convolution in sums]
+        used = {*others, *(symbol(array.name) for array in arrays), *(self.bath.symbols if self.bath else ())}
+        used = used.union(*(formula.free_symbols for formula in formulas))
         scalars = {symbol(array.name): value for array, value in zip(self.fields, self.field_defaults, strict=True)}
         values = scalars | self.constants
         warn_of_unused(self.name, self.function, values, self.inputs, used)
         moving = {array.name: array for array in self.momenta} or self._velocities
-        for name in moving:
-            this = {name: moving[name]}
+        for name, array in moving.items():
+            this = {name: array}
             kinetic = [term for term in self.terms for _ in velocity_symbols(term, this)]
             if len(kinetic) == 1:  # masses of several loops are added where these meet
                 (mass,) = masses_of(kinetic[0], this)

@@ -21,13 +21,13 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.common.precision import Number, mp
-from scvi_codegen.systems.formulas.expressions import Tape, jacobian, kinks_of, parts_of_type, shortened
+from scvi_codegen.systems.formulas.expressions import ATTEMPTS, Tape, jacobian, kinks_of, parts_of_type, shortened
 from scvi_codegen.systems.formulas.intermediates import parts
 from scvi_codegen.systems.formulas.kinks import Mode, rint, switching_function, unit_step
 from scvi_codegen.systems.formulas.tables import table_with_corners, without_tables
 
-POINTS, ATTEMPTS, ITERATIONS = 3, 24, 40
-"""Points of a surface that are examined; starts of Newton's method, and its iterations."""
+POINTS, ITERATIONS = 3, 40
+"""Points of a surface that are examined, and iterations of Newton's method."""
 MOST_SURFACES = 64
 """Largest number of surfaces of a function that are examined: those of arrays of known sizes are alike."""
 APART = (mp.mpf(10) ** -16, mp.mpf(10) ** -24)

@@ -61,8 +61,7 @@ def warn_of_mistakes(system: MechanicalSystem, others: Iterable[Expr] = ()) -> b
     )
     used = set[Symbol](energy).union(*(formula.free_symbols for formula in formulas))
     unused = warn_of_unused(system.name, function, system.parameters, system.inputs, used)
-    plain = system.clock.plain.formula if system.clock and system.clock.plain else system.formula
-    entries = {} if system.is_first_order else hessian(plain, variables)
+    entries = {} if system.is_first_order else hessian(system.in_time.formula, variables)
     masses = {f"d2{function[0]}/d{v}2": entries[i, i] for i, v in enumerate(variables) if (i, i) in entries}
     return warn_of_negative(system.name, masses, system.constants) or unused
 

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.common.precision import mp
@@ -40,6 +41,7 @@ STATES = 192
 
 def with_dry_friction(system: Any) -> Any:
     """Return the system with contacts in place of the dry friction in its forces; itself if there is none."""
+    from scvi_codegen.systems.formulas.expressions import jacobian
     from scvi_codegen.systems.lagrangian import LagrangianSystem
 
     if not isinstance(system, LagrangianSystem) or isinstance(system, OfRunTimeSizes) or _is_smooth(system):
@@ -49,9 +51,7 @@ def with_dry_friction(system: Any) -> Any:
     forces, contacts = system.forces, []
     for slip, divided in _slips(system):
         directions = [[part.diff(rate) for rate in system.velocities] for part in slip]
-        rows = [row for direction in directions for row in direction]
-        is_linear = all(map(any, directions)) and not any(row.free_symbols & {*system.velocities} for row in rows)
-        if is_linear:
+        if all(map(any, directions)) and not jacobian([*chain(*directions)], system.velocities):  # linear slips
             pushes, others = zip(*map(divided, forces), strict=True)
             if limit := _limit(system, slip, directions, pushes):
                 forces = others

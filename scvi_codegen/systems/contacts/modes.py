@@ -12,6 +12,7 @@ from dataclasses import replace
 from fractions import Fraction
 from functools import partial
 from itertools import repeat
+from operator import mul, sub
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from scvi_codegen.common.errors import SystemDefinitionError
@@ -271,75 +272,70 @@ class _Binding:
                 )
 
     def _add(self, number: int, item: Any) -> ContactRows:
-        of_gap = isinstance(item, Contact)
-        slips = slips_of(item)
+        of_gap, slips = isinstance(item, Contact), slips_of(item)
         along = [self._gradient(item, slip, self.system.velocities, "slip") for slip in slips]
         self._check_friction(item)
-        closed = self._mask(number, "closed") if of_gap else None
-        sticks = [self._mask(number, f"sticks_{k}") for k in range(1, len(slips) + 1)]
-        moving = self._slipping(number, slips) if slips else None
+        closed = self._mask(number, "closed") if of_gap else self.sympy.S.One
+        sticks = [self._mask(number, f"sticks_{k}") for k, _ in enumerate(slips, 1)]
+        moving = self._slipping(number, slips)
         held = self._mask(number, "held")
-        normal = tangential = None
-        transitions: dict[str, Expr] = {}
+        sliding = item.friction if of_gap else item.limit
+        drag = [sliding * self.sympy.Add(*map(mul, moving.direction, column)) for column in zip(*along, strict=True)]
+        normal, pressure = None, self.sympy.S.One
+        transitions: list[tuple[str, Expr]] = []
         conditions: list[Expr] = []
-        oblique = (
-            [
-                self.sympy.Add(*(d * b for d, b in zip(moving.direction, column, strict=True)))
-                for column in zip(*along, strict=True)
-            ]
-            if moving
-            else [0] * self.system.dimension
-        )
-        if closed is not None:
+        if of_gap:
             force = self._gradient(item, item.gap, self.system.coordinates, "gap")
-            if moving:
-                force = [a - item.friction * b for a, b in zip(force, oblique, strict=True)]
-            normal = self._row(item.gap, closed, force)
-            pushes = closed * self._multiplier(normal) + 1 - closed
-            transitions |= {"closes": item.gap + closed + held, "lifts": pushes}
-            conditions = [self._read(item, condition, "where") for condition in item.conditions]
+            normal = self._row(item.gap, closed, [*map(sub, force, drag)] or force)
+            pressure = self._multiplier(normal)
+            transitions += ("closes", item.gap + closed + held), ("lifts", _in_mode(closed, pressure))
+            conditions += map(partial(self._read, item, role="where"), item.conditions)
         else:
-            sliding = [self.turning.in_coordinates(item.limit * b) for b in oblique]
-            self.forces = [force - push for force, push in zip(self.forces, sliding, strict=True)]
-        if moving:
-            rows = [self._row(slip, mask, row) for slip, mask, row in zip(slips, sticks, along, strict=True)]
-            tangential = rows[0]
-            normal_force = self._multiplier(normal) if normal is not None else self.sympy.S.One
-            limit = normal_force * static_limit(item)
-            transitions["stops"] = (1 - held) * moving.ahead + held
-            tau = [self._multiplier(row) for row in rows]
-            if len(slips) == 1:
-                transitions["backward"] = sticks[0] * (limit - tau[0]) + 1 - sticks[0]  # slip begins against the force
-                transitions["forward"] = sticks[0] * (limit + tau[0]) + 1 - sticks[0]
-            else:
-                transitions["begins"] = sticks[0] * (limit**2 - tau[0] ** 2 - tau[1] ** 2) + 1 - sticks[0]
-        names = closed and closed.name, tuple(mask.name for mask in sticks), moving.names if moving else (), held.name
-        leaves = [("leaves", closed * u + (1 - closed) ** 2) for u in conditions if closed is not None]  # u if closed
-        drives = [("drives", function) for function in self._watched(item, closed, sticks)] if moving else []
-        quantities = self._add_quantities(
-            number, [*transitions.values(), *(function for _, function in drives), *conditions]
-        )
+            self.forces = [*map(sub, self.forces, map(self.turning.in_coordinates, drag))]
+        rows = [*map(self._row, slips, sticks, along)]
+        leaves = [("leaves", closed * u + (1 - closed) ** 2) for u in conditions]  # u if closed
+        if slips:
+            margins = _margins(pressure * static_limit(item), [*map(self._multiplier, rows)])
+            begins = [(kind, _in_mode(sticks[0], margin)) for kind, margin in margins.items()]
+            drives = zip(repeat("drives"), self._watched(sliding, static_limit(item), closed, sticks), strict=False)
+            transitions += ("stops", (1 - held) * moving.ahead + held), *begins, *leaves, *drives
+        else:
+            transitions += leaves
+        quantities = self._add_quantities(number, [*(function for _, function in transitions), *conditions])
         where = [f"{self._text_of(u)} >= 0" for u in conditions]
         functions = tuple(
-            (kind, self._text_of(function), *(where if kind == "closes" else ()))
-            for kind, function in (*transitions.items(), *leaves, *drives)
+            (kind, self._text_of(function), *(where if kind == "closes" else ())) for kind, function in transitions
         )
-        shown = () if item.name else (item.gap,) if of_gap else slips
-        title = item.name or f"{'gap' if of_gap else 'slip'} '{' and '.join(map(self.system.text_of, shown))}'"
-        law = getattr(item, "impacts", Impacts.SEQUENTIAL)
-        return ContactRows(normal, tangential, len(slips), *names, title, functions, law, quantities)
+        return ContactRows(
+            normal=normal,
+            tangential=next(iter(rows), None),
+            slips=len(slips),
+            closed=str(closed) if of_gap else None,
+            sticks=tuple(map(str, sticks)),
+            directions=moving.names,
+            held=held.name,
+            title=item.name or self._title(item),
+            transitions=functions,
+            impacts=getattr(item, "impacts", Impacts.SEQUENTIAL),
+            quantities=quantities,
+        )
 
-    def _watched(self, item: Any, closed: Symbol | None, sticks: Sequence[Symbol]) -> Iterator[Expr]:
+    def _title(self, item: ContactLike) -> str:
+        """Return the formulas of a contact without a name, for messages."""
+        part, formulas = ("gap", (item.gap,)) if isinstance(item, Contact) else ("slip", slips_of(item))
+        return f"{part} '{' and '.join(map(self.system.text_of, formulas))}'"
+
+    def _watched(self, sliding: Expr, static: Expr, closed: Expr, sticks: Sequence[Symbol]) -> Iterator[Expr]:
         """Yield what must not become negative: friction, and by how much that at rest exceeds it; 1 in other modes."""
-        sliding: Any = item.friction if isinstance(item, Contact) else item.limit
-        static = static_limit(item)
         excess = self.sympy.S.Zero if static == sliding else static - (1 - EQUAL) * sliding
         for formula, mask in ((sliding, closed), (excess, sticks[0])):
             if not (formula.is_nonnegative or formula.free_symbols <= {*self.system.parameters}):
-                yield formula if mask is None else mask * formula + 1 - mask
+                yield _in_mode(mask, formula)
 
     def _slipping(self, number: int, slips: Sequence[Expr]) -> Slipping:
         """Return the direction of a slip w: a parameter d in a plane, else that of (ahead.w) w + start."""
+        if not slips:
+            return Slipping((), self.sympy.S.One, ())
         if len(slips) == 1:
             d = self._mask(number, "direction")
             return Slipping((d,), d * slips[0] + 1 - d**2, (d.name,))
@@ -351,6 +347,21 @@ class _Binding:
         )
         names = (slides.name, *(vector.name for vector in vectors))
         return Slipping(tuple(slides * x / length for x in vector), slides * ahead + 1 - slides, names)
+
+
+def _in_mode(mask: Expr, function: Expr) -> Expr:
+    """Return a function that is 1 where its mask is 0."""
+    return mask * function + 1 - mask
+
+
+def _margins(limit: Expr, tau: Sequence[Expr]) -> dict[str, Expr]:
+    """Return by how much friction at rest stays within its limit, by the kind of slip that begins where it is 0.
+
+    In a plane the slip begins against the force: backward at tau = limit, forward at tau = -limit.
+    """
+    if len(tau) == 1:
+        return {"backward": limit - tau[0], "forward": limit + tau[0]}
+    return {"begins": limit**2 - tau[0] ** 2 - tau[1] ** 2}
 
 
 def mapped(item: ContactLike, function: Callable[[Any, str], Any]) -> Any:

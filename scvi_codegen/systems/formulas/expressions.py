@@ -10,8 +10,10 @@ Values are computed by straight-line programs that evaluate each subexpression o
 
 from __future__ import annotations
 
+import math
 import operator
 import random
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
@@ -49,7 +51,7 @@ from scvi_codegen.systems.formulas.kinks import (
     wrap,
 )
 
-LARGEST = 1.7976931348623157e308
+LARGEST = sys.float_info.max
 """Largest finite C double."""
 
 
@@ -272,7 +274,7 @@ def sums_to_zero(terms: Sequence[Expr]) -> bool:
 MAX_EXPONENT = 64
 MAX_EXPONENT_DENOMINATOR = 10_000
 MAX_BITS = 2048
-MAX_DIGITS = 616
+MAX_DIGITS = int(MAX_BITS * math.log10(2.0))
 """Maximum number of decimal digits of an integer of ``MAX_BITS`` bits."""
 MAX_PASSES = 8
 

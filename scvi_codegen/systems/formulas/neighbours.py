@@ -70,7 +70,9 @@ def parse_neighbours(
         arrays: coordinates.
         symbols: parameters by name.
     """
-    by_name, results = {array.name: array for array in arrays}, []
+    positions = {array.name: array for array in arrays if len(array.axes) == 1}
+    positions |= {array.name: array for array in arrays if [bool(axis.name) for axis in array.axes[1:]] == [False]}
+    results = []
     for name, entry in argument.items():
         check_name(name)
         keys = set(entry) if isinstance(entry, Mapping) else set()
@@ -78,8 +80,7 @@ def parse_neighbours(
             raise SystemDefinitionError(
                 f"the neighbours '{name}' must have the keys of and cutoff, and may have box and skin, not {entry!r}"
             )
-        array = by_name.get(str(entry["of"]))
-        if array is None or not 1 <= len(array.axes) <= 2 or (len(array.axes) == 2 and array.axes[1].name):
+        if (array := positions.get(str(entry["of"]))) is None:
             raise SystemDefinitionError(
                 f"the neighbours '{name}' are of '{entry['of']}', which is not an array of positions, as r[N, 3]"
             )

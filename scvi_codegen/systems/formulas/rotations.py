@@ -33,7 +33,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import product
+from itertools import chain, product
 from typing import Any
 
 import numpy as np
@@ -380,35 +380,39 @@ class RotationNames:
         """Return the forces by name of a coordinate (one), rotation or direction (three components), and ``others``."""
         if not isinstance(forces or {}, Mapping):
             raise SystemDefinitionError(f"forces must be a mapping from coordinates to formulas, not {forces!r}")
-        rotating = {member.name: member for member in self.rotations}
-        moved = [*coordinates, *(member.name for member in self.members if isinstance(member, Direction))]
+        into_body = {member.name: Matrix(3, 3, member.entries).T for member in self.rotations}
+        turning = dict.fromkeys(into_body, len(AXES))
+        moved = dict.fromkeys(coordinates, 1)
+        moved |= {member.name: len(AXES) for member in self.members if isinstance(member, Direction)}
+        in_space = self._stated("torque", "rotation", torques_space or {}, turning, read)
         total: dict[str, tuple[Expr, ...]] = {}
-
-        def add(name: str, force: Iterable[Expr]) -> None:
-            total[name] = tuple(map(Add, total[name], force)) if name in total else tuple(force)
-
-        for kind, where, by_name, targets in (
-            ("force", "coordinate", forces, moved),
-            ("torque", "rotation", torques, [*rotating]),
-            ("torque", "rotation", torques_space, [*rotating]),
+        for name, force in chain(
+            self._stated("force", "coordinate", forces or {}, moved, read),
+            self._stated("torque", "rotation", torques or {}, turning, read),
+            ((name, into_body[name] * Matrix(torque)) for name, torque in in_space),
+            others,
+            () if dissipation is None else self._friction(read(dissipation), coordinates),
         ):
-            for name, formulas in ((name_of_key(key), value) for key, value in (by_name or {}).items()):
-                if name not in targets:
-                    hint = f": write torques={{'{name}': [..]}}." if name in rotating else closest(name, targets)
-                    raise SystemDefinitionError(
-                        f"there is a {kind} on '{name}', which is not a {where}{hint} "
-                        f"{where.capitalize()}s: {', '.join(targets) or 'none'}"
-                    )
-                single = isinstance(formulas, str) or not isinstance(formulas, Sequence)
-                force = [*map(read, [formulas] if single else formulas)]
-                if len(force) != (1 if name in coordinates else len(AXES)):
-                    raise SystemDefinitionError(f"the {kind} on '{name}' must have three components, not {formulas!r}")
-                in_space = by_name is torques_space
-                add(name, Matrix(3, 3, rotating[name].entries).T * Matrix(force) if in_space else force)
-        friction = [] if dissipation is None else self._friction(read(dissipation), coordinates)
-        for name, components in (*others, *friction):
-            add(name, components)
+            total[name] = tuple(map(Add, total[name], force)) if name in total else tuple(force)
         return tuple(total.items())
+
+    def _stated(
+        self, kind: str, where: str, by_name: Mapping[Any, Any], targets: Mapping[str, int], read: Callable[[Any], Expr]
+    ) -> Iterator[tuple[str, Iterable[Expr]]]:
+        """Yield the forces or torques by name of what they act on; ``targets``: numbers of components by name."""
+        for key, formulas in by_name.items():
+            if (name := name_of_key(key)) not in targets:
+                turns = name in {member.name for member in self.rotations}
+                hint = f": write torques={{'{name}': [..]}}." if turns else closest(name, [*targets])
+                raise SystemDefinitionError(
+                    f"there is a {kind} on '{name}', which is not a {where}{hint} "
+                    f"{where.capitalize()}s: {', '.join(targets) or 'none'}"
+                )
+            single = isinstance(formulas, str) or not isinstance(formulas, Sequence)
+            force = [*map(read, [formulas] if single else formulas)]
+            if len(force) != targets[name]:
+                raise SystemDefinitionError(f"the {kind} on '{name}' must have three components, not {formulas!r}")
+            yield name, force
 
     def _friction(self, dissipation: Expr, coordinates: Sequence[str]) -> list[tuple[str, tuple[Expr, ...]]]:
         """Return the forces -dD/dv of Rayleigh's function."""

@@ -7,8 +7,9 @@ magnetic field, pendulums in spherical angles, masses that depend on the positio
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 from sympy import Add, Expr, S, Symbol
 
@@ -43,27 +44,17 @@ def site_hamiltonian(system: ArraySystem) -> SiteHamiltonian | None:
     moving = {array.name + DOT: Array(f"p_{array.name}", array.axes) for array in system.coordinates}
     if system.momenta or system.rotations or system.constraints or system.damping != 0:
         return None
-    if any(access.array.name in moving for force in system.forces for _, access in force.slots):
+    if any(_moving(force, moving) for force in system.forces):
         return None
-    groups: dict[tuple[object, ...], ArrayTerm] = {}
-    still: list[ArrayTerm] = []
-    for term in system.terms:
-        if not any(access.array.name in moving for _, access in term.slots):
-            still.append(term)
-            continue
-        site = _of_site(term, moving)
-        if site is None:
-            return None
-        former = groups.get(site.loops)
-        if former is not None:
-            site = term_of(site.loops, former.formula + site.formula, dict((*former.slots, *site.slots)))
-        groups[site.loops] = site
-    of_groups = [_transformed(group, moving) for group in groups.values()]
-    accessed = [access for group in groups.values() for _, access in group.slots if access.array.name in moving]
-    if None in of_groups or not _each_once(accessed, system.coordinates):
+    kinetic = [term for term in system.terms if _moving(term, moving)]
+    still = [term for term in system.terms if not _moving(term, moving)]
+    sites = [_of_site(term, moving) for term in kinetic]
+    groups = _sums_by_sites(filter(None, sites))
+    of_groups = [_transformed(group, moving) for group in groups]
+    accessed = chain.from_iterable(_moving(group, moving).values() for group in groups)
+    if None in sites or None in of_groups or not _each_once([*accessed], system.coordinates):
         return None
-    transformed = [parts for parts in of_groups if parts is not None]
-    energies, momenta, velocities = zip(*transformed, strict=True) if transformed else ((), (), ())
+    energies, momenta, velocities = zip(*filter(None, of_groups), strict=True) if of_groups else ((), (), ())
     hamiltonian = ArrayHamiltonian(
         **{name: getattr(system, name) for name in COMMON},
         momenta=tuple(moving.values()),
@@ -79,29 +70,41 @@ COMMON = (
 """Fields that a Lagrangian and its Hamiltonian have in common."""
 
 
+def _moving(term: ArrayTerm | ArrayForce, moving: dict[str, Array]) -> dict[Symbol, Access]:
+    """Return the velocities in a term."""
+    return {slot: access for slot, access in term.slots if access.array.name in moving}
+
+
 def _of_site(term: ArrayTerm, moving: dict[str, Array]) -> ArrayTerm | None:
     """Return a term with indices site0, site1, .. along the axes; ``None`` if elements share velocities."""
-    velocities = [access for _, access in term.slots if access.array.name in moving]
-    indices = {tuple(place.index for place in access.places if place.index) for access in velocities}
+    places = [(*zip(access.places, access.array.axes, strict=True),) for access in _moving(term, moving).values()]
+    indices = {tuple(place.index for place, _ in axes if place.index) for axes in places}
+    loops = {loop.index: loop for loop in term.loops}
     if len(indices) != 1 or any(loop.behind or not loop.is_whole for loop in term.loops):
         return None
     (order,) = indices
-    ends = {loop.index: loop.end for loop in term.loops}
-    for access in velocities:
-        for place, axis in zip(access.places, access.array.axes, strict=True):
-            if place.table or (place.index and (place.base.number or ends[place.index] != axis)):
-                return None
-    if set(order) != set(ends) or len(set(order)) < len(order):
+    along = [(place, axis) for place, axis in chain(*places) if place.index]
+    if any(place.table for place, _ in chain(*places)) or sorted(order) != sorted(loops):
         return None
-    names = {index: f"site{k}" for k, index in enumerate(order)}
-    renamed = {
-        slot: replace(access, places=tuple(replace(p, index=names[p.index]) if p.index else p for p in access.places))
-        for slot, access in term.slots
-    }
-    rule = {slot: symbol(str(access)) for slot, access in renamed.items()}
-    loops = {loop.index: replace(loop, index=names[loop.index]) for loop in term.loops}
-    accesses = {rule[slot]: access for slot, access in renamed.items()}
-    return term_of(tuple(loops[index] for index in order), term.formula.xreplace(rule), accesses)
+    if any(place.base.number or loops[place.index].end != axis for place, axis in along):
+        return None
+    names = {"": ""} | {index: f"site{k}" for k, index in enumerate(order)}
+    rule, accesses = dict[Symbol, Symbol](), dict[Symbol, Access]()
+    for slot, access in term.slots:
+        renamed = replace(access, places=tuple(replace(place, index=names[place.index]) for place in access.places))
+        rule[slot] = symbol(str(renamed))
+        accesses[rule[slot]] = renamed
+    sites = tuple(replace(loops[index], index=names[index]) for index in order)
+    return term_of(sites, term.formula.xreplace(rule), accesses)
+
+
+def _sums_by_sites(terms: Iterable[ArrayTerm]) -> list[ArrayTerm]:
+    """Return the sum of all terms of the same sites."""
+    groups: dict[tuple[object, ...], ArrayTerm] = {}
+    for term in terms:
+        former = groups.get(term.loops, replace(term, formula=S.Zero))
+        groups[term.loops] = term_of(term.loops, former.formula + term.formula, dict((*former.slots, *term.slots)))
+    return [*groups.values()]
 
 
 def _each_once(accesses: Sequence[Access], coordinates: Sequence[Array]) -> bool:
@@ -119,9 +122,9 @@ def _each_once(accesses: Sequence[Access], coordinates: Sequence[Array]) -> bool
 
 def _transformed(group: ArrayTerm, moving: dict[str, Array]) -> tuple[ArrayTerm, ArrayForce, ArrayForce] | None:
     """Return the term of H, and the gradients of l by velocities and of H by momenta."""
-    pairs = [(slot, access) for slot, access in group.slots if access.array.name in moving]
-    v = [slot for slot, _ in pairs]
-    p_accesses = [replace(access, array=moving[access.array.name]) for _, access in pairs]
+    rates = _moving(group, moving)
+    v = [*rates]
+    p_accesses = [replace(access, array=moving[access.array.name]) for access in rates.values()]
     p = [symbol(str(access)) for access in p_accesses]
     entries, derivatives = hessian(group.formula, v), gradient_tuple(group.formula, v)
     if any(entry.free_symbols & set(v) for entry in entries.values()):
@@ -139,7 +142,7 @@ def _transformed(group: ArrayTerm, moving: dict[str, Array]) -> tuple[ArrayTerm,
     return (
         term_of(group.loops, energy, accesses),
         _gradient(group, p_accesses, derivatives, accesses),
-        _gradient(group, [access for _, access in pairs], gradient_tuple(energy, p), accesses),
+        _gradient(group, [*rates.values()], gradient_tuple(energy, p), accesses),
     )
 
 

@@ -12,6 +12,7 @@ symmetry with the same reduced space T*SO(3).
 
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import chain
 
 import sympy
 from sympy import Add, Expr, Matrix, S, Symbol
@@ -35,15 +36,14 @@ def hamiltonian_of_rotations(system: LagrangianSystem) -> HamiltonianSystem | No
     if reduced is None or system.constraints or len(names.rotations) < len(names.members):
         return None
     ordinary = [q for q in system.coordinates if q.name not in names.coordinates]
-    rates = (rate for rotation in names.rotations for rate in rotation.rates)
-    u = (*(symbol(f"{q.name}_dot") for q in ordinary), *rates)
+    u = (*(symbol(f"{q.name}_dot") for q in ordinary), *chain(*(rotation.rates for rotation in names.rotations)))
     inverse = _inverse_of_constant(reduced.lagrangian, u, set(system.parameters))
     if inverse is None:
         return None
     momenta = {q: symbol(f"p_{q.name}") for q in system.coordinates}
     at_rest = dict.fromkeys(u, S.Zero)
     linear = gradient_tuple(reduced.lagrangian, u)
-    mu = [momenta[q] for q in ordinary]
+    mu = [*map(momenta.__getitem__, ordinary)]
     for rotation in names.rotations:
         mu += rotation.body_momentum(tuple(momenta[symbol(name)] for name in rotation.coordinates))
     rest = Matrix([m - rate.xreplace(at_rest) for m, rate in zip(mu, linear, strict=True)])

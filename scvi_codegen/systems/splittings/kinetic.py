@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise, permutations
+from operator import mul
 from typing import Any
 
 from sympy import Add, Expr, Matrix, Quaternion, Rational, S, atan2, cos, expand, eye, sin, sqrt, zeros
@@ -135,7 +136,7 @@ def kinetic_splitting(system: MechanicalSystem) -> KineticSplitting | str:
     members = system.rotations
     q = system.coordinates
     p = system.auxiliaries
-    bound = members and (system.constraints or not all(isinstance(member, Rotation) for member in members))
+    bound = members and (system.constraints or {*map(type, members)} != {Rotation})
     if not p or forms.one_form or system.damping != 0 or bound:
         return "there are constraints, damping, directions or spins, or masses that vary"
     places = [q.index(symbol(member.coordinates[0])) for member in members]
@@ -143,22 +144,24 @@ def kinetic_splitting(system: MechanicalSystem) -> KineticSplitting | str:
     for k in places:  # conj(q) p = (q . p, 2 Pi)
         values[k : k + 4] = (Quaternion(*q[k : k + 4]).conjugate() * Quaternion(*p[k : k + 4])).args
     upright: dict[Expr, Expr] = {q[i]: S(int(i in places)) for i in turning}
-    velocity = [expand(rate.xreplace(upright)) if members else rate for rate in forms.legendre]
+    velocity = [*(expand(rate.xreplace(upright)) for rate in forms.legendre)] if members else [*forms.legendre]
     if jacobian(velocity, (*q, system.time)):
         return "the kinetic energy has coefficients that depend on coordinates or time"
     bodies = [_body(k, velocity[k : k + 4], p[k + 1 : k + 4], system) for k in places]
     if reasons := [body for body in bodies if isinstance(body, str)]:
         return reasons[0]
-    at_rest = dict.fromkeys(p, S.Zero)
+    force, applied = forms.force, forms.force
     if members:
-        energy = Add(*(v * x / 2 for v, x in zip(velocity, p, strict=True))).xreplace(dict(zip(p, values, strict=True)))
+        at_rest = dict.fromkeys(p, S.Zero)
+        energy = Add(*map(mul, velocity, p)).xreplace(dict(zip(p, values, strict=True))) / 2
         if expand(system.formula - system.formula.xreplace(at_rest) - energy) != 0:
             return "the kinetic energy is not a quadratic form in the momenta with constant coefficients"
-    force = [component.xreplace(at_rest) for component in forms.force] if members else forms.force
-    if jacobian(system.forces if members else force, (*system.velocities, *p)):
+        force, applied = tuple(component.xreplace(at_rest) for component in force), system.forces
+    if jacobian(applied, (*system.velocities, *p)):
         return "there are forces or torques that depend on velocities"
-    ordinary = tuple(S.Zero if i in turning else rate for i, rate in enumerate(velocity))
-    return KineticSplitting(system, tuple(force), ordinary, *map(tuple, zip(*bodies, strict=True)))
+    for i in turning:
+        velocity[i] = S.Zero
+    return KineticSplitting(system, force, tuple(velocity), *map(tuple, zip(*bodies, strict=True)))
 
 
 def _body(first: int, v: Sequence[Expr], p: Sequence[Expr], system: MechanicalSystem) -> tuple[Any, ...] | str:

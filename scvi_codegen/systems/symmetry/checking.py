@@ -30,7 +30,7 @@ from scvi_codegen.systems.formulas.expressions import (
 )
 from scvi_codegen.systems.formulas.grammar import parse_expression
 from scvi_codegen.systems.symmetry.invariants import combined, conserved, gauge_columns, polynomial_in
-from scvi_codegen.systems.symmetry.sampling import Sample, rates_of
+from scvi_codegen.systems.symmetry.sampling import VERIFIED_AT, Sample, rates_of
 from scvi_codegen.systems.symmetry.symmetry import MAX_SEARCHED_COORDINATES, Symmetry
 from scvi_codegen.systems.system import MechanicalSystem
 
@@ -67,8 +67,6 @@ def is_total_derivative(system: MechanicalSystem, change: Expr, points: Iterable
 
 
 MAX_SHOWN_LENGTH = 300
-DECIDED_AT = 3
-"""Number of points at which the change of L is tested."""
 
 
 @checks_arguments(system=MechanicalSystem.KIND)
@@ -162,7 +160,7 @@ def _integrated_gauge(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
         if conserved(system, motion, [product]):
             return f
     parameters = {x: mp.mpf(value) for x, value in motion.constants.items()}
-    if is_total_derivative(system, change, motion.points(parameters, DECIDED_AT)) is False:
+    if is_total_derivative(system, change, motion.points(parameters, VERIFIED_AT)) is False:
         raise SystemDefinitionError(_defect(system, xi, None))
     raise SystemDefinitionError(
         f"it is undecided whether ({', '.join(map(str, xi))}) is a symmetry of '{system.name}': along "

@@ -24,7 +24,7 @@ from sympy import Expr, Symbol
 from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.systems.constraints import constraint_multipliers, with_constraint_forces
 from scvi_codegen.systems.derived_expressions import forms_of
-from scvi_codegen.systems.formulas.expressions import LARGEST, Tape, evaluate
+from scvi_codegen.systems.formulas.expressions import ATTEMPTS, LARGEST, Tape, evaluate
 from scvi_codegen.systems.formulas.intermediates import parts
 from scvi_codegen.systems.formulas.numpy_values import array_value
 from scvi_codegen.systems.system import MechanicalSystem
@@ -137,8 +137,8 @@ Array = NDArray[np.float64]
 SEED = 20250101
 SPREADS = (1.0, 0.3, 0.1)
 """Scales of velocities or momenta; some Lagrangians are defined for small ones only."""
-ATTEMPTS = 24
 VERIFIED_AT = 3
+"""Number of points at which an identity is tested."""
 LONGEST_NUMBER = 1000
 """Longest numerator or denominator of exact numbers; longer ones are treated as parameters (measured values)."""
 

@@ -42,6 +42,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain
+from sys import float_info
 from typing import Any
 
 import numpy as np
@@ -80,7 +81,7 @@ from scvi_codegen.codegen.lowering.stage_groups import (
 from scvi_codegen.common.precision import Matrix, Vector, mp
 from scvi_codegen.methods.stage_system import Accelerations, Shape, Velocities, words_of_tables
 from scvi_codegen.methods.tables.basis import matrix_product, transpose
-from scvi_codegen.systems.derived_expressions import InverseMass, forms_of
+from scvi_codegen.systems.derived_expressions import InverseMass, dense, forms_of
 from scvi_codegen.systems.formulas.expressions import gradient_tuple, jacobian
 from scvi_codegen.systems.formulas.intermediates import inner_of
 from scvi_codegen.systems.formulas.symbols import symbol
@@ -197,10 +198,8 @@ def _is_stable(system: LagrangianSystem, entries: Mapping[tuple[int, int], Expr]
     values = dict(zip(system.parameters, system.defaults, strict=True))
     if any(entry.free_symbols - (values.keys() - inputs) for entry in entries.values()):
         return False
-    matrix = np.zeros((system.dimension, system.dimension))
-    for place, entry in entries.items():
-        matrix[place] = float(entry.xreplace(values))
-    rates = np.linalg.eigvalsh(matrix)
+    numbers = (entry.xreplace(values) for entry in entries.values())
+    rates = np.linalg.eigvalsh(dense(entries, numbers, (system.dimension, system.dimension)))
     return bool(rates[0] < 0 and rates[-1] <= ROUNDING * -rates[0])
 
 
@@ -340,7 +339,6 @@ def _nearly_equal(a: Matrix, b: Matrix) -> bool:
 
 EPSILON = 1e-14
 """Largest difference of tables that rounding explains."""
-FRACTION_BITS = 51
 MOST_LINEARISED, MOST_COUPLED = 8, 2
 """Largest numbers of coordinates with linearised forces; beyond, their derivatives cost more than they save: if masses
 depend on positions, and if momenta do with masses that do not."""
@@ -429,7 +427,7 @@ def weighted_tables(tables: VelocityTables) -> tuple[Matrix, Vector, Matrix, Vec
     if not tables.variational:
         ones = (mp.one,) * len(beta)
         return tables.position, ones, tables.momentum, ones
-    unit = mp.ldexp(1, FRACTION_BITS * words_of_tables())
+    unit = mp.ldexp(1, (float_info.mant_dig - 2) * words_of_tables())
     mu = tuple(tuple(mp.nint(x * unit) / unit for x in over(line, beta)) for line in tables.position)
     if tables.projection:
         return mu, beta, tuple(over(line, weights) for line in tables.momentum), weights

@@ -183,10 +183,8 @@ def _tables_of_functions() -> str:
         sines = [(-1) ** (n + 1) / mp.factorial(2 * n + 3) for n in range(7)]
         cosines = [(-1) ** (n + 1) / mp.factorial(2 * n + 2) for n in range(7)]
         exponential = [1 / mp.factorial(n + 2) for n in range(11)]
-        turn = []
-        for k in range(PER_TURN):
-            both = [mp.zero if abs(x) < mp.mpf(10) ** -60 else x for x in (mp.sin(k * angle), mp.cos(k * angle))]
-            turn.append([*_words(both[0], 2), *_words(both[1], 2)])
+        circle = [map(mp.chop, (mp.sin(k * angle), mp.cos(k * angle))) for k in range(PER_TURN)]
+        turn = [[word for x in both for word in _words(x, 2)] for both in circle]
         powers = [_words(mp.exp(k * exponent), 2) for k in range(PER_BINADE)]
         signed = [k if k < NEAR else k - 2 * NEAR for k in range(2 * NEAR)]  # row of k: k modulo the number of rows
         near = [_words(mp.expm1(k * exponent), 2) for k in signed]

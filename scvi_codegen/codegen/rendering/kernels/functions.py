@@ -286,15 +286,14 @@ def _text(kernel: Kernel, target: Target, lanes: Lanes | None, printed: Printed,
     time, parameter = (lanes.type_of(name, target.scalar) if lanes else real for name in ("t", "parameters"))
     declared = {name: f"{real} *{name}" for name in ARRAYS} | {"u": f"const {real} *u", "t": f"{time} t"}
     declared |= {"parameters": f"const {parameter} *parameters", "kept": f"{real} *restrict kept"}
-    cut = parts(kernel)
-    texts = [
-        _function(PART, part, [declared[name] for name in ARRAYS if part.uses(name)], printed(part))
-        for part in (cut if len(cut) > 1 else ())
-    ]
-    texts += [
-        text for loop in kernel.sums for text in (_text(loop.kernel, target, lanes, printed), *_tables(loop, target))
-    ]
-    statements = [*printed(kernel), *(line for loop in kernel.sums for line in _Rows(loop, real, parameter).lines())]
+    texts = []
+    if len(cut := parts(kernel)) > 1:
+        arrays = [[declared[name] for name in filter(part.uses, ARRAYS)] for part in cut]
+        texts = [_function(PART, *of, printed(of[0])) for of in zip(cut, arrays, strict=True)]
+    statements = [*printed(kernel)]
+    for loop in kernel.sums:
+        texts += _text(loop.kernel, target, lanes, printed), *_tables(loop, target)
+        statements += _Rows(loop, real, parameter).lines()
     last = ["derivative"] if len(kernel.results) > kernel.values or partials else []
     names = ["u", "t", "parameters", *(["value"] if kernel.values or not last else []), *last]
     counts = ", ".join(f"{count} {operator}" for operator, count in kernel.operation_counts().items()) or "constants"

@@ -208,11 +208,12 @@ def gathered(table: Any, blocks: Sequence[Any]) -> sympy.Expr:
 
 def _group_terms(letter: str, group: Sequence[tuple[Column, Any]]) -> Iterator[sympy.Expr]:
     """Yield unknowns of one kind times their coefficients."""
-    columns, numbers = [column for column, _ in group], [int(block.index) for _, block in group]
+    pairs = [(column, int(block.index)) for column, block in group]
+    columns, numbers = map(list, zip(*pairs, strict=True))
     factor, span = h ** group[0][1].power, (j, numbers[0], numbers[-1])
     kinds = {column.kind for column in columns}
-    named = [(column, number) for column, number in zip(columns, numbers, strict=True) if column.kind == "named"]
-    present = [(column, number) for column, number in zip(columns, numbers, strict=True) if column.kind != "zero"]
+    named = [(column, number) for column, number in pairs if column.kind == "named"]
+    present = [(column, number) for column, number in pairs if column.kind != "zero"]
     if not present:
         return
     if len(present) == 1 and present[0][0].kind in ("named", "constant"):

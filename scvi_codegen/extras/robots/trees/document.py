@@ -133,6 +133,10 @@ class Element:
         """Return the first child with a tag."""
         return next(iter(self.children(tag)), None)
 
+    def optional(self, tag: str) -> Element:
+        """Return the first child with a tag; one without attributes if there is none."""
+        return self.child(tag) or Element(ElementTree.Element(tag), self.places)
+
     def unit(self, key: str, default: Sequence[float] | None = None) -> Vector:
         """Return an attribute as a vector of length 1."""
         vector = self.vector(key, default)

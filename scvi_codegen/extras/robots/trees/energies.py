@@ -36,7 +36,7 @@ Robotics Research 10 (1991), 371-381; R. Featherstone, Rigid Body Dynamics Algor
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import chain
+from itertools import chain, islice
 from types import MappingProxyType
 from typing import Any
 
@@ -276,21 +276,15 @@ class Tree:
         Raises:
             SystemDefinitionError: if a joint does not exist.
         """
-        singles = [joint.name for joint in self.joints.values() if joint.kind in SINGLE and not joint.follows]
-        if isinstance(actuated, bool):
-            actuated = singles if actuated else []
-        names = {joint.label: joint.name for joint in self.joints.values()}
-        driven = [names.get(name, name) for name in actuated]
-        for name in driven:
-            if name not in singles:
-                raise SystemDefinitionError(f"there is no hinge or slide '{name}' to act on{closest(name, singles)}")
-        free = [joint for joint in self.joints.values() if joint.kind == "free"]
-        turning = [rotation_of(joint) for joint in self.joints.values() if joint.kind in ("ball", "free")]
+        joints = [*self.joints.values()]
+        singles = [joint.name for joint in joints if joint.kind in SINGLE and not joint.follows]
+        driven = self._driven(actuated, singles)
+        free = [joint for joint in joints if joint.kind == "free"]
+        turning = [rotation_of(joint) for joint in joints if joint.kind in ("ball", "free")]
         names_of_q = [*chain.from_iterable(map(position_of, free)), *singles]
-        spins = (rate for rotation in turning for rate in rotation.rates)
-        rates = [*(symbol(name + DOT) for name in names_of_q), *spins]
-        pulls = {symbol(joint.name + DOT): joint.pull for joint in self.joints.values()}
-        acting = (between(f, pulls.get(rate)) for rate, f in zip(rates, forces_on(rates, actuating), strict=True))
+        rates = [*(symbol(name + DOT) for name in names_of_q), *chain(*(rotation.rates for rotation in turning))]
+        pulls = {symbol(joint.name + DOT): joint.pull for joint in joints}
+        acting = map(between, forces_on(rates, actuating), map(pulls.get, rates))
         loads = map(Add, forces_on(rates, self.loads_of_medium()), acting)
         forces = {name: next(loads) + (symbol(f"tau_{name}") if name in driven else 0) for name in names_of_q}
         return {
@@ -299,9 +293,20 @@ class Tree:
             "lagrangian": self.kinetic_energy() - self.potential_energy(),
             "dissipation": self.dissipation(),
             "forces": {name: force for name, force in forces.items() if force != 0},
-            "torques": {turn.name: load for turn in turning if any(load := [next(loads) for _ in range(3)])},
+            "torques": {turn.name: load for turn in turning if any(load := [*islice(loads, 3)])},
             "inputs": [f"tau_{name}" for name in driven],
         }
+
+    def _driven(self, actuated: Collection[str] | bool, singles: Sequence[str]) -> list[str]:
+        """Return the names of the hinges and slides on which inputs act."""
+        if isinstance(actuated, bool):
+            return [*singles] * actuated
+        names = {joint.label: joint.name for joint in self.joints.values()}
+        driven = [names.get(name, name) for name in actuated]
+        if unknown := [name for name in driven if name not in singles]:
+            name = unknown[0]
+            raise SystemDefinitionError(f"there is no hinge or slide '{name}' to act on{closest(name, singles)}")
+        return driven
 
 
 def forces_on(rates: Sequence[Symbol], loads: Iterable[tuple[Expr, Expr]]) -> Iterator[Expr]:
@@ -415,13 +420,7 @@ def system_of_tree(
             raise SystemDefinitionError(f"{problem}, or integrate it as it is written by check_inertias=False")
         warn(problem, SystemDefinitionWarning)
     contacts = *tree.contacts(law), *touching
-    rows, of_parts = (sum(item.rows for item in some) for some in (contacts, touching))
-    if rows > Contact.MOST_ROWS:
-        raise SystemDefinitionError(
-            f"the robot has {rows} gaps and slips of contacts, {of_parts} of them of geoms and tendons, of at "
-            f"most {Contact.MOST_ROWS}: leave some out by contype='0' conaffinity='0' or condim='1' of geoms, "
-            "<exclude>, limits='ignore' or friction='ignore'"
-        )
+    check_rows(contacts, touching)
 
     def made(**fields: Any) -> Any:
         members = fields.get("rotations", ())
@@ -445,6 +444,17 @@ def system_of_tree(
                 f"joint '{idle[0]}' moves no mass: give a link that it carries an <inertial>, or fix the joint"
             ) from error
         raise
+
+
+def check_rows(contacts: Sequence[Contact | Friction], touching: Sequence[Contact | Friction]) -> None:
+    """Raise :class:`SystemDefinitionError` for more gaps and slips, some of parts that touch, than a step can have."""
+    rows, of_parts = (sum(item.rows for item in some) for some in (contacts, touching))
+    if rows > Contact.MOST_ROWS:
+        raise SystemDefinitionError(
+            f"the robot has {rows} gaps and slips of contacts, {of_parts} of them of geoms and tendons, of at "
+            f"most {Contact.MOST_ROWS}: leave some out by contype='0' conaffinity='0' or condim='1' of geoms, "
+            "<exclude>, limits='ignore' or friction='ignore'"
+        )
 
 
 def _in_quaternions(

@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import combinations, zip_longest
+from itertools import chain, combinations, zip_longest
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from scvi_codegen.extras.robots.trees.actuators import (
     ACTED,
     JOINTED,
     Actuator,
+    Motion,
     Range,
     activation_of,
     actuator_of,
@@ -215,16 +216,15 @@ class _MujocoModel:
         """Yield the pairs of geoms of different bodies that may touch, in MuJoCo's rules."""
         if self.disabled & {"contact", "constraint"}:
             return
-        stated = [element for section in self.root.children("contact") for element in section.children()]
+        stated = self.root.children("contact")
         written = set[tuple[int, ...]]()
-        for pair in (element for element in stated if element.tag == "pair"):
+        for pair in chain(*(section.children("pair") for section in stated)):
             first, second = sorted(self.place(pair, key)[0] for key in ("geom1", "geom2"))
             written.add((first, second))
             yield Pair.of_element(pair, self.geoms[first], self.geoms[second])
         excluded = {
             frozenset(self.place(element, key)[0] for key in ("body1", "body2"))
-            for element in stated
-            if element.tag == "exclude"
+            for element in chain(*(section.children("exclude") for section in stated))
         }
         near = set() if "filterparent" in self.disabled else {*self.parents.items()}
         shapes = [(k, geom.link, self.carriers[geom.link], *geom.types) for k, geom in enumerate(self.geoms)]
@@ -302,30 +302,15 @@ class _MujocoModel:
         inverses = {self.links[k].joint.label: m for k, m in mean_inverses(self.completed() if damped else (), damped)}
         for element, target in zip(elements, targets, strict=True):
             gear = np.append(element.vector("gear", (1,), range(1, 7)), np.zeros(5))[:6]
-            places = [key for key in (*ACTED, "refsite") if element.has(key)]
-            if places != OF_SITES and len(places) > 1:
-                element.refuse(f"acts on {' and '.join(places)}: give one, or a site and its refsite")
-            if not target[0]:
-                element.refuse("acts on no joint, tendon or site, which are the parts that are read")
-            if target[0] == "site":
-                motion = motion_of_sites(self.links, [self.place(element, key) for key in places], gear)
-            else:
-                parts: Mapping[str, Joint | Tendon] = paths if target[0] == "tendon" else joints
-                part = element.named_by(target[0], target[0].removesuffix("inparent"), parts)
-                motion = motion_of(self.links, part, gear, target[0] == "jointinparent")
+            motion = self.acted_on(element, target[0], gear, {"tendon": paths, **dict.fromkeys(JOINTED, joints)})
             pull, several = paths[target[1]].pull if target[0] == "tendon" else None, targets.count(target) > 1
             if pull and several and not pull[0] < 0 < pull[1]:
                 element.refuse("is one of several on a tendon with actuatorfrcrange, which must contain 0")
-            law, inherited = activation_of(element), self.inherited(element, target)
-            controls = self.bounds(element, "ctrl", inherited)
-            activations = self.bounds(element, "act", inherited if law == "integrator" else (0, 0))
-            if law == "none" and activations:
-                element.refuse("has actrange, the range of an activation, which its dyntype does not have")
-            unclamped = law == "integrator" or "clampctrl" in self.disabled
-            controls = clamped(None if unclamped else controls, activations, 1.0)
-            ranges = controls, clamped(self.bounds(element, "force"), None if several else pull, 1.0)
+            law = activation_of(element)
+            controls = self.controls(element, law, self.inherited(element, target))
+            forces = clamped(self.bounds(element, "force"), None if several else pull, 1.0)
             inverse = inverses.get(target[1]) if target[0] in JOINTED else None
-            actuator = actuator_of(self.links, element, motion, gear[0], names, *ranges, inverse)
+            actuator = actuator_of(self.links, element, motion, gear[0], names, controls, forces, inverse)
             names[actuator[0]] = actuator[1]
             if element.number("group", 0) in self.idle:
                 actuator = *actuator[:-1], (S.Zero, S.Zero)
@@ -334,6 +319,27 @@ class _MujocoModel:
                 self.unread.add(f"the law of activations (dyntype '{law}'), which are the inputs, of", actuator[0])
             acting.append(actuator)
         return in_shared_ranges(acting, targets, tendons)
+
+    def acted_on(self, element: Element, kind: str, gear: Vector, parts: Mapping[str, Mapping[str, Any]]) -> Motion:
+        """Return the motion of the part of a kind on which an actuator acts."""
+        places = [key for key in (*ACTED, "refsite") if element.has(key)]
+        if places != OF_SITES and len(places) > 1:
+            element.refuse(f"acts on {' and '.join(places)}: give one, or a site and its refsite")
+        if not kind:
+            element.refuse("acts on no joint, tendon or site, which are the parts that are read")
+        if kind == "site":
+            return motion_of_sites(self.links, [self.place(element, key) for key in places], gear)
+        part = element.named_by(kind, kind.removesuffix("inparent"), parts[kind])
+        return motion_of(self.links, part, gear, kind == "jointinparent")
+
+    def controls(self, element: Element, law: str, inherited: Sequence[float]) -> Range:
+        """Return the range of the input of an actuator: of its control, or of its activation by a law."""
+        controls = self.bounds(element, "ctrl", inherited)
+        activations = self.bounds(element, "act", inherited if law == "integrator" else (0, 0))
+        if law == "none" and activations:
+            element.refuse("has actrange, the range of an activation, which its dyntype does not have")
+        unclamped = law == "integrator" or "clampctrl" in self.disabled
+        return clamped(None if unclamped else controls, activations, 1.0)
 
     def inherited(self, element: Element, target: tuple[str, str]) -> Sequence[float]:
         """Return the range of a control by ``inheritrange``, this multiple of that of its part; (0, 0) without."""

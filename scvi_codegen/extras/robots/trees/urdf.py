@@ -176,8 +176,8 @@ def _joints(joint: Element, parts: Collection[str], armature: float) -> list[Joi
     kind = joint.text("type")
     if kind not in KINDS:
         joint.refuse(f"is of type '{kind}', which is not read; possible: {', '.join(KINDS)}")
-    axis, dynamics, mimic, older = (joint.child(tag) for tag in ("axis", "dynamics", "mimic", "joint_properties"))
-    if older and (older.number("damping", 0) or older.number("friction", 0)):
+    dynamics, mimic, older = joint.optional("dynamics"), joint.child("mimic"), joint.optional("joint_properties")
+    if older.number("damping", 0) or older.number("friction", 0):
         older.refuse("has damping or friction, which is not read: write <dynamics>")
     single = KINDS[kind] in SINGLE
     follows = None
@@ -186,8 +186,9 @@ def _joints(joint: Element, parts: Collection[str], armature: float) -> list[Joi
             joint.refuse(f"is of type '{kind}', which cannot mimic another joint")
         follows = (mimic.text("joint"), mimic.number("multiplier", 1), mimic.number("offset", 0))
     bounds, friction = _limits(joint)
-    along = axis.unit("xyz", (1, 0, 0)) if axis and (single or kind == "planar") else np.array([1.0, 0.0, 0.0])
-    spring = dynamics.number("spring_stiffness", 0, 0) if dynamics else 0.0
+    turns = single or kind == "planar"
+    along = joint.optional("axis").unit("xyz", (1, 0, 0)) if turns else np.array([1.0, 0.0, 0.0])
+    spring = dynamics.number("spring_stiffness", 0, 0)
     if spring and not single:
         joint.refuse("has a spring_stiffness, which is read of revolute, continuous and prismatic joints only")
     read = Joint(
@@ -195,9 +196,9 @@ def _joints(joint: Element, parts: Collection[str], armature: float) -> list[Joi
         kind=KINDS[kind],
         pose=_pose(joint),
         axis=along,
-        damping=(dynamics.number("damping", 0, 0),) if dynamics else (),
+        damping=(dynamics.number("damping", 0, 0),),
         stiffness=(spring,),
-        rest=dynamics.number("spring_reference", 0) if dynamics else 0.0,
+        rest=dynamics.number("spring_reference", 0),
         armature=armature,
         limits=checked_limits(joint, *bounds) if bounds and "limits" in parts else None,
         dry_friction=friction if "friction" in parts else 0.0,
@@ -205,10 +206,9 @@ def _joints(joint: Element, parts: Collection[str], armature: float) -> list[Joi
     )
     if kind != "planar":
         return [read]
-    moved = zip(
-        ("x", "y", "angle"), (*["slide"] * 2, "hinge"), axes_of(along).T, (read.pose, Pose(), Pose()), strict=True
-    )
-    return [replace(read, name=f"{part}_{joint.name}", kind=kind, axis=e, pose=at) for part, kind, e, at in moved]
+    moved = zip(("x", "y", "angle"), ("slide", "slide", "hinge"), axes_of(along).T, strict=True)
+    x, *others = (replace(read, name=f"{part}_{joint.name}", kind=motion, axis=e) for part, motion, e in moved)
+    return [x, *(replace(other, pose=Pose()) for other in others)]
 
 
 def _inertia(link: Element) -> Inertia:
@@ -224,9 +224,7 @@ def _inertia(link: Element) -> Inertia:
 
 
 def _pose(element: Element) -> Pose:
-    origin = element.child("origin")
-    if origin is None:
-        return Pose()
+    origin = element.optional("origin")
     return Pose(origin.vector("xyz", (0, 0, 0)), rotation_of_rpy(origin.vector("rpy", (0, 0, 0))))
 
 

@@ -28,8 +28,7 @@ LONG_ARRAY = 1000
 
 def document_of(model: Model, *, as_arrays: bool = True) -> dict[str, Any]:
     """Return all sections, in the order of a file; ``as_arrays``: with the arrays that the system was read with."""
-    clock = model.system.clock
-    system = clock.plain if clock and clock.plain else model.system
+    clock, system = model.system.clock, model.system.in_time
     document, parameters, motion = _system_and_state(model, system, as_arrays=as_arrays)
     if g := clock.time_transformation if clock else model.time_transformation:
         document["system"]["time_transformation"] = g
