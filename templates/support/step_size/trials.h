@@ -27,6 +27,7 @@
 #define TRIED_AGAIN (-1) /* run->avoiding of the step after those by Newton's method */
 #define COST_OF_NEWTON (10LL * M * KEPT) /* of an update, in iterations: measured 1 to 10 times M KEPT */
 #define UPDATES 4 /* of a step by Newton's method from a straight line */
+#define LEAP 2 /* levels by which a free flight is larger than the step before */
 #define PARTS_OF_LEAP 16
 #define BEYOND_END REAL(0.125) /* of the step: part behind its end whose force is examined */
 #define OTHER_FORCE REAL(0.5) /* relative difference beyond which another force sets in */
@@ -638,11 +639,13 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
   return now->status;
 }
 
-/* Returns 1 for a free flight in doubt, as the error of its curve is rounding: one of another size than the step before.
- * Estimates see forces only at the points of a step, and a wall or a pulse may lie between them. */
+/* Returns 1 for a free flight in doubt, as the error of its curve is rounding: one that is much larger than the step
+ * before, or smaller, or after a step that was wrong. Estimates see forces only at the points of a step, and a wall or a
+ * pulse may lie between them. */
 static inline int is_leap(const run_memory *run, const trial *now)
 {
-  if ((run->step > 0 && now->change == 0) || now->error > now->limits.least)
+  const int changes = run->step == 0 || now->change >= LEAP || now->change < 0;
+  if (!(changes || run->steps_to_compare > 0) || now->error > now->limits.least)
     return 0;
   return by_newton(now) ? now->change >= LEVELS_PER_BINADE : estimate(run, now, 0) <= LEAST_UNRESOLVED;
 }
