@@ -116,7 +116,7 @@ class Contact:
     def laws(self) -> tuple[Expr, Expr, Expr]:
         """Coefficients of friction and static friction, 0 without, and of restitution, of expressions."""
         friction: Any = zero() if self.friction is None else self.friction
-        return friction, zero() if self.friction is None else static_limit(self), cast("Expr", self.restitution)
+        return friction, zero() if self.friction is None else limits_of(self)[1], cast("Expr", self.restitution)
 
     @property
     def rows(self) -> int:
@@ -172,7 +172,7 @@ class Friction:
     @property
     def laws(self) -> tuple[Expr, Expr, Expr]:
         """Limits of friction and static friction, and 0, of expressions."""
-        return cast("Expr", self.limit), static_limit(self), zero()
+        return *limits_of(self), zero()
 
     @property
     def rows(self) -> int:
@@ -298,12 +298,12 @@ def friction(
     return Friction(cast(Any, slip), limit, static_limit, name)
 
 
-def static_limit(item: Any) -> Any:
-    """Return the coefficient or the force up to which a contact sticks."""
-    kinetic, static = (
+def limits_of(item: Any) -> tuple[Any, Any]:
+    """Return the coefficients or the forces of friction: with which a contact slides, and up to which it sticks."""
+    sliding, static = (
         (item.friction, item.static_friction) if isinstance(item, Contact) else (item.limit, item.static_limit)
     )
-    return kinetic if static is None else static
+    return sliding, sliding if static is None else static
 
 
 def coefficients(system: Any) -> list[Expr]:

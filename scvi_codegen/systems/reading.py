@@ -38,6 +38,8 @@ Read = Callable[[Any], Expr]
 TURNING = ("rotations", "directions", "spins")
 TORQUES = ("torques", "torques_space")
 """Arguments of ``from_text`` of systems with rotations."""
+NOT_OF_ARRAYS = {"noise": "write their entries as coordinates", "point_forces": "give torques and forces by index"}
+"""Arguments of ``from_text`` that systems of arrays do not have, and what to do instead."""
 NAMES_AT_POINTS = ("body", "frame")
 """Entries of a force at a point that are names."""
 
@@ -52,10 +54,9 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
     turning = [arguments.get(key) for key in TURNING]
     declared = (parameters, arguments["tables"], *turning)
     if are_arrays(ordinary, *(declarations or () for declarations in declared)) or arguments.get("neighbours"):
-        if arguments.get("noise") is not None:
-            raise SystemDefinitionError("noise= of arrays is not supported: write their entries as coordinates")
-        if arguments.get("point_forces"):
-            raise SystemDefinitionError("point_forces of arrays are not supported: give torques and forces by index")
+        for name, remedy in NOT_OF_ARRAYS.items():
+            if arguments.get(name) not in (None, (), []):
+                raise SystemDefinitionError(f"{name}= of arrays is not supported: {remedy}")
         return _of_arrays(cls, arrays_from_text(arguments), arguments.get("contacts", ())), True
     names = RotationNames.declared(*turning, momentum=of_momenta)
     coordinates, momenta = (*ordinary, *names.coordinates), arguments.get("momenta", ())

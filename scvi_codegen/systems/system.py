@@ -346,6 +346,11 @@ class MechanicalSystem(Deferred, ABC):
         return dict(zip(self.parameters, self.defaults, strict=True))
 
     @property
+    def constants_by_name(self) -> dict[str, float]:
+        """Default values by the names of parameters."""
+        return {parameter.name: value for parameter, value in self.constants.items()}
+
+    @property
     def integrands(self) -> tuple[Expr, ...]:
         """Functions integrated along the curve of each step: the rate dt/dtau of a time transformation."""
         return (self.clock.rate,) if self.clock else ()

@@ -189,7 +189,7 @@ class EventFormulas:
             whole, grammar = str(text) if text is event.function else f"{text}{event.loops}", self._grammar
             try:
                 term = parse_constraint(whole, grammar.arrays, self._known, grammar.tables)
-                return [cast("Expr", term.formula.xreplace(rule)) for _, rule in grammar.rules.rules(term)]
+                return grammar.rules.formulas(term)
             except ScviCodegenError as error:
                 raise EventError(f"the formula '{text}' of the event '{event.function}': {error}") from error
 

@@ -38,7 +38,7 @@ def fields_at_points(section: Mapping[str, Any], system: Any) -> Mapping[str, An
     mesh: Mesh = system.mesh
     density, state = mesh.field_system, dict(section)
     names = {TIME: ModelSection.real(section.get(TIME, 0.0), "[initial] t"), **mesh.points}
-    names |= {parameter.name: value for parameter, value in zip(system.parameters, system.defaults, strict=True)}
+    names |= system.constants_by_name
     for key in {"q", "p", "q_dot"} & section.keys():
         value = section[key]
         if not isinstance(value, dict) or "file" in value:

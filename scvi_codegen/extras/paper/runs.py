@@ -332,8 +332,10 @@ def compared(claim: str, check: str, runs: Runs) -> Comparison:
         terms = [[term.strip() for term in chain.split("<")] for chain in chains.split(",")]
         keys = dict.fromkeys(term.split("*")[-1] for chain in terms for term in chain)
         measure, named = MEASURES[attribute], [runs[key] for key in keys if key in runs]
-        texts = ((getattr(run, attribute), run.label) for run in named)
-        listed = ", ".join(f"{'none' if x is None else format(x, measure.form)} ({label})" for x, label in texts)
+        listed = ", ".join(
+            f"{'none' if (x := getattr(run, attribute)) is None else format(x, measure.form)} ({run.label})"
+            for run in named
+        )
         measured.append(f"{measure.heading}: {listed}")
         for chain in terms:
             values = [_value(term, attribute, runs) for term in chain]

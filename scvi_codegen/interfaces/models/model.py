@@ -319,8 +319,8 @@ class Model(TimeSpan):
         """Parameters by name: the system's defaults, without the energy of a transformation and inputs; and fields."""
         clock = self.system.clock
         others = {clock.energy.name if clock else "", *input_parameters(self.system.inputs)}
-        constants = zip(self.system.parameters, self.system.defaults, strict=True)
-        return {**{symbol.name: value for symbol, value in constants if symbol.name not in others}, **self.fields}
+        constants = self.system.constants_by_name
+        return {name: value for name, value in constants.items() if name not in others} | {**self.fields}
 
     def first_step_size(self, stepper: Stepper) -> float:
         """Return h, or the size of the first adaptive step; with a time transformation, the step size in tau."""

@@ -18,7 +18,7 @@ from scvi_codegen.runs.accuracy.local_error import tolerable_change
 from scvi_codegen.runs.driver.singular_time import ProgressWatch, check_energy_surface
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import FEW, NUMBERS, SEQUENCES, Array, evaluation
-from scvi_codegen.runs.states.words import block_of
+from scvi_codegen.runs.states.words import block_of, from_block
 from scvi_codegen.runs.stepping.chunks import drive
 from scvi_codegen.runs.stepping.memory import Memory
 from scvi_codegen.runs.stepping.noise import report_of
@@ -119,27 +119,28 @@ class StateRows:
     """Memory for the times, positions, momenta and iterations of states of a run.
 
     Attributes:
-        states: the arrays, of times and states with the words of their numbers in each row; of a run that sums the
-            action, also its values.
+        states: the arrays; of a run that sums the action, also its values.
         starts: pointers to their first rows.
     """
 
     def __init__(self, memory: Memory, rows: int) -> None:
-        binding, self.layout = memory.stepper.binding, memory.stepper._states
-        m = self.layout.words * len(memory._q)
-        t, q, p = (empty_array((rows, numbers)) for numbers in (self.layout.words, m, m))
+        binding, self.words = memory.stepper.binding, memory.stepper.interface.words
+        m = self.words * len(memory._q)
+        t = empty_array((rows,) if self.words == 1 else (rows, self.words))
+        q, p = empty_array((rows, m)), empty_array((rows, m))
         actions = (np.zeros(rows),) if memory._sums_action else ()
         self.states: States = t, q, p, np.zeros(rows, INT32), *actions
         self.starts = *binding.pointers(t, q, p), binding.integers(self.states[3]), *binding.pointers(*actions)
 
     def after(self, row: int) -> tuple[Any, ...]:
         """Return pointers to a row."""
-        return tuple(start + row * column[0].size for start, column in zip(self.starts, self.states, strict=True))
+        (t, q, p, *others), begin = self.starts, row * self.states[1].shape[1]
+        return t + self.words * row, q + begin, p + begin, *(column + row for column in others)
 
     def first(self, count: int) -> States:
-        """Return the first rows, in the same memory."""
+        """Return the first rows, in the same memory; copies of numbers of two words."""
         t, q, p, *others = (column[:count] for column in self.states)
-        return self.layout.times(t), self.layout.numbers(q), self.layout.numbers(p), *others
+        return (t, q, p, *others) if self.words == 1 else (*_numbers(t, q, p), *others)
 
     def copies(self, count: int) -> States:
         """Return copies of the first rows."""
@@ -200,6 +201,11 @@ class ShortRuns(StateRows):
         return (t.copy(), q.copy(), p.copy(), iterations.copy()), sizes
 
 
+def _numbers(t: Array, q: Array, p: Array) -> tuple[Array, Array, Array]:
+    """Return times (n, 2) and states (n, 2m) of two words as numbers, contiguous copies."""
+    return from_block(t)[:, 0].copy(), from_block(q).copy(), from_block(p).copy()
+
+
 class _StateRecorder:
     """Present state of a run, and every ``save_every``-th of the following ones, in arrays that C fills.
 
@@ -219,7 +225,8 @@ class _StateRecorder:
         self.rows = kept if kept is not None and rows <= len(kept.states[0]) else StateRows(memory, rows)
         if not filled:
             t, q, p, _, *actions = self.rows.states
-            t[0], q[0], p[0] = block_of(memory._times), block_of(memory._q), block_of(memory._p)
+            t[0] = memory.t if self.rows.words == 1 else (memory.t, memory._memory.t_low)
+            q[0], p[0] = map(block_of, (memory._q, memory._p))
             for sums in actions:
                 sums[0] = memory._memory.action
         self.earlier: list[States] = []
@@ -255,8 +262,10 @@ class _StateRecorder:
     def _states(self) -> States:
         """Return the rows in use; copies if most are not, or if the run uses the memory again."""
         rows, count = self.rows, self.filled
-        mostly_free = 2 * count <= len(rows.states[0])
-        return rows.copies(count) if mostly_free or rows is self.memory._rows else rows.first(count)
+        capacity = len(rows.states[0])
+        if rows is self.memory._rows or 2 * count <= capacity:
+            return rows.copies(count)
+        return rows.states if count == capacity and rows.words == 1 else rows.first(count)
 
     def trajectory(self) -> Trajectory:
         memory, states = self.memory, self._states()

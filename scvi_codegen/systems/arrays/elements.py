@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ def unrolled_fields(
         for array in system.fields
         for name, value in zip(names[array.name].flat, fields[array.name].flat, strict=True)
     }
-    numbers = {parameter.name: value for parameter, value in system.constants.items()}
+    numbers = system.constants_by_name
     for name, value in remaining.items():
         if name not in numbers:
             raise SystemDefinitionError(f"'{system.name}' has no parameter '{name}'{closest(name, numbers)}")
@@ -110,8 +111,7 @@ def _formulas(system: ArraySystem, written: EntryRules, constants: Sequence[Symb
     )
     coordinates = (*coordinates, *map(symbol, turning.coordinates))
     summands, constraints, friction = (
-        [term.formula.xreplace(rule) for term in terms for _, rule in written.rules(term)]
-        for terms in (system.terms, system.constraints, system.friction)
+        [*chain(*map(written.formulas, terms))] for terms in (system.terms, system.constraints, system.friction)
     )
     total = {q: Add(*formulas) for q, formulas in written.forces(system.forces).items()}
     forces = _forces_by_name(turning, total)

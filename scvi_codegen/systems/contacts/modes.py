@@ -16,16 +16,7 @@ from operator import mul, sub
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.systems.contact import (
-    MOST_ROWS,
-    WORDS,
-    Contact,
-    ContactLike,
-    Friction,
-    Impacts,
-    slips_of,
-    static_limit,
-)
+from scvi_codegen.systems.contact import MOST_ROWS, WORDS, Contact, ContactLike, Friction, Impacts, limits_of, slips_of
 from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.event import LOOPS, Formula
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
@@ -177,18 +168,18 @@ class _Binding:
             if not isinstance(value, str):
                 return repeat(value)
             term = parse_constraint(value if value == first else value + loops, entries, self.names | self.functions)
-            return [term.formula.xreplace(rule) for _, rule in rules.rules(term)]
+            return rules.formulas(term)
 
         fields = {name: getattr(item, name) for name in item.__dataclass_fields__ if name not in WORDS}
         if fields.get("where") is not None:
             fields["where"] = tuple(map(str, cast("Contact", item).conditions))  # formulas that are >= 0
-        elements = [
-            dict(zip(fields, values, strict=True)) for values in zip(*map(formulas, fields.values()), strict=False)
-        ]
-        for element in elements:
+        elements = []
+        for values in zip(*map(formulas, fields.values()), strict=False):
+            element = dict(zip(fields, values, strict=True))
             if element.get("where") is not None:
                 element["where"] = tuple(self.sympy.Ge(part, 0, evaluate=False) for part in element["where"])
-        return [replace(cast("Any", item), **element) for element in elements]
+            elements.append(replace(cast("Any", item), **element))
+        return elements
 
     def _read(self, item: ContactLike, formula: Formula, role: str) -> Expr:
         """Return a formula in the names of rotations and directions."""
@@ -273,13 +264,13 @@ class _Binding:
 
     def _add(self, number: int, item: Any) -> ContactRows:
         of_gap, slips = isinstance(item, Contact), slips_of(item)
-        along = [self._gradient(item, slip, self.system.velocities, "slip") for slip in slips]
+        along = [*map(partial(self._gradient, item, variables=self.system.velocities, role="slip"), slips)]
         self._check_friction(item)
         closed = self._mask(number, "closed") if of_gap else self.sympy.S.One
         sticks = [self._mask(number, f"sticks_{k}") for k, _ in enumerate(slips, 1)]
         moving = self._slipping(number, slips)
         held = self._mask(number, "held")
-        sliding = item.friction if of_gap else item.limit
+        sliding, static = limits_of(item)
         drag = [sliding * self.sympy.Add(*map(mul, moving.direction, column)) for column in zip(*along, strict=True)]
         normal, pressure = None, self.sympy.S.One
         transitions: list[tuple[str, Expr]] = []
@@ -295,9 +286,9 @@ class _Binding:
         rows = [*map(self._row, slips, sticks, along)]
         leaves = [("leaves", closed * u + (1 - closed) ** 2) for u in conditions]  # u if closed
         if slips:
-            margins = _margins(pressure * static_limit(item), [*map(self._multiplier, rows)])
+            margins = _margins(pressure * static, [*map(self._multiplier, rows)])
             begins = [(kind, _in_mode(sticks[0], margin)) for kind, margin in margins.items()]
-            drives = zip(repeat("drives"), self._watched(sliding, static_limit(item), closed, sticks), strict=False)
+            drives = zip(repeat("drives"), self._watched(sliding, static, closed, sticks), strict=False)
             transitions += ("stops", (1 - held) * moving.ahead + held), *begins, *leaves, *drives
         else:
             transitions += leaves

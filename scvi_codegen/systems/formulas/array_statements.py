@@ -372,7 +372,7 @@ def formula_of_entries(
     ((_, values),) = rules.rules(term_of((), whole, parser.accesses))
     for placeholder, (loops, formula, _) in parser.sums.items():
         term = term_of(loops, formula, parser.accesses)
-        values[placeholder] = Add(*(formula.xreplace(rule) for _, rule in rules.rules(term)))
+        values[placeholder] = Add(*rules.formulas(term))
     return whole.xreplace(values)
 
 
@@ -413,6 +413,10 @@ class EntryRules:
         """Yield the values of the indices with the symbol that replaces each access."""
         for at in elements(term.loops, self.sizes):
             yield at, {slot: self.entry(access, at, term.loops) for slot, access in term.slots}
+
+    def formulas(self, term: ArrayTerm) -> list[Expr]:
+        """Return the formula of a term at each value of its indices, in symbols of entries."""
+        return [term.formula.xreplace(rule) for _, rule in self.rules(term)]
 
     def forces(self, forces: Sequence[ArrayForce]) -> dict[Symbol, list[Expr]]:
         """Return the contributions to the force on each coordinate."""

@@ -42,9 +42,8 @@ class SiteHamiltonian:
 def site_hamiltonian(system: ArraySystem) -> SiteHamiltonian | None:
     """Return the Hamiltonian of a Lagrangian with terms of this form; ``None`` of others."""
     moving = {array.name + DOT: Array(f"p_{array.name}", array.axes) for array in system.coordinates}
-    if system.momenta or system.rotations or system.constraints or system.damping != 0:
-        return None
-    if any(_moving(force, moving) for force in system.forces):
+    moved = any(_moving(force, moving) for force in system.forces)
+    if system.momenta or system.rotations or system.constraints or system.damping != 0 or moved:
         return None
     kinetic = [term for term in system.terms if _moving(term, moving)]
     still = [term for term in system.terms if not _moving(term, moving)]

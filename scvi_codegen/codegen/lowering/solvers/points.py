@@ -195,7 +195,7 @@ def _is_stable(system: LagrangianSystem, entries: Mapping[tuple[int, int], Expr]
     smallest, which must be negative.
     """
     inputs = {symbol(f"{name}_{k}") for name in system.inputs for k in range(INPUT_PARAMETERS)}
-    values = dict(zip(system.parameters, system.defaults, strict=True))
+    values = system.constants
     if any(entry.free_symbols - (values.keys() - inputs) for entry in entries.values()):
         return False
     numbers = (entry.xreplace(values) for entry in entries.values())

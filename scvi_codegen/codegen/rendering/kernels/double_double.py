@@ -6,8 +6,10 @@ of numbers, all high words before all low words.
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import chain
 
 from scvi_codegen.codegen.ir.kernel import Constant, Expression, Kernel, Load, Number, Operation
 from scvi_codegen.codegen.rendering.kernels.simd import Lanes
@@ -176,6 +178,10 @@ def _words(value: Number, count: int) -> list[str]:
     return [repr(word) for word in words]
 
 
+def _pairs(numbers: Iterable[Number]) -> list[list[str]]:
+    return [_words(number, 2) for number in numbers]
+
+
 def _tables_of_functions() -> str:
     """Return the tables and coefficients of the elementary functions of pairs."""
     with mp.workdps(80):
@@ -184,16 +190,16 @@ def _tables_of_functions() -> str:
         cosines = [(-1) ** (n + 1) / mp.factorial(2 * n + 2) for n in range(7)]
         exponential = [1 / mp.factorial(n + 2) for n in range(11)]
         circle = [map(mp.chop, (mp.sin(k * angle), mp.cos(k * angle))) for k in range(PER_TURN)]
-        turn = [[word for x in both for word in _words(x, 2)] for both in circle]
-        powers = [_words(mp.exp(k * exponent), 2) for k in range(PER_BINADE)]
+        turn = [[*chain(*_pairs(both))] for both in circle]
+        powers = _pairs(mp.exp(k * exponent) for k in range(PER_BINADE))
         signed = [k if k < NEAR else k - 2 * NEAR for k in range(2 * NEAR)]  # row of k: k modulo the number of rows
-        near = [_words(mp.expm1(k * exponent), 2) for k in signed]
+        near = _pairs(mp.expm1(k * exponent) for k in signed)
         scalars = {"PER_UNIT_OF_ANGLE": 1 / angle, "PER_UNIT_OF_EXPONENT": 1 / exponent}
         units = {"UNIT_OF_ANGLE": _words(angle, 3), "UNIT_OF_EXPONENT": _words(exponent, 3)}
         rows = {
-            "SINE": [_words(x, 2) for x in sines],
-            "COSINE": [_words(x, 2) for x in cosines],
-            "EXPONENTIAL": [_words(x, 2) for x in exponential],
+            "SINE": _pairs(sines),
+            "COSINE": _pairs(cosines),
+            "EXPONENTIAL": _pairs(exponential),
             "CIRCLE": turn,
             "POWERS": powers,
             "POWERS_LESS_1": near,

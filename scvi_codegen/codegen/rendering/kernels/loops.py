@@ -1,6 +1,6 @@
 """Systems of arrays as C: functions of nested loops around kernels, lattices, and the template's context."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import accumulate, groupby
 from math import prod
@@ -56,8 +56,8 @@ def rows_text(layout: Layout, forces: Sequence[RolledKernel]) -> tuple[str, str,
         return None
     lead, ((axis,),) = reaches.index(max(reaches)), axes
     coupling, before, behind = forces[lead], forces[:lead], forces[lead + 1 :]
-    others = [rolled.kernel for rolled in (*before, *behind) if len(rolled.loops) == 1]
-    if any(sharing_of(rolled) is not Sharing.IN_TURN for rolled in forces) or loop_functions(others):
+    others = _kernels_of(rolled for rolled in (*before, *behind) if len(rolled.loops) == 1)
+    if {*map(sharing_of, forces)} != {Sharing.IN_TURN} or loop_functions(others):
         return None
     # in a lattice of one axis the terms behind an element of all targets neither read nor change it
     writes, chunked = coupling.writes, len(coupling.loops) == 1
@@ -110,31 +110,29 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
     terms = [(rolled, rolled.scalar) for rolled in loops.forces if rolled.scalar]
     terms += [(rolled, rolled.kernel) for rolled in loops.constants]
     constants = (*loops.masses, *loops.frictions, *loops.heats)
-    scalars = _scalar_kernels(program, [*(rolled.kernel for rolled in constants), *(scalar for _, scalar in terms)])
+    applied, forces = _kernels_of(loops.applied), _kernels_of(loops.forces)
+    scalars = _scalar_kernels(program, [*_kernels_of(constants), *(scalar for _, scalar in terms)])
     return {
         "program": program,
         "most_threads": 1 if constrained else MOST_THREADS,
-        "cut": is_divided((*scalars, *(rolled.kernel for rolled in loops.applied))),
+        "cut": is_divided((*scalars, *applied)),
         "forces": [_force_text(program, rolled, rows[2] if rows else "") for rolled in loops.applied],
         "energies": [_energy_text(program, rolled, scalar, declared=rolled in pairs) for rolled, scalar in terms],
         "masses": [_mass_text(program, rolled) for rolled in constants],
         "lists": [(name, _list_text(program, count, lengths)) for name, count, lengths in loops.neighbours],
-        "force_names": [rolled.kernel.name for rolled in loops.forces],
+        "force_names": [kernel.name for kernel in forces],
         "energy_names": [(scalar.name, _has_sums(rolled)) for rolled, scalar in terms],
         "equal_masses": [*map(_is_uniform, loops.masses)] == [True],
-        "mass_names": [rolled.kernel.name for rolled in loops.masses],
+        "mass_names": [kernel.name for kernel in _kernels_of(loops.masses)],
         "scalar_kernels": [kernel_text(kernel, DOUBLE) for kernel in scalars],
         "inverse_roots": inverse_roots(scalars),
-        "vector_functions": loop_functions(
-            [] if program.fixed_point else [rolled.kernel for rolled in loops.forces]  # of an explicit method
-        ),
+        "vector_functions": loop_functions([] if program.fixed_point else forces),  # of an explicit method
         "coordinates": function_of_sizes(
             layout,
             "static long long coordinates_of(const problem *arrays)",
             [f"return {' + '.join(map(product_text, layout.coordinates))};"],
         ),
-        "fixed_point": fixed_point
-        and iteration_source(fixed_point, POINTS, kernels=[rolled.kernel for rolled in loops.applied]),
+        "fixed_point": fixed_point and iteration_source(fixed_point, POINTS, kernels=applied),
         "work": _step_work(program) + _transform_work(program),
         "continued": loops.continued,
         "site_functions": [_site_text(program, rolled) for rolled in (*loops.velocities, *loops.momenta)],
@@ -156,6 +154,10 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
     }
 
 
+def _kernels_of(groups: Iterable[RolledKernel]) -> list[Kernel]:
+    return [rolled.kernel for rolled in groups]
+
+
 def _scalar_kernels(program: ArrayProgram, first: Sequence[Kernel]) -> list[Kernel]:
     """Return the kernels of numbers: the first ones, of explicit forces, of constraints and of sites."""
     loops, kernels = program.loops, [*first]
@@ -163,8 +165,8 @@ def _scalar_kernels(program: ArrayProgram, first: Sequence[Kernel]) -> list[Kern
         apart = _apart(rolled)
         kernels += apart[1:] if apart else [rolled.kernel]
     if loops.constrained:
-        kernels += [rolled.kernel for rolled in (*loops.constrained.conditions, *loops.constrained.curvatures)]
-    return kernels + [rolled.kernel for rolled in (*loops.velocities, *loops.momenta)]
+        kernels += _kernels_of((*loops.constrained.conditions, *loops.constrained.curvatures))
+    return kernels + _kernels_of((*loops.velocities, *loops.momenta))
 
 
 def _transform_context(program: ArrayProgram, pairs: Sequence[RolledKernel], sums: Sequence[str]) -> dict[str, Any]:

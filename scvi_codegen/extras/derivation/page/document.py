@@ -444,6 +444,9 @@ def _sum(coefficient: str, value: sympy.Expr) -> sympy.Expr:
     return sympy.Sum(Symbol(coefficient) * value, (j, 1, g))
 
 
+_END = Formula(q + h * _sum("b_j", Symbol("V_j")), Symbol("q_k+1"))
+_POSITIONS = Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n"))
+_VELOCITIES = Formula(v0 + _sum("a_n_j", Symbol("z_j")), Symbol("V_n"))
 ITERATIONS: dict[str, tuple[Content, ...]] = {
     "separable": (
         Paragraph("Positions q_n at the points, F the forces L_q, M the constant masses; iterated to convergence:"),
@@ -453,23 +456,23 @@ ITERATIONS: dict[str, tuple[Content, ...]] = {
     ),
     "coupled": (
         Paragraph("Velocities V_n at the points, corrected to convergence; M = L_vv there:"),
-        Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),
+        _POSITIONS,
         Formula(p + h * _sum("A_n_j", Symbol("L_q_j")), Symbol("P_n")),
         Formula(Symbol("V_n") + inverse_mass * (Symbol("P_n") - Symbol("L_v_n")), Symbol("V_n_new")),
         Paragraph(
             "If the masses of few coordinates depend on positions, the correction includes its first-order effect on "
             "P_n and L_v. After convergence:"
         ),
-        Formula(q + h * _sum("b_j", Symbol("V_j")), Symbol("q_k+1")),
+        _END,
         Formula(p + h * _sum("B_j", Symbol("L_q_j")), Symbol("p_k+1")),
     ),
     "Hamiltonian": (
         Paragraph("Positions, forces, momenta and velocities V_n = H_p at the points, in turn to convergence:"),
-        Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),
+        _POSITIONS,
         Formula(-Applied("H_q")(Symbol("q_n"), Symbol("P_n")), Symbol("F_n")),
         Formula(p + h * _sum("A_n_j", Symbol("F_j")), Symbol("P_n")),
         Formula(Applied("H_p")(Symbol("q_n"), Symbol("P_n")), Symbol("V_n")),
-        Formula(q + h * _sum("b_j", Symbol("V_j")), Symbol("q_k+1")),
+        _END,
         Formula(p + h * _sum("B_j", Symbol("F_j")), Symbol("p_k+1")),
     ),
     "shooting": (
@@ -477,14 +480,14 @@ ITERATIONS: dict[str, tuple[Content, ...]] = {
             "Scaled accelerations z_n at the nodes, corrected by the Euler-Lagrange residuals E; then p_(k+1), the "
             "velocity v_0 at the start and the multipliers, in turn to convergence:"
         ),
-        Formula(v0 + _sum("a_n_j", Symbol("z_j")), Symbol("V_n")),
-        Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),
+        _VELOCITIES,
+        _POSITIONS,
         Formula(Symbol("z_n") - h * inverse_mass * Symbol("E_n"), Symbol("z_n_new")),
     ),
     "collocation": (
         Paragraph("Scaled accelerations z_n at the nodes, F = L_q - L_vq v - L_vt, M = L_vv; iterated to convergence:"),
-        Formula(v0 + _sum("a_n_j", Symbol("z_j")), Symbol("V_n")),
-        Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),
+        _VELOCITIES,
+        _POSITIONS,
         Formula(h * inverse_mass * Symbol("F_n"), Symbol("z_n")),
     ),
 }

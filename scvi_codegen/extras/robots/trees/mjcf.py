@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import chain, combinations, zip_longest
+from itertools import combinations, zip_longest
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -115,10 +115,10 @@ class _MujocoModel:
         if self.compensating and any(link.inertia.lift[0] for link in self.links):
             self.compensating[0].refuse("has actuatorgravcomp, which is not read where bodies have gravcomp")
 
-    def entries(self, section: str) -> Iterator[Element]:
-        """Yield the elements in all sections of a name."""
+    def entries(self, section: str, *tags: str) -> Iterator[Element]:
+        """Yield the elements in all sections of a name, all of them or those with one of the tags."""
         for element in self.root.children(section):
-            yield from element.children()
+            yield from element.children(*tags)
 
     def tendons(self) -> Iterator[Tendon]:
         """Yield the tendons with forces, rotors, limits, actuators or equalities.
@@ -216,15 +216,14 @@ class _MujocoModel:
         """Yield the pairs of geoms of different bodies that may touch, in MuJoCo's rules."""
         if self.disabled & {"contact", "constraint"}:
             return
-        stated = self.root.children("contact")
         written = set[tuple[int, ...]]()
-        for pair in chain(*(section.children("pair") for section in stated)):
+        for pair in self.entries("contact", "pair"):
             first, second = sorted(self.place(pair, key)[0] for key in ("geom1", "geom2"))
             written.add((first, second))
             yield Pair.of_element(pair, self.geoms[first], self.geoms[second])
         excluded = {
             frozenset(self.place(element, key)[0] for key in ("body1", "body2"))
-            for element in chain(*(section.children("exclude") for section in stated))
+            for element in self.entries("contact", "exclude")
         }
         near = set() if "filterparent" in self.disabled else {*self.parents.items()}
         shapes = [(k, geom.link, self.carriers[geom.link], *geom.types) for k, geom in enumerate(self.geoms)]
@@ -298,8 +297,7 @@ class _MujocoModel:
         paths = {tendon.name: tendon for tendon in tendons}
         joints = {link.joint.label: link.joint for link in self.links if link.joint.kind != "fixed"}
         rated = {label for x, (_, label) in zip(elements, targets, strict=True) if damping_ratio(x)}
-        damped = self.singles.keys() & rated
-        inverses = {self.links[k].joint.label: m for k, m in mean_inverses(self.completed() if damped else (), damped)}
+        inverses = self.inverses(self.singles.keys() & rated)
         for element, target in zip(elements, targets, strict=True):
             gear = np.append(element.vector("gear", (1,), range(1, 7)), np.zeros(5))[:6]
             motion = self.acted_on(element, target[0], gear, {"tendon": paths, **dict.fromkeys(JOINTED, joints)})
@@ -319,6 +317,12 @@ class _MujocoModel:
                 self.unread.add(f"the law of activations (dyntype '{law}'), which are the inputs, of", actuator[0])
             acting.append(actuator)
         return in_shared_ranges(acting, targets, tendons)
+
+    def inverses(self, joints: Collection[str]) -> dict[str, float]:
+        """Return the mean diagonals of M^-1 at the reference over the rates of joints."""
+        if not joints:
+            return {}
+        return {self.links[k].joint.label: m for k, m in mean_inverses(self.completed(), joints)}
 
     def acted_on(self, element: Element, kind: str, gear: Vector, parts: Mapping[str, Mapping[str, Any]]) -> Motion:
         """Return the motion of the part of a kind on which an actuator acts."""

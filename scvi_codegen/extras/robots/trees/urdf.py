@@ -139,9 +139,8 @@ def _checked(robot: Element, parts: Collection[str]) -> Unread:
 
 def _limits(joint: Element) -> tuple[tuple[float, float] | None, float]:
     """Return the smallest and the largest value of a joint, if they limit it, and its dry friction."""
-    limit, dynamics = joint.child("limit"), joint.child("dynamics")
-    low, high = (0.0, 0.0) if limit is None else (limit.number("lower", 0), limit.number("upper", 0))
-    friction = 0.0 if dynamics is None else dynamics.number("friction", 0, 0)
+    low, high = (joint.optional("limit").number(key, 0) for key in ("lower", "upper"))
+    friction = joint.optional("dynamics").number("friction", 0, 0)
     return (low, high) if (low or high) and joint.text("type") in LIMITED else None, friction
 
 

@@ -35,9 +35,8 @@ def systems(name: str | None) -> None:
 def _entry(name: str) -> dict[str, Any]:
     """Return name, description, coordinates and parameter values of a system of the catalogue."""
     entry = problem(name)
-    values = zip(map(str, entry.system.parameters), entry.system.defaults, strict=True)
-    coordinates = [coordinate.name for coordinate in entry.system.coordinates]
-    return {"name": name, "description": entry.title, "coordinates": coordinates, "parameters": dict(values)}
+    coordinates, values = [coordinate.name for coordinate in entry.system.coordinates], entry.system.constants_by_name
+    return {"name": name, "description": entry.title, "coordinates": coordinates, "parameters": values}
 
 
 def systems_table(entries: Sequence[Mapping[str, Any]]) -> str:

@@ -86,8 +86,7 @@ def _values_of_coordinates(
         for array in coordinate_arrays:
             if isinstance(value, dict) and array.name in value:
                 entries[key, array.name] = ArrayValue(array, value[array.name], where + array.name)
-    numbers = {parameter.name: value for parameter, value in system.constants.items()}
-    read = _read_arrays(entries, {}, folder, numbers)
+    read = _read_arrays(entries, {}, folder, system.constants_by_name)
     elements = {
         key: dict(zip(entries[key].array.elements, values.reshape(-1).tolist(), strict=True))
         for key, values in read.items()
@@ -139,8 +138,7 @@ def _values_of_arrays(
     check_keys(sizes, system.sizes, "size", "[sizes]")
     for name, value in sizes.items():
         checked_count(value, f"[sizes] {name}", least=1, error=ModelFileError)
-    numbers = {parameter.name: value for parameter, value in system.constants.items()}
-    read = _read_arrays(entries, sizes, folder, numbers)
+    read = _read_arrays(entries, sizes, folder, system.constants_by_name)
     groups: dict[str, dict[str, Any]] = {}
     for (group, name), values in read.items():
         groups.setdefault(group, {})[name] = _whole(values, f"[tables] {name}") if group == "tables" else values
