@@ -18,7 +18,7 @@ from scipy.integrate import solve_ivp
 import scvi_codegen as sc
 from scvi_codegen.runs.accuracy.run_error import with_uncertainty
 
-PAGE = Path(__file__).parents[2] / "docs" / "steps.md"
+PAGE = Path(__file__).parents[2] / "docs" / "theory" / "steps.md"
 
 
 @cache

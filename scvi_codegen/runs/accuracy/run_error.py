@@ -297,8 +297,9 @@ def sizes_of(run: Any, rows: int, errors: Array) -> Array:
         absolute = absolute_tolerances(interface, m, plan.absolute_tolerance)
     t, q, p = (np.asarray(column)[:rows] for column in (run.t, run.q, run.p))
     kinetic, firsts = momenta_of_velocities(run.stepper, t, q, p, run.parameters), first_of_groups(interface, m)
-    moves = np.ptp(q, axis=0).min(initial=np.inf) > math.sqrt(roundoff(1)) * np.abs(q).max(initial=0.0)
-    by_reactions = np.zeros((2, m)) if moves else motion_by_reactions(run, t, q, p)
+    by_reactions = motion_by_reactions(run, t[:1], q[:1], p[:1])
+    if not (np.ptp(q, axis=0) > math.sqrt(roundoff(1)) * by_reactions[0]).all():  # the motion may be rounding of these
+        by_reactions = motion_by_reactions(run, t, q, p)
     q, p = (np.ascontiguousarray(column.T) for column in (q, p))
     return sizes_of_motion(q, p, errors, kinetic, by_reactions, firsts, roundoff(interface.words), absolute)
 

@@ -7,8 +7,8 @@
 
 typedef struct stored_curves stored_curves;
 
-/* Steps and the vectors propagated over them, of shape (steps + 1, count, STEP_INPUTS); of rounding errors only those at
- * both ends of the present step, (2, count, STEP_INPUTS). */
+/* Steps and the vectors propagated over them, of shape (steps + 1, count, STEP_INPUTS); of rounding errors only
+ * those at both ends of the present step, (2, count, STEP_INPUTS). */
 typedef struct {
   const real *t, *h, *q, *p, *parameters;
   const solver_options *options;
