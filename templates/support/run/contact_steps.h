@@ -2,7 +2,8 @@
 #include "event_changes.h"
 
 /* Contacts by steps: runs of fixed steps without transitions, two contact problems in each, for svi:1 on two Lobatto
- * points, Ld(q0, q1) = h/2 (L(q0, v) + L(q1, v)), v = (q1 - q0) / h. With the rows G0, G1 of gaps g and slips at its ends
+ * points, Ld(q0, q1) = h/2 (L(q0, v) + L(q1, v)), v = (q1 - q0) / h. With the rows G0, G1 of gaps g and slips at its
+ * ends
  *
  *   p0 + G0^T f1 = -D1 Ld(q0, q1),   rates (g(q1) / h, (G0 + G1)/2 (q1 - q0) / h)   [positions]
  *   p1 = D2 Ld(q0, q1) + G1^T f2,    rates G1 M1^-1 p1                             [velocities]
@@ -40,8 +41,8 @@ typedef struct {
   real matrix[STEP_SIZE * STEP_SIZE], pivot[STEP_SIZE];
 } step_matrix;
 
-/* A step of length h from (t, q, p, v) to q1; contacts whose rows are formed, and their responses: A^-1 G0^T, M0^-1 G0^T
- * or M1^-1 G1^T. */
+/* A step of length h from (t, q, p, v) to q1; contacts whose rows are formed, and their responses: A^-1 G0^T,
+ * M0^-1 G0^T or M1^-1 G1^T. */
 typedef struct {
   real t, h, q[M], p[M], v[M], q1[M], fastest;
   const real *idle, *imposed; /* parameters */
@@ -145,7 +146,8 @@ static int linearise_step(contact_step *in, real *x)
   for (int i = 0; i < M; i++) {
     x[i] = in->p[i] + 0.5 * (in->h * in->first.force[i] - in->first.momentum[i] - in->last.momentum[i]);
     for (int j = 0; j < M; j++)
-      A[i][j] = 0.5 * ((in->first.by_state[i][M + j] + in->last.by_state[i][M + j]) / in->h + in->last.by_state[i][j] - in->first.by_state[M + i][M + j]);
+      A[i][j] = 0.5 * ((in->first.by_state[i][M + j] + in->last.by_state[i][M + j]) / in->h +
+          in->last.by_state[i][j] - in->first.by_state[M + i][M + j]);
   }
   for (int c = 0; c < STEP_FIXED; c++)
     x[M + c] = -in->end.value[c];
@@ -164,8 +166,8 @@ static void find_near(contact_step *in, const real *x)
   }
 }
 
-/* Rates b + W f of the first problem at a change x, at first static friction where slips rest; *slow: whether a row yields
- * little to its own force at the end, so that W is that of the start. */
+/* Rates b + W f of the first problem at a change x, at first static friction where slips rest; *slow: whether a row
+ * yields little to its own force at the end, so that W is that of the start. */
 static int solve_positions(contact_step *in, const contact_memory *from, const real *x, int first, int *slow)
 {
   cone_problem *const of = &in->problem;
@@ -262,7 +264,7 @@ static void add_responses(const contact_step *in, const real *f, real *x)
       x[i] += in->response[r][i] * f[r];
 }
 
-/* Solves the first problem for q1 and the impulses f1: Newton's method on both at once, a contact problem an iteration. */
+/* Solves the first problem for q1 and the impulses f1: Newton's method on both, a contact problem an iteration. */
 static int find_positions(contact_step *in, const contact_memory *from)
 {
   real size = 0.0, *const f = in->problem.f;
@@ -387,7 +389,8 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   memcpy(before, x, sizeof before);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
-    of->takes_part[k] = in->is_near[k] && (normal < 0 || in->pushes[k] || in->end.value[row] <= CONTACT_LOWEST * DBL_EPSILON * size_by_position(in->end.G[row], in->q1));
+    of->takes_part[k] = in->is_near[k] && (normal < 0 || in->pushes[k] ||
+        in->end.value[row] <= CONTACT_LOWEST * DBL_EPSILON * size_by_position(in->end.G[row], in->q1));
     pose_limits(in, k, &in->end, from.sticks[k] && !in->has_begun[k]);
   }
   respond(in, &in->moving, &in->end, in->response);
