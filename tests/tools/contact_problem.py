@@ -24,7 +24,8 @@ typedef struct {{
   int takes_part[{CONTACTS}], rests[{CONTACTS}];
   double mu[{CONTACTS}], mu_static[{CONTACTS}], given[{CONTACTS}][2];
   cone_mode mode[{CONTACTS}];
-  int is_static[{CONTACTS}], newtons, points;
+  int is_static[{CONTACTS}], most_points, newtons, points;
+  double compliance, residual;
 }} cone_problem;
 int solve_problem(const contact_places *places, cone_problem *in);
 """

@@ -41,11 +41,12 @@ STATES = 192
 
 def with_dry_friction(system: Any) -> Any:
     """Return the system with contacts in place of the dry friction in its forces; itself if there is none."""
-    from scvi_codegen.systems.formulas.expressions import jacobian
     from scvi_codegen.systems.lagrangian import LagrangianSystem
 
     if not isinstance(system, LagrangianSystem) or isinstance(system, OfRunTimeSizes) or _is_smooth(system):
         return system
+    from scvi_codegen.systems.formulas.expressions import jacobian  # here: imports SymPy
+
     if system.clock or system.gauge != 0 or system.rotations or system.bath is not None:
         return system
     forces, contacts = system.forces, []

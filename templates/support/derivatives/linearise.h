@@ -240,9 +240,9 @@ int NAME(linearise)(long long steps, const real *t, const real *h, const real *q
 }
 
 #ifdef VECTORS_BY_ITERATION
-/* Samples of rounding errors along the saved states of a run, until an iteration fails. The vectors after the last of k
- * steps are those of row k % 2. What is `left` of the change of a vector compounds over the steps. Their derivatives are
- * those along the curves of another method, with values at `points` abscissae in each step. */
+/* Samples of rounding errors along the saved states of a run, until an iteration fails. The vectors after the last of
+ * k steps are those of row k % 2. What is `left` of the change of a vector compounds over the steps. Their derivatives
+ * are those along the curves of another method, with values at `points` abscissae in each step. */
 int NAME(transport_roundings)(long long steps, const real *t, const real *h, const real *q, const real *p,
     const real *parameters, const solver_options *options, int points, const real *abscissae, const real *curves,
     int count, double left, double rounding, unsigned long long seed, real *vectors, long long stride, real *deviations,

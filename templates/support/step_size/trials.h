@@ -289,25 +289,12 @@ static inline void note_trial(run_memory *run, const trial *now)
 }
 
 #ifdef NEWTON_ADMITTED
-/* Number of updates of a step by Newton's method that take as long per unit of time as the iteration took. */
-static inline real updates_as_dear(const run_memory *run)
-{
-  const real gain = size_of_level(run->grid_level) / size_of_level(run->failed);
-  return MANY_ITERATIONS * gain / (real)COST_OF_NEWTON;
-}
-
-/* A trial by Newton's method, which ends where it becomes dearer than the iteration; returns the error estimate of its
- * stages, converted to that of curves. */
-static SELDOM double attempt_by_newton(
-    const run_memory *run, trial *now, const solver_options *options, solver_report *report)
+/* A trial by Newton's method; returns the error estimate of its stages, converted to that of curves. */
+static SELDOM double attempt_by_newton(trial *now, const solver_options *options, solver_report *report)
 {
   double *workspace = now->step.scratch + SCRATCH, error;
   const error_measure measure = {EACH, now->limits.decay};
-  const real most = larger(updates_as_dear(run), UPDATES);
-  solver_options few = *options;
-  if ((real)few.max_iterations > most)
-    few.max_iterations = (int)most;
-  const int status = fall_back(NOT_CONVERGED, &now->step, now->dq, now->dp, &few, report, workspace, &measure);
+  const int status = fall_back(NOT_CONVERGED, &now->step, now->dq, now->dp, options, report, workspace, &measure);
   now->guess = 0;
   now->status = status > STATUS(SPURIOUS_SOLUTION) ? status : OK; /* Newton's method is not there */
   now->fallbacks = status == OK && reaches(&now->step, now->dq, now->dp);
@@ -348,7 +335,7 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
 #ifdef NEWTON_ADMITTED
   now->fallbacks = 0;
   if (run->avoiding < TRIED_AGAIN) {
-    now->error = larger(attempt_by_newton(run, now, options, report), least);
+    now->error = larger(attempt_by_newton(now, options, report), least);
     now->iterations = report->iterations - now->iterations;
     return;
   }
@@ -564,6 +551,13 @@ static SELDOM int may_grow(const run_memory *run, const trial *now, int levels)
 #endif
 
 #ifdef NEWTON_ADMITTED
+/* Returns 1 if so many updates of a step by Newton's method take longer per unit of time than the iteration took. */
+static inline int is_dear(const run_memory *run, long long updates)
+{
+  const real gain = size_of_level(run->grid_level) / size_of_level(run->failed);
+  return (real)(updates * COST_OF_NEWTON) > MANY_ITERATIONS * gain;
+}
+
 /* Returns to the iteration and its size. */
 static inline void leave_newton(run_memory *run)
 {
@@ -583,7 +577,7 @@ static inline int try_by_newton(run_memory *run, trial *now, const solver_option
     try_step(run, now, now->limits.least, options, report);
     return 1;
   }
-  if (run->avoiding < TRIED_AGAIN && UPDATES > updates_as_dear(run)) {
+  if (run->avoiding < TRIED_AGAIN && is_dear(run, UPDATES)) {
     leave_newton(run);
     try_step(run, now, now->limits.least, options, report);
     return 1;
@@ -820,7 +814,7 @@ static inline void change_to_newton(run_memory *run, const trial *now, int is_li
   const int gain = (int)level_below(UPDATES * COST_OF_NEWTON / MANY_ITERATIONS) + 1;
   const int change = (int)run->change + gain;
   const long long steps = run->step + 1;
-  if (by_newton(now) && UPDATES / 2 > updates_as_dear(run))
+  if (by_newton(now) && is_dear(run, UPDATES / 2))
     leave_newton(run);
   if (!is_limited || run->change != 0 || by_newton(now) || run->avoiding < 0 || steps < COST_OF_NEWTON ||
       (steps & (steps - 1)) != 0)
