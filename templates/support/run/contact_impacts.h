@@ -156,21 +156,16 @@ static int push(const event_step *step, event_sample *at, contact_terms *of, con
   return terms_at(step, at, of);
 }
 
-/* Removes the rates w of low rebounds from contacts that touch, with slips that rest. Those that remain have the impulse
- * of friction of all rebounds: their normal impulses are w / W_nn less than that of the load until they end, as gaps are
- * 0 then, too. */
+/* Removes the rates of low rebounds from contacts that touch, with slips that rest: slips that remain have the
+ * direction of their friction. */
 static int settle(const event_step *step, event_sample *at, contact_terms *of, const contact_change *now)
 {
   contact_mode mode[EVENT_CONTACTS];
   real impulse[CONTACT_ROWS], after[CONTACT_ROWS];
   for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const contact_places *place = CONTACTS + k;
-    const real *const slip = of->rate + place->tangential;
     mode[k] = now->rests[k] ? CONTACT_STICKS : CONTACT_SLIPS;
-    if (place->normal >= 0 && !now->touches[k])
+    if (CONTACTS[k].normal >= 0 && !now->touches[k])
       mode[k] = CONTACT_IS_OPEN;
-    for (int i = 0; place->normal >= 0 && mode[k].closed && !mode[k].sticks && i < place->slips; i++)
-      mode[k].direction[i] = slip[i] / fmax(length_of(slip, place->slips), DBL_MIN);
   }
   const real discord = solve_rows(of, mode, of->rate, of->rate, impulse, after, NULL);
   return discord > CONTACT_ROUNDING ? OK : push(step, at, of, impulse);
