@@ -342,3 +342,21 @@ def test_robots_of_files_rest_on_their_limits(tmp_path: Path) -> None:
         assert run.p[-1] @ run.velocity[-1] < RESTS * np.ptp(run.energy())
         assert abs(run["hip"]).max() < np.pi / 3 + PENETRATES
         assert run.contact_residual < 1e-6
+
+
+def test_a_step_that_fails_leaves_the_run_as_it_was() -> None:
+    """Forces end at x = 1: the first halves of the step beyond are solved, the last ones are not."""
+    slide = sc.LagrangianSystem.from_text(
+        "slide", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - 9.81*y + sqrt(1 - x)/9", contacts=[sc.contact("y")]
+    )
+    stepper = sc.compile_stepper(slide, "svi:1").by_transitions("by steps")
+    run = stepper.start([0.0, 0.0], velocity=[1.0, 0.0], h=0.03)
+    with pytest.raises(sc.StepFailedError):
+        run.advance(100)
+    t, x = run.t, float(run.q[0])
+    assert 0.9 < x < 1.0
+    with pytest.raises(sc.StepFailedError):
+        run.advance(1)
+    assert (run.t, float(run.q[0])) == (t, x)
+    again = stepper.start(run.q, run.p, t=t, h=0.03)
+    assert again.velocity == pytest.approx(run.velocity)

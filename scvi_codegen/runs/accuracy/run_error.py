@@ -164,7 +164,7 @@ class WithErrors:
         """Global errors of states since :attr:`initial`, with their signs (:class:`RunError`), made at first access.
 
         One step of a finer method and products with the Jacobian of the step for each step, about five times the cost
-        of the run and 0.3 ms; a finer method is compiled once. docs/steps.md lists which runs are refused.
+        of the run and 0.3 ms; a finer method is compiled once. docs/theory/steps.md lists which runs are refused.
 
         Raises:
             MethodError, StateError: for runs whose error is not defined or not known, with the reason.
@@ -446,9 +446,8 @@ class _Replay:
         fine = self.finer._run(*start, plan=plan, t=t, parameters=parameters)._recorded(None, ALL_STATES)
         after = self._state(piece, end)
         if changes:
-            at_start = (
-                0.0 if self.finer.constraints or interface.contacts else 0.5
-            )  # rounded states are not on constraints
+            is_on_constraints = self.finer.constraints or interface.contacts  # rounded states are not
+            at_start = 0.0 if is_on_constraints else 0.5
             self._round(state, at_start * steps)
             image = fine.tangent(np.vstack([self.now, self.samples]).T)[-1].T
             self.now, self.samples = image[0] + (after - self._state(fine, -1)), np.ascontiguousarray(image[1:])

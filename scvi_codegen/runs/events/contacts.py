@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.codegen.native.options import REASONS
-from scvi_codegen.common.errors import AccuracyWarning, ContactError, EventWarning, MethodError, warn
+from scvi_codegen.common.errors import AccuracyWarning, ContactError, EventWarning, MethodError, StateError, warn
 from scvi_codegen.runs.events.contact_changes import Rows
 from scvi_codegen.runs.results.saved_states import Array, SavedStates
 from scvi_codegen.runs.states.validation import Parameters, States
@@ -38,6 +38,8 @@ NOISE = 1e-9
 """Part of the momenta that rounding changes in a step, from which on it may be why adaptive steps fail."""
 SOON = 1e-9
 """Time relative to that of a failure of adaptive steps, after which friction is undefined if that is why they fail."""
+UNSOLVED = 1e-6
+"""Residual of contact problems of steps without a warning, that of the last update of a step (contact_steps.h)."""
 PARTS = 0.5 ** np.arange(4, -1, -1)
 """Parts of a step after which friction is evaluated."""
 ROUNDED = (
@@ -77,7 +79,10 @@ def undefined_friction(run: Any, watch: Any) -> ContactError | None:
     closed = [k for k, contact in enumerate(contacts) if contact.mode(named) is not ContactMode.OPEN]
     for ahead in (run._step_size or SOON * abs(run.t)) * PARTS:
         state, t = np.concatenate([run.q + ahead * velocity, run.p]), run.t + ahead
-        friction = Rows.at(stepper, state, t, values).coefficients[:, :2].sum(axis=1)
+        try:
+            friction = Rows.at(stepper, state, t, values).coefficients[:, :2].sum(axis=1)
+        except StateError:  # forces of the system end there, too
+            return None
         for k in closed:
             if not np.isfinite(friction[k]):
                 title = f"{k + 1} ({contacts[k].title})"
@@ -93,7 +98,14 @@ def check_forward(run: Any) -> None:
 
 
 def warn_of_choices(stepper: Integrator, watch: Any) -> None:
-    """Warn of several motions, of impacts without collision, a replaced restitution, and a missed tolerance."""
+    """Warn of several motions, impacts without collision, a replaced restitution, a missed tolerance, a residual."""
+    if stepper.by_steps and watch.steps.residual > UNSOLVED:
+        warn(
+            f"contact problems of steps were solved up to {watch.steps.residual:.1g} of their forces, with a "
+            f"compliance of up to {watch.steps.compliance:.1g} (run.contact_residual, run.compliance): reduce h, or "
+            "locate transitions",
+            AccuracyWarning,
+        )
     if getattr(watch, "ambiguous", 0):
         warn(
             "a transition has several motions, with contacts open, sticking or sliding, as in Painleve's paradox; the "

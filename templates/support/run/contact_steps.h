@@ -610,7 +610,11 @@ int NAME(advance_by_steps)(event_run *run, event_watch *watch, real t_end, const
     report->t = left.t = run->t;
     copy_state(left.q, left.p, run->q, run->p);
     copy_state(right.q, right.p, run->q, run->p);
-    TRY(step_by_steps(&in, &watch->steps, run->t, h, right.q, right.p, 0, workspace));
+    const int status = step_by_steps(&in, &watch->steps, run->t, h, right.q, right.p, 0, workspace);
+    if (status != OK) { /* the first of two halves may have been solved */
+      watch->steps = before;
+      return status;
+    }
     set_run(run, run->t, &right);
     if (h == run->h) {
       add_compensated(&run->t, &run->t_low, h, 0.0);
