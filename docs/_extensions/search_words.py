@@ -1,7 +1,7 @@
 """Search in other words than a page's: index entries in comments, British and American spelling, accents.
 
-``<!-- index: neighbour list, Verlet list -->`` below a heading adds phrases that lead to its section, in the search and
-in the general index. Viewers of Markdown do not show the comment.
+``<!-- index: neighbour list, Verlet list -->`` below a heading adds phrases that lead to its section, or below the
+title to the page, in the search and in the general index. Viewers of Markdown do not show the comment.
 """
 
 import json
@@ -82,7 +82,11 @@ class IndexComments(SphinxTransform):
             if found is None:
                 continue
             phrases = re.split(r",\s+", " ".join(found[1].split()))
-            section = comment.parent["ids"][0]
+            section = (
+                comment.parent["ids"][0]
+                if isinstance(comment.parent.parent, nodes.section)
+                else ""
+            )
             forms = dict.fromkeys(
                 form for phrase in phrases for form in (phrase, spelled(phrase))
             )
