@@ -25,6 +25,8 @@ from scipy import signal, special
 import scvi_codegen
 from scvi_codegen.systems.formulas.expressions import CONSTANTS, FUNCTIONS
 
+pytestmark = pytest.mark.long  # a page takes up to a minute
+
 DOCS = ROOT / "docs"
 PAGES = {str(path.relative_to(DOCS)): path.read_text(encoding="utf-8") for path in sorted(DOCS.rglob("*.md"))}
 ELSEWHERE = ("extending.md", "extending_runs.md", "frameworks.md")
@@ -116,10 +118,15 @@ def test_formulas_translate_to_mathml(name):
         assert "<math" in tex2mathml(formula), formula
 
 
-@pytest.mark.full
+_TASKS = tomllib.loads((ROOT / "tests/corpus/tasks.toml").read_text(encoding="utf-8"))
+TASKS = [task | {"page": page} for page, tasks in _TASKS.items() for task in tasks]
+"""Problems from public threads, each with the page whose code solves it."""
+
+
 @pytest.mark.usefixtures("as_users_compile")
-@pytest.mark.parametrize("name", RUN)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.rotated(k)) for k, name in enumerate(RUN)])
 def test_a_page_runs_from_top_to_bottom(name, tmp_path, monkeypatch):
+    """Its output and pictures are those shown, and it solves the problems of public threads that name it."""
     missing = [peer for peer in PEERS if peer in imported(PAGES[name]) and importlib.util.find_spec(peer) is None]
     if any(words in PAGES[name] for words in ("--platform ", "scvi-codegen page ")):  # need the compiler from a wheel
         missing += [wheel for wheel in ["ziglang"] if importlib.util.find_spec(wheel) is None]
@@ -129,25 +136,10 @@ def test_a_page_runs_from_top_to_bottom(name, tmp_path, monkeypatch):
     if "{write-your-own}" in PAGES[name]:  # the form of the page writes the example
         form = (ROOT / "docs" / "_extensions" / "motions.py").read_text(encoding="utf-8")
         parts.insert(0, Part("file", re.findall(r'"Model file">(.*?)</pre>', form, re.DOTALL)[0], "model.toml"))
-    run_page(name, parts, tmp_path, monkeypatch)
+    names = run_page(name, parts, tmp_path, monkeypatch) | {"signal": signal, "special": special}
     assert [picture for picture in PICTURE.findall(PAGES[name]) if not (tmp_path / picture).is_file()] == []
-
-
-_TASKS = tomllib.loads((ROOT / "tests/corpus/tasks.toml").read_text(encoding="utf-8"))
-TASKS = [task | {"page": page} for page, tasks in _TASKS.items() for task in tasks]
-"""Problems from public threads, each with the page whose code solves it."""
-
-
-@pytest.mark.rotated
-@pytest.mark.parametrize("name", sorted({task["page"] for task in TASKS}))
-def test_pages_solve_the_problems_of_public_threads(name, here, monkeypatch):
-    monkeypatch.setenv("MPLBACKEND", "agg")
-    names: dict[str, Any] = {"signal": signal, "special": special}
-    for part in runnable(PAGES[f"{name}.md"]):
-        if part.kind == "python":
-            exec(compile(part.text, name, "exec"), names)
     for task in TASKS:
-        if task["page"] == name:
+        if f"{task['page']}.md" == name:
             value, expected = (eval(task[key], names) for key in ("value", "expected"))
             np.testing.assert_allclose(value, expected, 0, task.get("within", 1e-12), err_msg=task["query"])
 

@@ -1,4 +1,4 @@
-"""Notebooks: saved without outputs, listed on the site, and executed in processes of their own."""
+"""Notebooks: saved without outputs, and executed in processes of their own; building the site executes all."""
 
 import importlib.util
 import json
@@ -60,24 +60,3 @@ def test_error_of_a_cell_names_it(tmp_path):
     _, errors = process.communicate(timeout=60)
     assert process.returncode
     assert "one.ipynb, cell 3 failed: ZeroDivisionError: division by zero" in errors
-
-
-SECOND = ("crane", "first_steps")
-"""Notebooks that the second tier executes; the site and the full tier execute all."""
-
-
-@pytest.mark.parametrize(
-    "path",
-    [
-        pytest.param(path, marks=pytest.mark.rotated if path.stem in SECOND else pytest.mark.full, id=path.stem)
-        for path in NOTEBOOKS
-    ],
-)
-def test_a_notebook_runs_from_top_to_bottom(path):
-    process = notebooks.run_in_process(path)
-    output, errors = process.communicate(timeout=300)
-    assert process.returncode == 0, errors[-3000:]
-    results = json.loads(output)
-    expected = ["alt" in cell["metadata"] for cell in notebooks.cells(path)]
-    assert [any("svg" in result for result in cell) for cell in results] == expected
-    assert notebooks.to_markdown(path, results).count("```{image}") >= 2

@@ -91,8 +91,8 @@ def agree(message: str, printed: str) -> None:
 
 def run_page(
     name: str, parts: list[Part], folder: Path, monkeypatch: Any, heard: Callable[[str, str], None] = agree
-) -> None:
-    """Run all parts of a page in order, in a folder with a copy of the examples.
+) -> dict[str, Any]:
+    """Run all parts of a page in order, in a folder with a copy of the examples, and return the names of its code.
 
     ``heard`` is called with the expected and the printed output.
     """
@@ -115,3 +115,4 @@ def run_page(
             run_command(part.text)
     if "matplotlib.pyplot" in sys.modules:
         sys.modules["matplotlib.pyplot"].close("all")
+    return namespace

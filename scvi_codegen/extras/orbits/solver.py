@@ -110,7 +110,7 @@ class PeriodicOrbit:
         names, values = [*state_names(self.stepper), "period"], [*self.q, *self.p, self.period]
         rows = zip(names, values, self.errors.bounds, strict=True)
         lines = [f"{name} = {Products.with_uncertainty(value, bound)}" for name, value, bound in rows]
-        return "\n".join([*lines, f"relative error {self.error:.1e}", *filter(None, [self.errors.reason])])
+        return "\n".join([*lines, f"relative error {self.error:.0e}", *filter(None, [self.errors.reason])])
 
     def run(self, *, save_every: int = 1) -> Trajectory:
         """Return the trajectory of one period, every ``save_every``-th state; of adaptive steps a new adaptive run."""
