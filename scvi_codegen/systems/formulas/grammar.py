@@ -59,7 +59,7 @@ _TOKEN = re.compile(
 _SPACE = re.compile(r"[ \t\r\n\f]*")
 
 _HINTS = {
-    ".": "functions have no module: write cos(q), not np.cos(q)",
+    ".": "attributes are not part of the grammar: write cos(q), not np.cos(q)",
     "[": 'subscripts require arrays: declare coordinates=["q[3]"], or parameters={"m[2]": [1.0, 2.0]}, whose entries '
     "m[0] and m[1] systems of named coordinates may use, too (of a rotation: R_11)",
     "^": "powers are written x**2",
