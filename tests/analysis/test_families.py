@@ -231,21 +231,6 @@ def test_families_with_nonholonomic_constraints_are_refused():
 
 
 @pytest.mark.rotated
-def test_lyapunov_orbits_branch_to_halo_orbits(moon):
-    """The bifurcation has C = 3.17435 and T = 2.74299, and both sides are mirror images."""
-    family = sc.family(moon, sc.equilibrium(moon, [0.83, 0, 0]), amplitude=0.01, step=0.2, until="energy > -1.585")
-    (halo,) = family.bifurcations
-    assert halo.kind == "branch"
-    assert -2 * halo.orbit.energy == pytest.approx(3.174351954, abs=1e-9)
-    assert halo.orbit.period == pytest.approx(2.742994069, abs=1e-9)
-    north, south = (halo.switch(backward=side, count=3)[-1] for side in (False, True))
-    assert max(abs(north.run().q[:, 2])) > 1e-4
-    assert north.period == pytest.approx(south.period, abs=1e-9)
-    assert north.energy == pytest.approx(south.energy, abs=1e-9)
-    assert north.run().q[:, 2].max() == pytest.approx(-south.run().q[:, 2].min(), abs=1e-6)
-
-
-@pytest.mark.rotated
 def test_resonance_curve_has_two_folds():
     """Of a driven Duffing oscillator, at the frequencies where a multiplier is 1."""
     system = sc.LagrangianSystem.from_text(

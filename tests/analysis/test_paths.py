@@ -330,33 +330,3 @@ def test_refusals_name_the_remedy(kepler):
     ):
         with pytest.raises(error, match=words):
             call()
-
-
-def choreography(n, curve, steps, method):
-    names = [f"{axis}{i}" for i in range(n) for axis in "xy"]
-    pairs = [f"1/sqrt((x{i} - x{j})**2 + (y{i} - y{j})**2)" for i in range(n) for j in range(i)]
-    stepper = compiled(names, " + ".join([*(f"{name}_dot**2/2" for name in names), *pairs]), method)
-    follow = [f"{axis}{(i + 1) % n}" for i in range(n) for axis in "xy"]
-    path = stepper.path(
-        T=2 * np.pi / n,
-        steps=steps,
-        closed=follow,
-        start=lambda t: np.concatenate([curve(t + 2 * np.pi * i / n) for i in range(n)]),
-    )
-    assert (path.repetitions, path.index) == (n, 0)
-    return stepper, path, float(stepper.energy(path.q[0], path.p[0]))
-
-
-@pytest.mark.rotated
-def test_figure_eight_has_its_published_energy_and_multipliers():
-    stepper, path, energy = choreography(3, lambda a: [1.1 * np.sin(a), 0.4 * np.sin(2 * a)], 16, "svi:6")
-    published = float(
-        stepper.energy(
-            [0.97000436, -0.24308753, -0.97000436, 0.24308753, 0, 0],
-            [0.466203685, 0.43236573, 0.466203685, 0.43236573, -0.93240737, -0.86473146],
-        )
-    )
-    assert abs(energy - published * (6.32591398 / (2 * np.pi)) ** (2 / 3)) < 2e-8
-    orbit = sc.periodic_orbit(stepper, path.q[0], path.p[0], period=path.period, steps=192, fixed_period=True)
-    phases = np.sort(np.angle(orbit.multipliers) / (2 * np.pi))[::-1][:2]
-    assert np.abs(phases - [0.29809253, 0.00842272]).max() < 1e-7  # Simo 2002

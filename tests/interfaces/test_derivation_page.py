@@ -27,7 +27,7 @@ from scvi_codegen.extras.derivation.equations import derive
 from scvi_codegen.extras.derivation.notation import table_entries
 from scvi_codegen.extras.derivation.page.document import ITERATIONS, derivation_html, kernels_of
 from scvi_codegen.extras.derivation.page.drawings import curve_section, jacobian_pattern
-from scvi_codegen.extras.derivation.writing import MOST_LINES, Formula, Paragraph, formulas
+from scvi_codegen.extras.derivation.writing import MOST_LINES, Formula
 from scvi_codegen.methods.discretise import paper_equations
 from scvi_codegen.methods.tables.number_tables import positions
 
@@ -195,15 +195,3 @@ def test_page_renders_in_a_browser(browser, tmp_path, size, scheme):
             below = left[2] <= right[1] and left[0] == right[0]
             assert extra if size == "desk" else below
         assert view.evaluate("[...document.querySelectorAll('svg')].every(e => e.getBoundingClientRect().width > 200)")
-
-
-@pytest.mark.rotated
-def test_omitted_terms_are_counted():
-    x = sympy.symbols("x:300")
-    short, long = Formula(x[0] + x[1]), Formula(sympy.Add(*(s**2 for s in x)))
-    left = [block.text if isinstance(block, Paragraph) else block for block in formulas([short, long, short], "row")]
-    assert left == [short, short, "1 row of more than 400 operations left out, the longest of 599."]
-    assert list(formulas([short] * 20, "row"))[-1] == Paragraph("The first 12 of 20 rows.")
-    wide = Formula(sympy.Add(*x))
-    assert list(formulas([wide] * 4, "row")) == [wide, wide, Paragraph("The first 2 of 4 rows.")]
-    assert list(formulas([wide] * 4, "row", together=2000)) == [wide] * 4

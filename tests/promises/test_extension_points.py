@@ -76,17 +76,6 @@ def test_documented_additions_need_one_file_and_one_line() -> None:
     assert sum("import" not in line for line in lines) == len(of_package) + 1, "an option is one entry"
 
 
-@pytest.mark.quick
-def test_the_pages_name_the_rooms_alike() -> None:
-    """CONTRIBUTING, the page and the docstring of the package have one sentence for each room, in order."""
-    pages = (TEXT, (ROOT / "CONTRIBUTING.md").read_text(), scvi_codegen.__doc__.replace("``", "`"))
-    rows = r"^(?:\| |\* )`(\w+)`(?: \||:) (\w.*?)(?: \||\.)$"
-    tables = [dict(re.findall(rows, page.split("to a run")[1].split("\n\n")[1], re.M)) for page in pages]
-    assert tables[0] == tables[1] == tables[2]
-    assert [name for name in tables[0] if (Path(scvi_codegen.__file__).parent / name).is_dir()] == [*tables[0]]
-    assert len(tables[0]) == 8
-
-
 def test_documented_method_is_the_midpoint_rule(extended: Path) -> None:
     script = """
 import scvi_codegen, numpy as np

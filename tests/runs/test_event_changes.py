@@ -571,17 +571,6 @@ def test_derivatives_of_maps_of_velocities_are_those_of_the_computed_run(seed):
     assert np.abs(computed - differences(run, z, values)).max() < 1e-9 * np.abs(computed).max()
 
 
-@pytest.mark.full
-def test_lyapunov_exponent_of_the_stadium_billiard(point):
-    """Benettin & Strelcyn, Phys. Rev. A 17 (1978) 773: 0.43 for a = R = 1."""
-    run = point.integrate([0.1, 0.2], velocity=[0.8, 0.6], h=2.0, steps=4000, events=STADIUM)
-    assert sum(map(len, run.events)) > 3500
-    assert np.abs(np.hypot(*run.p.T) - 1.0).max() < 1e-12
-    exponents = run.lyapunov_exponents()
-    assert abs(exponents[0] - 0.43) < 0.03
-    assert abs(exponents[0] + exponents[3]) < 1e-10
-
-
 def test_derivatives_are_refused_where_they_do_not_exist(point, ball):
     grazing = point.integrate(
         [-3.0, 1.0 - 1e-14], velocity=[1.0, 0.0], h=0.37, t_end=6.0, events=sc.impact("x**2 + y**2 - 1")
