@@ -62,7 +62,7 @@ SYSTEMS = {
 """Coordinates, L, initial positions and velocities, end, and the bound; pericentres are down to 5e-5 of an orbit."""
 
 DEGREES = (("svi:2", 20.0, (1e-3, 1e-5)), ("svi:4", 1.0, (1e-3, 1e-6, 1e-9)), ("svi:8", 1.0, (1e-3, 1e-6, 1e-9)))
-"""Methods, factors of their bounds, and tolerances; curves of one or two coefficients see less (double pendulum: 17)."""
+"""Methods, factors of their bounds, and tolerances; one or two coefficients see less (double pendulum: 17)."""
 
 
 def largest_errors(name: str) -> list[float]:

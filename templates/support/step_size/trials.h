@@ -683,8 +683,8 @@ static inline int needs_momenta(const run_memory *run, const trial *now)
 }
 
 /* Returns 1 if the force beyond the end of a flight is another one: a wall, or a force that sets in, may lie between
- * the last point of a step and the first of the next. The force of a smooth motion goes on as it changed before the end:
- * by as much from part to part, also where it passes zero. A smaller impulse than NO_FORCE is what rounding
+ * the last point of a step and the first of the next. The force of a smooth motion goes on as it changed before the
+ * end: by as much from part to part, also where it passes zero. A smaller impulse than NO_FORCE is what rounding
  * leaves, and so is one that displaces by no more: at rest on constraints all are. */
 static SELDOM int force_sets_in(const trial *now, const solver_options *options)
 {
