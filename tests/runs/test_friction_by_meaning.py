@@ -72,7 +72,9 @@ def test_forces_with_a_jump_against_a_slip_are_friction():
             assert run.q[-1, 0] == pytest.approx(exact, abs=1e-8), (number, steps)
 
 
-PEAKS = {name: f"({a} + {b}*exp(-({name}_dot/{w})**2))" for name, a, b, w in zip("xyu", "ace", "bdf", ("w", "s", "r"))}
+PEAKS = {
+    name: f"({a} + {b}*exp(-({name}_dot/{w})**2))" for name, a, b, w in zip("xyu", "ace", "bdf", "wsr", strict=True)
+}
 """Stribeck friction of each slip."""
 
 
