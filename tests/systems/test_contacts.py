@@ -933,18 +933,6 @@ def test_stribeck_friction_of_the_size_of_a_slip() -> None:
 
 
 @pytest.mark.second
-@pytest.mark.parametrize(("tolerance", "error"), [(1e-4, 3e-5), (1e-8, 1e-7), (1e-12, 1e-9)])
-def test_adaptive_steps_see_stribeck_friction_just_before_the_stop(tolerance: float, error: float) -> None:
-    """The part of the first step to the stop is compared with its halves; up a slope, s is the integral of v/a dv."""
-    friction = sc.contact("y", slip="x_dot", friction="(2 + exp(-(10*x_dot)**2))/10", static_friction=0.5)
-    stepper = of("(x_dot**2 + y_dot**2)/2 + 9.81*(sin(0.3)*x - cos(0.3)*y)", "x y", [friction], "svi:3")
-    run = stepper.integrate([0, 0], velocity=[-1, 0], t_end=2, tolerance=tolerance)
-    slope, mu = np.tan(0.3), lambda v: (2 + np.exp(-((10 * v) ** 2))) / 10
-    path = quad(lambda v: v / (slope + mu(v)), 0, 1, points=[0.1, 0.3])[0] / (9.81 * np.cos(0.3))
-    assert run.q[-1, 0] == pytest.approx(-path, abs=error)
-
-
-@pytest.mark.second
 @pytest.mark.parametrize("steps", [{"h": 0.05}, {}])
 def test_a_step_that_fails_names_the_modes_of_contacts(steps: dict[str, float]) -> None:
     sole = sc.contact("z", slip=["x_dot", "y_dot"], friction=0.5, name="sole")

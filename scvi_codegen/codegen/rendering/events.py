@@ -42,6 +42,7 @@ from scvi_codegen.codegen.rendering.source import Interface, Source
 from scvi_codegen.common.errors import EventError, ScviCodegenError, SystemDefinitionError, closest
 from scvi_codegen.common.precision import mp
 from scvi_codegen.methods.tables.nodes import chebyshev_lobatto, to_unit
+from scvi_codegen.methods.tables.quadrature import gauss_lobatto
 from scvi_codegen.systems.contact import Impacts
 from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.event import Kink, Refraction, Transition, modes_of
@@ -64,6 +65,8 @@ from scvi_codegen.systems.formulas.symbols import DOT, TIME, identifier, input_f
 from scvi_codegen.systems.formulas.table import functions_of
 
 DEGREE = 4
+JUDGES = 10
+"""Points of the quadrature that judges friction that varies along a slip: exact for the 2s knots of degrees up to 8."""
 FUNCTIONS = {"controlled": "advance_to", "by_steps": "motion_terms"}
 """Functions of an integrator of adaptive steps, and of contacts by steps."""
 Formula: TypeAlias = "str | Expr | float"
@@ -393,7 +396,14 @@ def _formula_part(interface: Interface, events: Sequence[SearchedEvent]) -> dict
         "parameters": len(interface.parameters),
         "modes": tuple(map(interface.parameters.index, formulas.modes)),
         "contacts": tuple(_places(formulas.modes, contact) for contact in interface.contacts),
+        **(_judge_of_slips() if any(contact.varies for contact in interface.contacts) else {}),
     }
+
+
+def _judge_of_slips() -> dict[str, Any]:
+    """Return the quadrature with both ends by which friction that varies along a slip is judged."""
+    rule = gauss_lobatto(JUDGES)
+    return {"knots": lower_vector(rule.abscissae), "weights": lower_vector(rule.unit_weights)}
 
 
 def _change_part(interface: Interface, events: Sequence[SearchedEvent]) -> dict[str, Any]:
@@ -422,7 +432,7 @@ def _places(modes: Sequence[str], contact: ContactRows) -> tuple[int, ...]:
         contact.held,
     )
     places = (-1 if name is None else modes.index(name) for name in masks)
-    return *rows, contact.slips, *places, [*Impacts].index(Impacts(contact.impacts))
+    return *rows, contact.slips, *places, [*Impacts].index(Impacts(contact.impacts)), int(contact.varies)
 
 
 def _kind_in_time(g: Expr, moving: Iterable[Symbol]) -> int:

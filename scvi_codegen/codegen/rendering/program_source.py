@@ -184,8 +184,11 @@ class EventSearch:
         powers: below and above the zero of each of them, whether a power that is not whole acts; empty if none does.
         refracts: 1 for each event that is the zero of a kink where L jumps, else 0; empty if there is none.
         contacts: normal and first tangential row of each contact, number of its slips, and its closed, first sticks,
-            first direction and held among the modes; -1 for what it does not have.
+            first direction and held among the modes; -1 for what it does not have; law of impacts, and 1 if its
+            friction varies along its slip, else 0.
         vectors: number of components of each coordinate, rotation and direction, in order.
+        knots, weights: on [0, 1], of the quadrature by which friction that varies along a slip is judged; empty if
+            there is none.
         contact_rows, first_contact_row: number of rows, and of the constraints before them.
         transitions: contact and kind of each of their transitions, the events before the kinks.
         dissipates: whether energy cannot grow, also at events.
@@ -220,6 +223,8 @@ class EventSearch:
     refracts: tuple[int, ...] = ()
     contacts: tuple[tuple[int, ...], ...] = ()
     vectors: tuple[int, ...] = ()
+    knots: tuple[float, ...] = ()
+    weights: tuple[float, ...] = ()
     contact_rows: int = 0
     first_contact_row: int = 0
     transitions: tuple[tuple[int, str], ...] = ()

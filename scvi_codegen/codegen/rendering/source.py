@@ -69,6 +69,7 @@ def _contact_of(row: Sequence[Any]) -> ContactRows:
         and all(map(KINDS["tuple[str, ...]"], (contact.sticks, (*contact.directions, contact.title))))
         and all(map(KINDS["tuple[tuple[str, ...], ...]"], (contact.transitions, contact.quantities)))
         and contact.impacts in [*Impacts]
+        and KINDS["bool"](contact.varies)
     ):
         raise ValueError(f"contacts contain {contact!r:.60}: these are not the places of a contact")
     return contact

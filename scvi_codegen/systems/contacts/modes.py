@@ -309,6 +309,7 @@ class _Binding:
             transitions=functions,
             impacts=getattr(item, "impacts", Impacts.SEQUENTIAL),
             quantities=quantities,
+            varies=bool(slips) and not sliding.free_symbols <= {*self.system.parameters},
         )
 
     def _title(self, item: ContactLike) -> str:

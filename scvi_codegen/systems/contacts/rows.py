@@ -40,6 +40,7 @@ class ContactRows(NamedTuple):
         impacts: their law.
         quantities: names and formulas of the intermediate quantities in its transitions that no contact before it has,
             each after those in its formula: the velocity of a body is one of that of the body before it.
+        varies: whether the friction with which it slides depends on the state or on time.
     """
 
     normal: int | None
@@ -53,6 +54,7 @@ class ContactRows(NamedTuple):
     transitions: tuple[tuple[str, ...], ...]
     impacts: str = Impacts.SEQUENTIAL
     quantities: tuple[tuple[str, str], ...] = ()
+    varies: bool = False
 
     def mode(self, parameters: Mapping[str, float]) -> ContactMode:
         """Return its mode by the values of its masks."""

@@ -31,7 +31,6 @@ enum {
 #define CHANGE_GAIN 1e3 /* part of the energy of motion by which a step may create some, relative to the tolerance .. */
 #define CHANGE_MOST 1e-2 /* .. and the largest one: by steps from rest, of 173 tolerances */
 #define CHANGE_FAIR 1e-9 /* least tolerance of energies: rounding of gaps changes them by 1e-11 in the shortest steps */
-#define CHANGE_CONFIRMED 1e-8 /* least tolerance of a part of a step up to a change of modes, by its half parts */
 #define CHANGE_END 1e-6 /* relative to a step: remaining time at which an accumulation ends the run */
 
 /* Records the interval since the last hit. If the last intervals decrease geometrically and the remaining ones are
@@ -410,33 +409,41 @@ static int may_be_halved(const event_step *step, int status, real part, real pac
 }
 #endif
 
-#if defined(EVENT_CONTACTS) && EVENTS_CONTROLLED
-/* Compares the positions after the part of an adaptive step up to a change of modes, `at`, with those after two half
- * parts, where coefficients of friction change in it: the estimates of the step itself do not see these between its
- * points, as of slow slips. Rounding is that of positions and of forces that cancel. */
-static int confirm_part(const event_step *step, const event_sample *left, const event_sample *at, real part,
+#if defined(CONTACTS_VARY) && EVENTS_CONTROLLED
+/* Compares changes of slips whose friction varies, in a part of an adaptive step up to `at`, with moments of their
+ * second rates, integral of w' dt = w(T) - w(0) and of t/T w' dt = w(T) - mean of w, by a quadrature of more points than
+ * those of the part, and both ends: stages do not see the friction of slow slips just before a stop. One moment may be
+ * right by chance. Rounding is that of forces that cancel. */
+static int judge_slips(const event_step *step, const event_sample *left, const event_sample *at, real part,
     real tolerance)
 {
-  event_sample middle = {.t = left->t + 0.5 * part, .q = step->memory, .p = step->memory + M};
-  event_sample end = {.q = step->memory + 2 * M, .p = step->memory + 3 * M};
-  contact_terms of, first;
-  real moved = 0.0, apart = 0.0, size = 0.0;
-  if (0.5 * fabs(step->h) <= CHANGE_SHORT * step->watch->pace)
-    return OK;
-  TRY(terms_at(step, left, &first));
-  TRY(terms_at(step, at, &of));
-  if (memcmp(first.coefficient, of.coefficient, BYTES(3 * EVENT_CONTACTS)) == 0)
-    return OK;
-  TRY(step_from_left(step, left, 0.5 * part, &middle));
-  TRY(step_from_left(step, &middle, 0.5 * part, &end));
-  for (int r = 0; r < CONTACT_ROWS; r++)
-    size = fmax(size, of.second_terms[r] * part * part);
-  for (int i = 0; i < M; i++) {
-    size = fmax(size, fabs(at->q[i]));
-    moved = fmax(moved, fabs(at->q[i] - left->q[i]));
-    apart = fmax(apart, fabs(end.q[i] - at->q[i]));
+  real missed[2][CONTACT_ROWS] = {{0.0}}, size[CONTACT_ROWS] = {0.0}, rounding[CONTACT_ROWS] = {0.0};
+  real force[CONTACT_ROWS], second[CONTACT_ROWS];
+  contact_mode mode[EVENT_CONTACTS];
+  contact_terms of;
+  for (int j = 0; j < CONTACT_KNOTS; j++) {
+    event_sample knot = {.t = left->t + CONTACT_KNOT[j] * part, .q = step->memory, .p = step->memory + M};
+    const int starts = j == 0, ends = j == CONTACT_KNOTS - 1;
+    if (!starts && !ends)
+      TRY(step_from_left(step, left, CONTACT_KNOT[j] * part, &knot));
+    TRY(terms_at(step, starts ? left : ends ? at : &knot, &of));
+    modes_at(&of, step->watch->mode, mode);
+    solve_contacts(&of, mode, of.second, force, second, NULL);
+    for (int r = 0; r < CONTACT_ROWS; r++) {
+      missed[0][r] += CONTACT_WEIGHT[j] * part * second[r] + (starts - ends) * of.rate[r];
+      missed[1][r] += CONTACT_WEIGHT[j] * (CONTACT_KNOT[j] * part * second[r] + of.rate[r]) - ends * of.rate[r];
+      size[r] = fmax(size[r], fabs(of.rate[r]));
+      rounding[r] = fmax(rounding[r], CHANGE_SAFETY * DBL_EPSILON * of.second_terms[r] * fabs(part));
+    }
   }
-  return apart <= fmax(tolerance, CHANGE_CONFIRMED) * moved + CHANGE_SAFETY * DBL_EPSILON * size ? OK : NOT_CONVERGED;
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    for (int i = 0; CONTACTS[k].varies && mode[k].closed && !mode[k].sticks && i < CONTACTS[k].slips; i++) {
+      const int r = CONTACTS[k].tangential + i;
+      const real allowed = fmax(tolerance, CHANGE_SAFETY * DBL_EPSILON) * size[r] + rounding[r];
+      if (fmax(fabs(missed[0][r]), fabs(missed[1][r])) > allowed)
+        return 0.5 * fabs(part) > CONTACT_UNSOLVED * step->watch->pace ? NOT_CONVERGED : OK;
+    }
+  return OK;
 }
 #endif
 
@@ -556,11 +563,11 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
         group++;
       part *= step->found[group].fraction;
       TRY(refine_crossing(step, group, &right, &at, &part));
-#if defined(EVENT_CONTACTS) && EVENTS_CONTROLLED
-      if (adaptive)
-        TRY(confirm_part(step, &left, &at, part, control->tolerance));
-#endif
     }
+#if defined(CONTACTS_VARY) && EVENTS_CONTROLLED
+    if (adaptive)
+      TRY(judge_slips(step, &left, acts || step->watch->ended ? &at : &right, part, control->tolerance));
+#endif
     step->watch->time += part;
     cut &= !acts && !step->watch->ended;
     if (cut) {
