@@ -246,8 +246,10 @@ static void cone_connect(const real *W, const int *takes_part, int first, int *m
   for (int i = 0; i < count; i++)
     for (int k = 0; k < EVENT_CONTACTS; k++) {
       int row[3], column[3], meets = 0;
+      if (!takes_part[k] || member[k])
+        continue;
       const int rows = rows_of(list[i], row), columns = rows_of(k, column);
-      for (int r = 0; r < rows && takes_part[k] && !member[k]; r++)
+      for (int r = 0; r < rows; r++)
         for (int c = 0; c < columns; c++)
           meets |= W[row[r] * CONTACT_ROWS + column[c]] != 0.0;
       if (meets) {
