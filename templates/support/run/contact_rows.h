@@ -124,7 +124,7 @@ static real size_by_position(const real *G, const real *q)
       gradient += G[i] * G[i];
       position += q[i] * q[i];
     }
-    sum += sqrt(gradient) * sqrt(position);
+    sum += sqrt(gradient * position);
   }
   return sum;
 }
