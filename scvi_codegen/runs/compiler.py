@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.codegen.ir.variants import Derivatives, Sums, Variant
 from scvi_codegen.codegen.native.building import TUNED_FLAGS
 from scvi_codegen.codegen.native.compilers import REORDERING_FLAGS
-from scvi_codegen.codegen.native.option_table import OPTION
+from scvi_codegen.codegen.native.option_table import LOCATED, OPTION
 from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE, Interface, Source
 from scvi_codegen.common.cache import cached_source, key_of
 from scvi_codegen.common.errors import MethodError, MethodWarning, SizesRequiredError
@@ -75,6 +75,7 @@ def compile_stepper(
     precision: str = "double",
     sums: str = "compensated",
     contacts: Sequence[ContactLike] = (),
+    transitions: str = LOCATED,
 ) -> Stepper:
     """Derive, generate, compile and load the integrator of ``system`` by ``method``.
 
@@ -119,6 +120,8 @@ def compile_stepper(
         contacts: contacts and dry friction of the system, made by :func:`~scvi_codegen.contact` and
             :func:`~scvi_codegen.friction`, in addition to its own. The method is an SVI of degree s with s + 1 Lobatto
             points, ``"svi:3"``, in double precision.
+        transitions: ``"by steps"``: all runs have contacts by steps (:meth:`Stepper.integrate`), and the equations of
+            located steps are neither derived nor compiled, which takes half to two thirds of the time of robots.
 
     Raises:
         BuildError: if there is no C compiler.
@@ -126,6 +129,7 @@ def compile_stepper(
     """
     check_precision(precision, flags)
     summed: Sums = OPTION["sums"].checked(sums, MethodError)
+    OPTION["transitions"].checked(transitions)
     of_finer = {"sizes": sizes, "tables": tables, "flags": flags, "precision": precision}
     finer = Once(partial(_finer_stepper, system, method, tuple(contacts), of_finer))
     others = {"precision": precision, "sizes": sizes, "tables": tables, "controller": controller}
@@ -147,14 +151,16 @@ def compile_stepper(
     if isinstance(system, OfRunTimeSizes) and sizes is None and tables is None:
         of_arrays = _compile_arrays(system, method, symmetries, as_events(events), precision, common, summed, looser)
         of_arrays._finer = finer
-        return of_arrays
+        return of_arrays.by_transitions(transitions)
     if sums == "plain":
         raise MethodError(
             f"sums='plain' is not available for '{system.name}' with named coordinates or known sizes: leave out "
             "sums=, or declare arrays, q[N], whose sizes each run gives"
         )
     if precision == AUTO:
-        return _in_both_precisions(partial(compile_stepper, system, method, **further), events)
+        return _in_both_precisions(partial(compile_stepper, system, method, **further), events).by_transitions(
+            transitions
+        )
     shape: dict[str, Any] = {"mesh": system.mesh, "links": system.drawn_links}
     if sizes is not None or tables is not None:
         system, time_transformation = _at_sizes(system, time_transformation, sizes or {}, tables)
@@ -163,10 +169,11 @@ def compile_stepper(
     settings = system, as_method(named, system), solver, prefix, symmetries, time_transformation, controller
 
     def made(precision: str, events: tuple[Event, ...] = (), *, locates: bool = False) -> Stepper:
-        sources = CachedSources(*settings, precision, locates=locates)
+        sources = CachedSources(*settings, precision, locates=locates, by_steps=transitions != LOCATED)
         source, interface = sources.integrator()
         interface = replace(interface, layout=replace(interface.layout, **shape), contacts=rows)
-        return Stepper(source, interface, variants=sources.variants, flags=flags, events=events, looser=looser)
+        stepper = Stepper(source, interface, variants=sources.variants, flags=flags, events=events, looser=looser)
+        return stepper.by_transitions(transitions)
 
     stepper = made(precision, as_events(events), locates=precision != DOUBLE_DOUBLE)
     if precision == DOUBLE_DOUBLE:
@@ -318,12 +325,13 @@ class CachedSources:
         precision: str = "double",
         *,
         locates: bool = False,
+        by_steps: bool = False,
     ) -> None:
-        self.precision, self.locates = precision, locates
+        self.precision, self.locates, self.by_steps = precision, locates, by_steps
         self.system, self.method, self.solver, self.prefix = system, method, solver, prefix
         self.symmetries, self.g, self.controller = symmetries, g, controller
         choices = (solver, prefix, tuple(symmetries), g, controller, *([precision] if precision != "double" else []))
-        choices = (*choices, *(["located"] if locates else []))
+        choices = (*choices, *(["located"] if locates else []), *(["by steps"] if by_steps else []))
         self.key = (*system.key(), *method.key(), key_of(choices))
 
     @cached_property
@@ -332,7 +340,7 @@ class CachedSources:
         from scvi_codegen.codegen.pipeline import Sources
 
         choices = self.solver, self.prefix, self.symmetries, self.g, self.controller, self.precision
-        return Sources(self.system, self.method, *choices, locates=self.locates)
+        return Sources(self.system, self.method, *choices, locates=self.locates, by_steps=self.by_steps)
 
     @property
     def variants(self) -> Variants:

@@ -26,9 +26,9 @@ pytestmark = [pytest.mark.long, pytest.mark.rotated]
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SCRIPTS = (
     "ceres_orbit", "collisions_in_space", "curves_and_quadratures",
-    "eccentric_comet", "elements_on_processes", "field_on_two_processes", "halo_orbits", "hanging_chain",
-    "henon_heiles_map", "custom_sympy_system", "import_generated_stepper", "inspect_derivation", "joints",
-    "kepler_conservation", "lennard_jones_liquid", "logarithmic_hamiltonian", "mechanism_from_joints",
+    "eccentric_comet", "elements_on_processes", "falling_humanoid", "field_on_two_processes", "halo_orbits",
+    "hanging_chain", "henon_heiles_map", "custom_sympy_system", "import_generated_stepper", "inspect_derivation",
+    "joints", "kepler_conservation", "lennard_jones_liquid", "logarithmic_hamiltonian", "mechanism_from_joints",
     "rebound_bodies", "which_step",
 )  # fmt: skip
 ENERGY_ERRORS = {
@@ -172,6 +172,16 @@ def test_every_step_size_selection_has_its_documented_accuracy(output_of):
 def test_comet_returns_after_a_near_collision(output_of):
     errors = [float(line.split()[-1]) for line in output_of("collisions_in_space").splitlines()[1:]]
     assert max(errors) < 1e-11
+
+
+@many_steps
+def test_a_humanoid_falls_and_rests_in_less_than_the_time_of_its_fall(output_of):
+    motion, rest, energy = output_of("falling_humanoid").splitlines()
+    seconds, taken = map(float, re.findall(r"(\S+) s\b", motion))
+    assert taken < seconds
+    assert float(rest.split(";")[0].split()[-1]) < 1e-3
+    before, after, lost = map(float, re.findall(r"(\S+) J", energy))
+    assert after < before - lost < before
 
 
 def test_leapfrog_with_logarithmic_hamiltonian_preserves_an_ellipse(output_of):

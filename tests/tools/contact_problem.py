@@ -20,7 +20,7 @@ typedef struct {{ int normal, tangential, slips; }} contact_places;
 typedef struct {{ int is_closed, pushes, sticks; double direction[2]; }} cone_mode;
 typedef struct {{
   const double *W;
-  double b[{ROWS}], terms[{ROWS}], f[{ROWS}], u[{ROWS}];
+  double b[{ROWS}], terms[{ROWS}], f[{ROWS}];
   int takes_part[{CONTACTS}], rests[{CONTACTS}];
   double mu[{CONTACTS}], mu_static[{CONTACTS}], given[{CONTACTS}][2];
   cone_mode mode[{CONTACTS}];
@@ -151,4 +151,5 @@ def solve(problem: Problem, folder: Path, start: ArrayLike = 0.0) -> Solution:
     view("given").reshape(-1, 2)[:contacts] = problem.given
     solved = bool(library.solve_problem(places, own))
     sticks = np.array([bool(own.mode[k].sticks) for k in range(contacts)])
-    return Solution(solved, view("f")[:rows].copy(), view("u")[:rows].copy(), sticks)
+    f = view("f")[:rows].copy()
+    return Solution(solved, f, problem.b + problem.W @ f, sticks)

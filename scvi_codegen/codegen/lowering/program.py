@@ -8,6 +8,7 @@ matrix: on positions, on velocities, or on momenta and velocities
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import sympy
@@ -178,6 +179,7 @@ def lower(
     symmetries: Sequence[Symmetry] = (),
     lanes: bool = True,
     fallback: bool = True,
+    by_steps: bool = False,
 ) -> Program:
     """Return the program of one step of ``method`` for ``system``; exported C names begin with ``prefix``.
 
@@ -188,6 +190,7 @@ def lower(
         symmetries: whose momentum maps are included.
         lanes: allow a solver that uses SIMD lanes.
         fallback: include Newton's iteration as a fallback. Systems with integrals along the curve always include it.
+        by_steps: without the stage equations, for contacts by steps alone.
     """
     stages, explicit = discretise(system, method), solver in ("auto", "explicit")
     splitting = splitting_of(system, method) if explicit and not system.integrands else None
@@ -198,7 +201,9 @@ def lower(
     newton = solver in ("auto", "newton") and splitting is None and not alone
     in_lanes = bool(fixed_point and "MASS_TERMS" in fixed_point.facts) and not newton and not system.bath
     polynomial = method.exactness.curve != 0
-    equations = _equations(system, method, stages, newton=newton, curve=newton and polynomial)
+    equations = _equations(
+        system, method, stages, newton=newton and not by_steps, curve=newton and polynomial, coupled=by_steps
+    )
     return Program(
         **_heading(system, method, stages, prefix, geometry=_geometry(method, system)),
         layout=Layout(
@@ -301,22 +306,26 @@ def _ranges_of(groups: Iterable[Sequence[str]], system: MechanicalSystem) -> Ite
 
 
 def _equations(
-    system: MechanicalSystem, method: Method, stages: StageSystem, *, newton: bool, curve: bool
+    system: MechanicalSystem, method: Method, stages: StageSystem, *, newton: bool, curve: bool, coupled: bool = False
 ) -> StageEquations:
-    """Return the stage equations; ``newton``: with the stage groups, ``curve``: with the error estimate."""
+    """Return the stage equations; ``newton``: with the stage groups, ``curve``: with the error estimate.
+
+    ``coupled``: in an order of the unknowns in which all are coupled with each other.
+    """
     m, sites = system.dimension, layout_of(stages, system.dimension)
     blocks, rows = [stages.blocks[b] for b in sites.columns[None]], [stages.rows[r] for r in sites.rows[None]]
     stage_groups = tuple(lowered_stage_group(system, group, sites) for group in stages.stage_groups) if newton else ()
     pairs = (pair for group in stage_groups for block in group.blocks for pair in block.entries)
-    coupled = [*forms_of(system).legendre_jacobian, *pairs]  # with a nonzero derivative
-    order = bandwidth_ordering(coupled, sites.count)
+    all_pairs = product(range(sites.count), repeat=2) if coupled else ()
+    entries = [*forms_of(system).legendre_jacobian, *pairs, *all_pairs]  # with a nonzero derivative
+    order = bandwidth_ordering(entries, sites.count)
     return StageEquations(
         sites=sites.count,
         blocks=len(blocks),
         stage_groups=stage_groups,
         places=order,
         mass_positions=tuple(sorted(range(m), key=order.__getitem__).index(i) for i in range(m)),
-        bandwidth=bandwidth(coupled, order),
+        bandwidth=bandwidth(entries, order),
         momentum_rows=lower_vector(tuple(row.momentum for row in rows)),
         end_position=lower_vector(stages.end_position.columns([b + 1 for b in sites.columns[None]]).entries[0]),
         straight=tuple(int(block.straight[1]) for block in blocks),

@@ -12,7 +12,7 @@ import numpy as np
 
 from scvi_codegen.codegen.ir.variants import SUMS
 from scvi_codegen.codegen.lowering.arrays import check_solver
-from scvi_codegen.codegen.native.option_table import LOCATED, VELOCITY, check_agreement
+from scvi_codegen.codegen.native.option_table import VELOCITY, check_agreement
 from scvi_codegen.common.display.cards import Html, card, listed, plain
 from scvi_codegen.common.errors import ArgumentError, ModelFileError, StateError, speaking
 from scvi_codegen.common.representation import summary
@@ -346,6 +346,7 @@ class Model(TimeSpan):
             controller=self.controller,
             precision=self.precision or "double",
             sums=self.sums or SUMS[0],
+            transitions=self.transitions,
         )
         if self.mesh is not None and stepper.interface.layout.mesh is None:
             stepper.interface = replace(stepper.interface, layout=replace(stepper.interface.layout, mesh=self.mesh))
@@ -354,8 +355,6 @@ class Model(TimeSpan):
 
             require(stepper, "action")
             stepper = stepper.acting
-        if self.transitions != LOCATED:
-            stepper = stepper.by_transitions(self.transitions)
         return stepper.with_events(self.events)
 
     def momenta(self, stepper: Stepper) -> Array:

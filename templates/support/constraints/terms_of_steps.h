@@ -12,7 +12,7 @@ int NAME(motion_terms)(real t, const real *q, const real *v, const real *paramet
   memset(by_state, 0, sizeof(real) * 4 * M * M);
   for (int e = 0; e < MOTION_ENTRIES; e++)
     by_state[MOTION_ENTRY[e][0] * 2 * M + MOTION_ENTRY[e][1]] = derivative[e];
-  return all_finite(terms, 2 * M * (1 + 2 * M)) ? OK : NOT_FINITE;
+  return all_finite(terms, 2 * M) && all_finite(derivative, MOTION_ENTRIES) ? OK : NOT_FINITE;
 }
 
 int NAME(row_terms)(real t, const real *q, const real *v, const real *parameters, real *terms)
@@ -26,5 +26,5 @@ int NAME(row_terms)(real t, const real *q, const real *v, const real *parameters
   for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
     G[CONSTRAINT_ENTRY[e][0] * M + CONSTRAINT_ENTRY[e][1]] = derivative[e];
   contact_coefficients(u, t, parameters, G + CONSTRAINTS * M);
-  return all_finite(terms, CONSTRAINTS * (2 + M)) ? OK : NOT_FINITE;
+  return all_finite(terms, 2 * CONSTRAINTS) && all_finite(derivative, CONSTRAINT_ENTRIES) ? OK : NOT_FINITE;
 }

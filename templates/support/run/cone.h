@@ -35,7 +35,7 @@ typedef struct {
  * from 0. Newton's method starts from f. */
 typedef struct {
   const real *W;
-  real b[CONTACT_ROWS], terms[CONTACT_ROWS], f[CONTACT_ROWS], u[CONTACT_ROWS];
+  real b[CONTACT_ROWS], terms[CONTACT_ROWS], f[CONTACT_ROWS];
   int takes_part[EVENT_CONTACTS], rests[EVENT_CONTACTS];
   real mu[EVENT_CONTACTS], mu_static[EVENT_CONTACTS], given[EVENT_CONTACTS][2];
   cone_mode mode[EVENT_CONTACTS];
@@ -246,8 +246,10 @@ static void cone_connect(const real *W, const int *takes_part, int first, int *m
   for (int i = 0; i < count; i++)
     for (int k = 0; k < EVENT_CONTACTS; k++) {
       int row[3], column[3], meets = 0;
+      if (!takes_part[k] || member[k])
+        continue;
       const int rows = rows_of(list[i], row), columns = rows_of(k, column);
-      for (int r = 0; r < rows && takes_part[k] && !member[k]; r++)
+      for (int r = 0; r < rows; r++)
         for (int c = 0; c < columns; c++)
           meets |= W[row[r] * CONTACT_ROWS + column[c]] != 0.0;
       if (meets) {
@@ -402,7 +404,7 @@ static int cone_solve_static(cone_problem *in, const int *member, cone_block *of
   return solved;
 }
 
-/* Solves a problem within so many proximal points of a block; returns whether a solution was found, f, u, modes. */
+/* Solves a problem within so many proximal points of a block; returns whether a solution was found, f, modes. */
 static int solve_cone_within(cone_problem *in, int most_points)
 {
   cone_block block;
@@ -427,10 +429,6 @@ static int solve_cone_within(cone_problem *in, int most_points)
     for (int j = 0; j < EVENT_CONTACTS; j++)
       done[j] |= member[j];
   }
-  memcpy(in->u, in->b, sizeof in->u);
-  for (int j = 0; j < CONTACT_ROWS; j++) /* rows of others may be undefined */
-    for (int r = 0; r < CONTACT_ROWS && in->f[j] != 0.0; r++)
-      in->u[r] += in->W[r * CONTACT_ROWS + j] * in->f[j];
   return solved;
 }
 

@@ -121,10 +121,10 @@ static real size_by_position(const real *G, const real *q)
   for (int k = 0, i = 0; k < CONTACT_VECTORS; k++) {
     real gradient = 0.0, position = 0.0;
     for (const int next = i + CONTACT_VECTOR[k]; i < next; i++) {
-      gradient = hypot(gradient, G[i]);
-      position = hypot(position, q[i]);
+      gradient += G[i] * G[i];
+      position += q[i] * q[i];
     }
-    sum += gradient * position;
+    sum += sqrt(gradient * position);
   }
   return sum;
 }

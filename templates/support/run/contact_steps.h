@@ -41,16 +41,23 @@ typedef struct {
   real matrix[STEP_SIZE * STEP_SIZE], pivot[STEP_SIZE];
 } step_matrix;
 
-/* A step of length h from (t, q, p, v) to q1; contacts whose rows are formed, and their responses: A^-1 G0^T,
- * M0^-1 G0^T or M1^-1 G1^T. */
+/* Responses A^-1 G0^T, M0^-1 G0^T or M1^-1 G1^T of the `count` rows `row` of the contacts that take part, a column for
+ * each. */
 typedef struct {
-  real t, h, q[M], p[M], v[M], q1[M], fastest;
+  int count, row[CONTACT_ROWS];
+  real x[STEP_SIZE][CONTACT_ROWS];
+} responses;
+
+/* A step of length h from (t, q, p, v) to q1; contacts whose rows are formed, and their responses. */
+typedef struct {
+  real t, h, q[M], p[M], v[M], q1[M], fastest, curvature;
   const real *idle, *imposed; /* parameters */
   motion_terms first, last;
   row_terms start, end;
   step_matrix moving, resting;
+  int solved, continues; /* whether `moving` has the masses at q1, and `resting` had at its start */
   int is_near[EVENT_CONTACTS], pushes[EVENT_CONTACTS], has_begun[EVENT_CONTACTS];
-  real response[CONTACT_ROWS][STEP_SIZE], at_start[CONTACT_ROWS][STEP_SIZE];
+  responses response, at_start;
   real W[CONTACT_ROWS * CONTACT_ROWS];
   cone_problem problem;
 } contact_step;
@@ -86,46 +93,56 @@ static void solve_step(const step_matrix *of, real *x)
   back_substitute(of->matrix, &shape, of->pivot, x);
 }
 
-/* Solutions with the rows of the contacts that take part, as columns. */
-static void respond(const contact_step *in, const step_matrix *of, const row_terms *rows, real (*response)[STEP_SIZE])
+/* Responses to the rows of the contacts that take part: all columns at a time. */
+static void respond(const contact_step *in, const step_matrix *of, const row_terms *rows, responses *to)
 {
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    int row[3];
-    for (int i = in->problem.takes_part[k] ? rows_of(k, row) - 1 : -1; i >= 0; i--) {
-      memset(response[row[i]], 0, sizeof *response);
-      memcpy(response[row[i]], rows->G[STEP_FIXED + row[i]], BYTES(M));
-      solve_step(of, response[row[i]]);
+  real(*const x)[CONTACT_ROWS] = to->x;
+  to->count = 0;
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    if (in->problem.takes_part[k])
+      to->count += rows_of(k, to->row + to->count);
+  for (int i = 0; i < STEP_SIZE; i++)
+    for (int c = 0; c < to->count; c++)
+      x[i][c] = i < M ? rows->G[STEP_FIXED + to->row[c]][i] : 0.0;
+  for (int k = 0; k < STEP_SIZE; k++) {
+    real *const exchanged = x[(int)of->pivot[k]];
+    for (int c = 0; c < to->count; c++) {
+      const real kept = exchanged[c];
+      exchanged[c] = x[k][c];
+      x[k][c] = kept;
     }
+    for (int i = k + 1; i < STEP_SIZE; i++)
+      subtract(x[k], of->matrix[k * STEP_SIZE + i], 0, to->count, x[i]);
+  }
+  for (int k = STEP_SIZE - 1; k >= 0; k--) {
+    for (int c = 0; c < to->count; c++)
+      x[k][c] *= of->matrix[k * (STEP_SIZE + 1)];
+    for (int i = 0; i < k; i++)
+      subtract(x[k], of->matrix[k * STEP_SIZE + i], 0, to->count, x[i]);
   }
 }
 
-/* Lists the rows of the contacts that take part. */
-static int rows_in(const contact_step *in, int *list)
+/* W of the contacts that take part, a part of G times responses. */
+static void pose_matrix(contact_step *in, const row_terms *rows, const responses *of, real part)
 {
-  int count = 0;
-  for (int k = 0; k < EVENT_CONTACTS; k++)
-    if (in->problem.takes_part[k])
-      count += rows_of(k, list + count);
-  return count;
-}
-
-/* W of the contacts that take part, by rows and responses. */
-static void pose_matrix(contact_step *in, const row_terms *rows, real (*response)[STEP_SIZE], real part)
-{
-  int list[CONTACT_ROWS];
-  const int count = rows_in(in, list);
-  for (int r = 0; r < count; r++)
-    for (int c = 0; c < count; c++)
-      in->W[list[r] * CONTACT_ROWS + list[c]] = part * times_row(rows->G[STEP_FIXED + list[r]], response[list[c]]);
+  for (int r = 0; r < of->count; r++) {
+    real sum[CONTACT_ROWS] = {0.0}, *const W = in->W + of->row[r] * CONTACT_ROWS;
+    for (int i = 0; i < M; i++)
+      subtract(of->x[i], -part * rows->G[STEP_FIXED + of->row[r]][i], 0, of->count, sum);
+    for (int c = 0; c < of->count; c++)
+      W[of->row[c]] = sum[c];
+  }
   in->problem.W = in->W;
 }
 
-static int terms_between(contact_step *in)
+/* Terms at the end, and with `first` at the start, at the velocity of the step. */
+static int terms_between(contact_step *in, int first)
 {
   real v[M];
   for (int i = 0; i < M; i++)
     v[i] = (in->q1[i] - in->q[i]) / in->h;
-  TRY(NAME(motion_terms)(in->t, in->q, v, in->idle, in->first.momentum));
+  if (first)
+    TRY(NAME(motion_terms)(in->t, in->q, v, in->idle, in->first.momentum));
   TRY(NAME(motion_terms)(in->t + in->h, in->q1, v, in->idle, in->last.momentum));
   return NAME(row_terms)(in->t + in->h, in->q1, v, in->imposed, in->end.value);
 }
@@ -171,17 +188,19 @@ static void find_near(contact_step *in, const real *x)
 static int solve_positions(contact_step *in, const contact_memory *from, const real *x, int first, int *slow)
 {
   cone_problem *const of = &in->problem;
-  int list[CONTACT_ROWS];
+  const responses *const at = &in->at_start;
   real force[CONTACT_ROWS];
-  const int count = rows_in(in, list);
   memcpy(force, of->f, sizeof force);
-  respond(in, &in->moving, &in->start, in->response);
-  respond(in, &in->resting, &in->start, in->at_start);
-  pose_matrix(in, &in->end, in->response, 1.0 / in->h);
+  respond(in, &in->moving, &in->start, &in->response);
+  if (first || at->count != in->response.count) /* contacts only join */
+    respond(in, &in->resting, &in->start, &in->at_start);
+  pose_matrix(in, &in->end, &in->response, 1.0 / in->h);
   *slow = 0;
-  for (int i = 0; i < count; i++) {
-    const int r = list[i], row = STEP_FIXED + r;
-    *slow |= in->W[r * (CONTACT_ROWS + 1)] < STEP_YIELDS * times_row(in->start.G[row], in->at_start[r]);
+  for (int c = 0; c < at->count; c++) {
+    real yields = 0.0;
+    for (int i = 0; i < M; i++)
+      yields += in->start.G[STEP_FIXED + at->row[c]][i] * at->x[i][c];
+    *slow |= in->W[at->row[c] * (CONTACT_ROWS + 1)] < STEP_YIELDS * yields;
   }
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     int row[3];
@@ -196,12 +215,12 @@ static int solve_positions(contact_step *in, const contact_memory *from, const r
     }
   }
   if (*slow) { /* b + W f of the present forces stays */
-    for (int i = 0; i < count; i++)
-      of->b[list[i]] = cone_rate(of, list[i]);
-    pose_matrix(in, &in->start, in->at_start, 1.0);
-    for (int i = 0; i < count; i++)
-      for (int j = 0; j < count; j++)
-        of->b[list[i]] -= in->W[list[i] * CONTACT_ROWS + list[j]] * force[list[j]];
+    for (int c = 0; c < at->count; c++)
+      of->b[at->row[c]] = cone_rate(of, at->row[c]);
+    pose_matrix(in, &in->start, at, 1.0);
+    for (int r = 0; r < at->count; r++)
+      for (int c = 0; c < at->count; c++)
+        of->b[at->row[r]] -= in->W[at->row[r] * CONTACT_ROWS + at->row[c]] * force[at->row[c]];
   }
   if (!solve_cone_within(of, STEP_POINTS))
     return NOT_CONVERGED;
@@ -256,31 +275,34 @@ static int find_missed(contact_step *in)
   return missed;
 }
 
-/* x += X f with responses X. */
-static void add_responses(const contact_step *in, const real *f, real *x)
+/* y += part X f with responses X. */
+static void add_responses(const responses *of, real part, const real *f, real *y)
 {
-  for (int r = 0; r < CONTACT_ROWS; r++)
-    for (int i = 0; i < M && f[r] != 0.0; i++)
-      x[i] += in->response[r][i] * f[r];
+  for (int i = 0; i < M; i++)
+    for (int c = 0; c < of->count; c++)
+      y[i] += part * of->x[i][c] * f[of->row[c]];
 }
 
 /* Solves the first problem for q1 and the impulses f1: Newton's method on both, a contact problem an iteration. */
 static int find_positions(contact_step *in, const contact_memory *from)
 {
-  real size = 0.0, *const f = in->problem.f;
+  real size = 0.0, before = 0.0, *const f = in->problem.f;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     in->problem.takes_part[k] = in->is_near[k] && (CONTACTS[k].normal < 0 || from->pushes[k]);
     pose_limits(in, k, &in->start, from->sticks[k]);
   }
   for (int r = 0; r < CONTACT_ROWS; r++)
     f[r] = in->h * from->force[r];
-  for (int i = 0; i < M; i++)
-    in->q1[i] = in->q[i] + in->h * in->v[i];
+  for (int i = 0; i < M; i++) {
+    const real bend = (from->steady > 0 ? from->bend[i] : 0.0) + (from->steady > 1 ? from->turn[i] : 0.0);
+    in->q1[i] = in->q[i] + in->h * (in->v[i] + in->h * bend);
+  }
+  in->curvature = from->steady > 0 ? from->curvature : 0.0;
   for (int iteration = 0; iteration < STEP_ITERATIONS; iteration++) {
     real x[STEP_SIZE], rounding[M];
     int slow;
-    TRY(terms_between(in));
-    if (iteration == 0)
+    TRY(terms_between(in, 1));
+    if (iteration == 0 && !in->continues)
       TRY(factorise_step(NULL, &in->first, &in->start, &in->start, &in->resting));
     TRY(linearise_step(in, x));
     find_near(in, x);
@@ -290,14 +312,21 @@ static int find_positions(contact_step *in, const contact_memory *from)
     TRY(solve_positions(in, from, x, iteration == 0, &slow));
     if (iteration == 0)
       keep_limits(in, from);
-    add_responses(in, f, x);
+    add_responses(&in->response, 1.0, f, x);
     for (int i = 0; i < M; i++) {
       in->q1[i] += x[i];
       rounding[i] = CONTACT_LOWEST * DBL_EPSILON * fabs(in->q1[i]);
     }
-    if (!(norm_of(in, x) <= (slow ? STEP_SLOW_UPDATE / STEP_UPDATE : 1.0) * size + norm_of(in, rounding)))
+    const real update = norm_of(in, x), smallest = norm_of(in, rounding);
+    if (iteration == 1)
+      in->curvature = update / fmax(before * before, DBL_MIN);
+    before = update;
+    if (!(update <= (slow ? STEP_SLOW_UPDATE / STEP_UPDATE : 1.0) * size + smallest) &&
+        !(iteration == 0 && in->curvature > 0.0 && !slow && in->curvature * update * update <= STEP_UPDATE * size))
       continue;
-    TRY(terms_between(in));
+    for (int i = 0; i < M; i++) /* L_v is linear in v */
+      in->first.momentum[i] += times_row(in->first.by_state[i] + M, x) / in->h;
+    TRY(terms_between(in, 0));
     if (!find_missed(in))
       return OK;
   }
@@ -348,7 +377,7 @@ static int rebound(contact_step *in, const contact_memory *from, const real *f1,
   if (!solve_cone_within(of, STEP_POINTS))
     return NOT_CONVERGED;
   memcpy(w, before, sizeof w);
-  add_responses(in, of->f, w);
+  add_responses(&in->response, 1.0, of->f, w);
   for (int i = 0; i < M; i++)
     w[i] -= v[i];
   const real plastic = work_of_surfaces(&in->end, f);
@@ -364,17 +393,22 @@ static int rebound(contact_step *in, const contact_memory *from, const real *f1,
   return OK;
 }
 
+/* Whether a contact is open, sticks or slips unlike before. */
+static int has_changed(const contact_memory *before, const contact_memory *now, int k)
+{
+  return before->is_closed[k] != now->is_closed[k] || before->sticks[k] != now->sticks[k];
+}
+
 /* Solves the second problem for the velocities at q1, and keeps forces and modes. */
 static int find_velocities(contact_step *in, contact_memory *to, real *workspace)
 {
   cone_problem *const of = &in->problem;
   const contact_memory from = *to;
   real x[STEP_SIZE], f1[CONTACT_ROWS], before[M], v[M], work = 0.0, fastest = 0.0;
+  int changes = 0;
   memcpy(f1, of->f, sizeof f1);
   memcpy(v, in->v, sizeof v); /* the mean of those before and after f1 */
-  for (int r = 0; r < CONTACT_ROWS; r++)
-    for (int i = 0; i < M && f1[r] != 0.0; i++)
-      v[i] += 0.5 * in->at_start[r][i] * f1[r];
+  add_responses(&in->at_start, 0.5, f1, v);
   for (int r = 0; r < CONTACT_ROWS; r++)
     work += f1[r] == 0.0 ? 0.0 : f1[r] * times_row(in->start.G[STEP_FIXED + r], v);
   for (int i = 0; i < M; i++) {
@@ -393,8 +427,8 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
         in->end.value[row] <= CONTACT_LOWEST * DBL_EPSILON * size_by_position(in->end.G[row], in->q1));
     pose_limits(in, k, &in->end, from.sticks[k] && !in->has_begun[k]);
   }
-  respond(in, &in->moving, &in->end, in->response);
-  pose_matrix(in, &in->end, in->response, 1.0);
+  respond(in, &in->moving, &in->end, &in->response);
+  pose_matrix(in, &in->end, &in->response, 1.0);
   for (int r = 0; r < CONTACT_ROWS; r++) {
     of->b[r] = rate_of(&in->end, r, before);
     of->terms[r] = fabs(of->b[r]);
@@ -405,7 +439,7 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   if (!solve_cone_within(of, STEP_POINTS))
     return NOT_CONVERGED;
   memcpy(v, before, sizeof v);
-  add_responses(in, of->f, v);
+  add_responses(&in->response, 1.0, of->f, v);
   TRY(rebound(in, &from, f1, before, v, workspace));
   to->residual = fmax(to->residual, of->residual);
   to->compliance = fmax(to->compliance, of->compliance);
@@ -416,16 +450,28 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal;
     const real rate = normal < 0 ? 0.0 : rate_of(&in->end, normal, v);
+    changes |= from.pushes[k] != in->pushes[k];
     to->pushes[k] = in->pushes[k];
     to->is_closed[k] = of->takes_part[k] && rate <= CONTACT_ROUNDING * fastest;
     to->sticks[k] = to->is_closed[k] && of->mode[k].sticks;
     memcpy(to->direction[k], of->mode[k].direction, sizeof *to->direction);
+    changes |= has_changed(&from, to, k);
   }
+  for (int i = 0; i < M; i++) {
+    to->bend[i] = ((in->q1[i] - in->q[i]) / in->h - in->v[i]) / in->h;
+    to->turn[i] = to->bend[i] - from.bend[i];
+  }
+  to->steady = changes ? 0 : least(from.steady + 1, 2);
+  to->curvature = in->curvature;
   return OK;
 }
 
 static void take_state(contact_step *in, const contact_memory *memory, real t, real h, const real *q, const real *p)
 {
+  in->continues = in->solved && t == in->t + in->h && memcmp(q, in->q1, BYTES(M)) == 0;
+  if (in->continues)
+    in->resting = in->moving;
+  in->solved = 0;
   in->t = t;
   in->h = h;
   memcpy(in->q, q, BYTES(M));
@@ -465,12 +511,15 @@ static int step_by_steps(contact_step *in, contact_memory *memory, real t, real 
   status = find_positions(in, memory);
   if (status == OK)
     status = find_velocities(in, &next, workspace);
-  if (status == OK)
-    status = NAME(momentum)(t + h, in->q1, next.v, in->idle, in->p, workspace);
   if (status == OK) {
+    for (int i = 0; i < M; i++) { /* L_v is linear in v */
+      p[i] = in->last.momentum[i];
+      for (int j = 0; j < M; j++)
+        p[i] += in->last.by_state[i][M + j] * (next.v[j] - (in->q1[j] - in->q[j]) / h);
+    }
     memcpy(q, in->q1, BYTES(M));
-    memcpy(p, in->p, BYTES(M));
     *memory = next;
+    in->solved = 1;
     return OK;
   }
   if (depth == STEP_HALVINGS)
@@ -519,12 +568,6 @@ static int begin_by_steps(contact_step *in, event_run *run, event_watch *watch, 
   memory->begun = 1;
   put_memory(memory, watch->mode);
   return OK;
-}
-
-/* Whether a contact is open, sticks or slips unlike before. */
-static int has_changed(const contact_memory *before, const contact_memory *now, int k)
-{
-  return before->is_closed[k] != now->is_closed[k] || before->sticks[k] != now->sticks[k];
 }
 
 /* Adds a crossing at a state. */
