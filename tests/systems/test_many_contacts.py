@@ -318,6 +318,19 @@ def test_five_balls_of_a_cradle_at_rest_contact(law: str, after: list[float], un
         assert made.velocity[-1] / unit == pytest.approx(after, abs=1e-14)
 
 
+@pytest.mark.second
+def test_impacts_that_do_not_end_leave_the_common_velocity() -> None:
+    """Inelastic collapse of a light ball between two others (S. McNamara & W. R. Young, Phys. Fluids A 4, 1992)."""
+    text, gaps = "x_dot**2/2 + m*y_dot**2/2 + z_dot**2/2", [("y - x", 0.5), ("z - y", 0.3)]
+    contacts = [sc.contact(gap, restitution=e) for gap, e in gaps]
+    system = sc.LagrangianSystem.from_text("between", ["x", "y", "z"], text, contacts=contacts, parameters={"m": 1.0})
+    stepper = sc.compile_stepper(system, "svi:2", flags=("-O1",))
+    for m in (1e-2, 1e-3, 1e-5):
+        with pytest.warns(sc.EventWarning, match="impacts in a corner do not end"):
+            run = stepper.integrate([0, 0, 0], velocity=[1, 0, -0.5], parameters={"m": m}, t_end=1, h=0.1)
+        assert run.velocity[-1] == pytest.approx(3 * [0.5 / (2 + m)], abs=1e-14)
+
+
 @pytest.mark.tiers(0, 1)
 def test_a_box_that_falls_flat_does_not_turn_by_simultaneous_impacts(tmp_path: Any) -> None:
     """Both corners leave with e v; it slides on by v_x - mu (1 + e) v, or sticks."""
@@ -534,7 +547,8 @@ def test_nearly_straight_legs_pass_through_straight(start: dict[str, Any]) -> No
     ("bend", "start"),
     [
         (1.003e-6, {"h": 0.005}),  # a slip began against its friction ..
-        (1.003e-6, {"tolerance": 1e-6}),  # .. gained 5 J of 35 in one step, by a part in which the legs fold ..
+        # .. gained 5 J of 35 in one step, by a part in which the legs fold ..
+        pytest.param(1.003e-6, {"tolerance": 1e-6}, marks=ROUNDING_DECIDES),
         (1.003e-6, {"tolerance": 1e-9, "drop": 0.05}),  # .. stood still, as a slip stopped at its start ..
         pytest.param(1.0262313340441848e-06, {"tolerance": 1e-12}, marks=ROUNDING_DECIDES),  # .. or in steps of 1e-12
     ],
@@ -644,18 +658,9 @@ def comes_to_rest_on_feet(run: Any, gaps: NDArray[Any], weight: float, mu: float
     )
 
 
-PASSES_A_TOUCH = pytest.mark.xfail(
-    reason="a foot touches and leaves within one step beside feet that slide: its impact is passed over",
-    raises=sc.EventError,
-    strict=True,
-)
-
-
 @pytest.mark.tiers(0, 1)
 @pytest.mark.filterwarnings("ignore:a transition has several motions")
-@pytest.mark.parametrize(
-    ("seed", "e"), [*((seed, 0.0) for seed in range(3)), (0, 0.3), (1, 0.3), pytest.param(2, 0.3, marks=PASSES_A_TOUCH)]
-)
+@pytest.mark.parametrize(("seed", "e"), [(seed, e) for e in (0.0, 0.3) for seed in range(3)])
 def test_a_table_falls_on_four_feet_in_space_and_rests(e: float, seed: int) -> None:
     velocity = np.random.default_rng(seed).normal(size=6) * [0.3, 0.3, 0, 0.5, 0.5, 0.5]
     run = dining_table(e).integrate([0, 0, 0.3, 0, 0, 0], velocity=velocity, h=0.005, t_end=1.5)

@@ -18,20 +18,19 @@ REFUSALS = {
     1: "the run starts at t = {t:.17g} with the gap of contact {k} at {value:.6g}, which must not be negative: "
     "correct the initial positions, the range of the joint, or the sign of the gap",
     3: "no impulses satisfy the law of impact with friction at t = {t:.17g}, contact {k}: reduce its friction",
-    5: "friction of contact {k} is {value:.6g} at t = {t:.17g}: friction must not be negative, nor undefined. Correct "
+    4: "friction of contact {k} is {value:.6g} at t = {t:.17g}: friction must not be negative, nor undefined. Correct "
     "the formula or the number, as with max(0, ..)",
-    7: "static friction of contact {k} is {value:.6g} at t = {t:.17g}: at rest it must not be less than that of "
+    6: "static friction of contact {k} is {value:.6g} at t = {t:.17g}: at rest it must not be less than that of "
     "sliding. Correct one of the formulas or numbers, as with max(..)",
-    8: "restitution of contact {k} is {value:.6g} at t = {t:.17g}: it must not be negative, nor exceed 1. Correct the "
+    7: "restitution of contact {k} is {value:.6g} at t = {t:.17g}: it must not be negative, nor exceed 1. Correct the "
     "formula or the number, as with max(0, min(1, ..))",
     2: "neither forces nor impulses of the contacts are consistent at t = {t:.17g}: the contacts contradict each "
     "other, or none were found. Reduce friction, or use fewer contacts",
-    6: "contact {k} pulls, or exceeds its friction, at t = {t:.17g} in each mode that was tried: limit the steps by "
+    5: "contact {k} pulls, or exceeds its friction, at t = {t:.17g} in each mode that was tried: limit the steps by "
     "max_step= (or h=), or reduce its friction",
-    9: "steps of all sizes create energy at t = {t:.17g}, at last {value:.3g}: the motion ends there (a collision, a "
+    8: "steps of all sizes create energy at t = {t:.17g}, at last {value:.3g}: the motion ends there (a collision, a "
     "singularity), or closed contacts nearly depend on each other, as of legs that pass straight. Set t_end before "
     "that time, or give another tolerance, or h (fixed step size)",
-    4: "the impacts at t = {t:.17g} do not end: contacts close a corner; set a restitution to 0",
 }
 """Messages by the reasons of contacts.h."""
 NOISE = 1e-9
@@ -86,7 +85,7 @@ def undefined_friction(run: Any, watch: Any) -> ContactError | None:
         for k in closed:
             if not np.isfinite(friction[k]):
                 title = f"{k + 1} ({contacts[k].title})"
-                return ContactError(REFUSALS[5].format(k=title, value=friction[k], t=t))
+                return ContactError(REFUSALS[4].format(k=title, value=friction[k], t=t))
     return None
 
 
@@ -119,12 +118,14 @@ def warn_of_choices(stepper: Integrator, watch: Any) -> None:
             "(Painleve's paradox), and impulses, the limit of stiff contact, change the slip",
             EventWarning,
         )
-    if getattr(watch, "reduced", 0):
+    if getattr(watch, "reduced", 0) & 1:
         warn(
             "the restitution of an impact would have created kinetic energy with friction: it was reduced, so that "
             "none is created",
             EventWarning,
         )
+    if getattr(watch, "reduced", 0) & 2:
+        warn("impacts in a corner do not end: the last ones were without restitution", EventWarning)
     if missed := getattr(watch, "missed", 0.0):
         warn(
             f"some adaptive steps have a tolerance of up to {missed:.2g}: {ROUNDED.format(part=watch.rounded)}",

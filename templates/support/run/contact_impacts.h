@@ -86,17 +86,19 @@ static int restitute(const event_step *step, const contact_terms *of, const int 
   const real part = restitution_part(of, rate, plastic, impulse);
   for (int r = 0; r < CONTACT_ROWS; r++)
     impulse[r] = plastic[r] + part * (impulse[r] - plastic[r]);
-  step->watch->reduced = 1;
+  step->watch->reduced |= 1;
   return 1;
 }
 
 /* Adds to impulses those of the rows of contacts that approach, one after another, until none does: simultaneous ones
  * with those that touch and do not separate, all with closed ones and with those of e = 0, in blocks that W connects.
- * Without friction Newton's law creates no energy: T+ - T- = sum of (1 - e) Lambda v_n- / 2. */
+ * Without friction Newton's law creates no energy: T+ - T- = sum of (1 - e) Lambda v_n- / 2. Where they do not end, as
+ * in a corner, they accumulate and their rates vanish: the limit is one without restitution. */
 static int find_impulses(const event_step *step, const contact_terms *of, const int *approaches, const int *closed,
     real *total)
 {
-  for (int round = 0; round < CONTACT_IMPACTS * EVENT_CONTACTS; round++) {
+  for (int round = 0; round <= CONTACT_IMPACTS * EVENT_CONTACTS; round++) {
+    const int last = round == CONTACT_IMPACTS * EVENT_CONTACTS;
     real rate[CONTACT_ROWS];
     int meets[EVENT_CONTACTS], may_act[EVENT_CONTACTS], acted[EVENT_CONTACTS] = {0}, first = -1;
     for (int r = 0; r < CONTACT_ROWS; r++)
@@ -108,10 +110,12 @@ static int find_impulses(const event_step *step, const contact_terms *of, const 
     }
     if (first < 0)
       return OK;
+    step->watch->reduced |= 2 * last;
     for (int k = 0; k < EVENT_CONTACTS; k++) {
       const int normal = CONTACTS[k].normal, impacts = CONTACTS[k].impacts;
       const int together = impacts == CONTACT_SIMULTANEOUS && impacts == CONTACTS[first].impacts && approaches[k];
-      meets[k] = k == first || (together && rate[normal] <= CONTACT_ROUNDING * of->speed[normal]);
+      meets[k] = k == first || (together && rate[normal] <= CONTACT_ROUNDING * of->speed[normal]) ||
+          (last && approaches[k]);
       may_act[k] = meets[k] || closed[k] || (approaches[k] && of->coefficient[3 * k + 2] == 0.0);
     }
     for (int k = first; k < EVENT_CONTACTS; k++) {
@@ -120,7 +124,7 @@ static int find_impulses(const event_step *step, const contact_terms *of, const 
       if (!meets[k] || acted[k])
         continue;
       cone_connect(of->W, may_act, k, takes_part);
-      if (!restitute(step, of, takes_part, meets, rate, impulse))
+      if (!restitute(step, of, takes_part, last ? NULL : meets, rate, impulse))
         return refuse(step, CONTACT_WITHOUT_IMPULSE, k, 0.0);
       for (int r = 0; r < CONTACT_ROWS; r++)
         total[r] += impulse[r];
@@ -128,7 +132,7 @@ static int find_impulses(const event_step *step, const contact_terms *of, const 
         acted[i] |= takes_part[i];
     }
   }
-  return refuse(step, CONTACT_IN_CORNER, -1, 0.0);
+  return OK;
 }
 
 /* Whether the height w^2 / (2 g'') of a rebound is of the size of rounding, or of the residuals of the located zeros of

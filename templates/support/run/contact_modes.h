@@ -344,7 +344,6 @@ static int choose_modes(const event_step *step, const contact_terms *of, const c
     put_mode(CONTACTS + k, best[k], w, speed, step->watch->mode);
     if (is_slow)
       step->watch->fastest[k] = fmax(step->watch->fastest[k], speed);
-    step->watch->keeps[k] = 0;
     step->watch->part[k] = (is_slow ? CONTACT_BEGIN : 1.0) * fabs(step->whole);
   }
   put_modes(step->watch->mode, step->own);

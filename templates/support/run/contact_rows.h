@@ -14,7 +14,6 @@ enum {
   CONTACT_PENETRATES = 1,
   CONTACT_WITHOUT_MODE, /* and without impact: redundant contacts */
   CONTACT_WITHOUT_IMPULSE,
-  CONTACT_IN_CORNER,
   CONTACT_IMPOSSIBLE, /* friction, or a coefficient that is undefined */
   CONTACT_LEAVES_CONE,
   CONTACT_WEAKENS, /* static friction at rest, below that of sliding */

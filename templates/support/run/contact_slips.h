@@ -8,13 +8,11 @@ enum {
 #define CONTACT_BRAKES 0.25 /* longest parts relative to the time to its stop .. */
 #define CONTACT_GROWS 0.2 /* .. to that from its beginning .. */
 #define CONTACT_RELAXES 2.0 /* .. and to the relaxation of its direction, for which iterations on stages converge */
-#define CONTACT_SLOWER 16.0 /* times CONTACT_SLOW, of slips that turn before parts of a step that are not solved */
 #define CONTACT_STIFF 0.25 /* relaxation relative to a part and those times, below which it is not followed */
 #define CONTACT_BRAKED 0.03 /* braking relative to friction, above which slow slips keep their direction to the stop */
 #define CONTACT_TURNED 1e-7 /* change of a direction at which iterations end */
 #define CONTACT_GAMMA 0.2928932188134524 /* 1 - 1/sqrt(2), of the rule for directions of slips */
 #define CONTACT_ACCURACY 4e-10 /* error of slips that turn in a part, relative to the fastest one .. */
-#define CONTACT_DAMPED 25.0 /* .. as many times larger where several turn with each other .. */
 #define CONTACT_PATH 2e-3 /* .. and the weight of that of paths, relative to that of a step */
 /* Least size of an adaptive step for this, relative to the largest so far: the energy of a stool that falls on its feet
  * grows without bound for 0, and by 1e-8, 7e-11, 3e-12, 8e-13, 8e-13 for 2^-12, 2^-9, 2^-6, 2^-3, 1. */
@@ -166,17 +164,6 @@ static int solve_stage(const event_step *step, const event_sample *at, int *turn
   return NOT_CONVERGED;
 }
 
-/* How many times larger errors of a slip may be, as others that turn with it damp them. */
-static real damping_of(const contact_terms *of, int k, const int *turns)
-{
-  const int slip = CONTACTS[k].tangential;
-  real coupling = 0.0;
-  for (int j = 0; j < EVENT_CONTACTS; j++)
-    for (int i = 0; turns[j] && j != k && i < 4; i++)
-      coupling += fabs(of->W[(slip + i / 2) * CONTACT_ROWS + CONTACTS[j].tangential + i % 2]);
-  return coupling > 0.0 ? CONTACT_DAMPED : 1.0;
-}
-
 /* Error of a slip by a part: along it of second order in its turn, or less where it is slow; that of its path; what
  * friction gains; and the slip from its stop on, until which *stops of the part lasts. */
 static real error_of_turn(const event_step *step, const contact_terms *of, int k, slip_stage *last, real *stops)
@@ -226,8 +213,7 @@ static int turn_slips(const event_step *step, const event_sample *at, const cont
     worst = status == OK ? 0.0 : INFINITY;
     for (int k = 0; k < EVENT_CONTACTS && status == OK; k++)
       if (turns[k])
-        worst = fmax(worst,
-            error_of_turn(step, of, k, &last, &stops) / (step->watch->fastest[k] * damping_of(of, k, turns)));
+        worst = fmax(worst, error_of_turn(step, of, k, &last, &stops) / step->watch->fastest[k]);
     if (worst <= CONTACT_ACCURACY || fabs(*part) <= least) { /* what is shorter is rounding */
       TRY(status);
       break;
@@ -270,33 +256,9 @@ static slip_pace pace_of(const event_step *step, const contact_terms *of, int k,
   pace.relaxes = CONTACT_RELAXES * size / by_friction;
   pace.is_stiff = CONTACT_RELAXES * rate <= CONTACT_STIFF * CONTACT_GROWS * by_friction;
   pace.may_keep = rate < -CONTACT_BRAKED * by_friction || !pace.is_stiff;
-  real slow = CONTACT_SLOW * *fastest;
-  if (step->watch->keeps[k])
-    slow = pace.is_stiff ? INFINITY : CONTACT_SLOWER * slow;
-  pace.keeps = pace.may_keep && size <= slow;
+  pace.keeps = pace.may_keep && size <= CONTACT_SLOW * *fastest;
   pace.renews = pace.keeps != kept || (!kept && start[2] * w[0] + start[3] * w[1] < CONTACT_TURN * size);
   return pace;
-}
-
-/* Keeps the directions of slips that brake to their stops from a state on, or of slow ones that forces turn, where
- * parts of a step are too short for gaps that are rounded; whether there are any, in *any. */
-static int keep_directions(const event_step *step, const event_sample *at, int *any)
-{
-  contact_terms of;
-  contact_mode mode[EVENT_CONTACTS];
-  real force[CONTACT_ROWS], second[CONTACT_ROWS];
-  int slips;
-  *any = 0;
-  TRY(slips_at(step, at, &of, mode, force, second, &slips));
-  for (int k = 0; k < EVENT_CONTACTS && slips; k++) {
-    const slip_pace pace = pace_of(step, &of, k, mode + k, force, second);
-    if (!pace.moves || pace.keeps)
-      continue;
-    step->watch->keeps[k] = 1;
-    step->watch->keeps[k] = pace_of(step, &of, k, mode + k, force, second).keeps;
-    *any |= step->watch->keeps[k];
-  }
-  return OK;
 }
 
 /* Slips in space at the beginning of a part of a step, of at most *longest. Where they stop and where they begin

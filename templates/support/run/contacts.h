@@ -186,22 +186,6 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
   return OK;
 }
 
-/* Time in which accelerations displace gaps by as much as rounding does, sqrt(2 u r / |r''|), by the terms of both and
- * with the roundings of CONTACT_LOWEST: those of shorter parts of a step change momenta by more than forces. At least
- * the rounding of a step. */
-static int least_part(const event_step *step, const event_sample *at, real *least)
-{
-  contact_terms of;
-  *least = DBL_EPSILON * fabs(step->whole);
-  TRY(terms_at(step, at, &of));
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const int row = CONTACTS[k].normal;
-    if (row >= 0 && of.second_terms[row] > 0.0)
-      *least = fmax(*least, sqrt(2.0 * CONTACT_LOWEST * of.rounding[row] / of.second_terms[row]));
-  }
-  return OK;
-}
-
 /* Whether others nearly hold the gap of a closed contact, as where legs pass through straight, so that rounding
  * determines its force: without that it accelerates little, and they push, with `strongest` at most. */
 static int is_nearly_held(const event_step *step, const contact_terms *of, int k, real *strongest)
@@ -275,19 +259,6 @@ static int renew_slips(const event_step *step, event_sample *at, real *longest)
 }
 #endif
 
-/* Whether a condition of a contact has failed now: its gap may vanish again where that is 0 within rounding. */
-static int has_just_left(const event_step *step, int k)
-{
-  const event_watch *watch = step->watch;
-  int left = 0;
-  for (int i = 0; i < TRANSITIONS; i++) {
-    const NAME(event_history) *const history = watch->history + EVENT_FIRST[FIRST_TRANSITION + i];
-    left |= TRANSITION[i][0] == k && TRANSITION[i][1] == CONTACT_LEAVES && history->hits > 0 &&
-        fabs(watch->time - history->last) <= EVENT_TIE * fabs(step->whole);
-  }
-  return left;
-}
-
 /* Modes after the transitions among the crossings from `first` on, which have one state. */
 static int change_contacts(const event_step *step, long long first, event_sample *at)
 {
@@ -307,7 +278,7 @@ static int change_contacts(const event_step *step, long long first, event_sample
         TRY(terms_at(step, at, &of));
         now.leaves[k] = is_nearly_held(step, &of, k, &strongest);
       }
-      now.leaves[k] |= transition[1] == CONTACT_LEAVES || (transition[1] == CONTACT_CLOSES && has_just_left(step, k));
+      now.leaves[k] |= transition[1] == CONTACT_LEAVES;
       now.stops[k] |= transition[1] == CONTACT_STOPS;
       now.begins[k] += (transition[1] == CONTACT_FORWARD || transition[1] == CONTACT_BEGINS) -
           (transition[1] == CONTACT_BACKWARD);

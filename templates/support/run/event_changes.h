@@ -523,16 +523,10 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     longest = INFINITY;
     if (!adaptive && may_be_halved(step, status, part, 0.0)) {
       int opens = 0;
-      real least;
       *step->filled = first;
       longest = 0.5 * fabs(part);
-      TRY(least_part(step, &left, &least));
-      if (longest <= least) {
-#ifdef CONTACTS_IN_SPACE
-        TRY(keep_directions(step, &left, &opens));
-#endif
-        if (!opens)
-          TRY(open_nearly_held(step, &left, &opens));
+      if (longest <= CONTACT_UNSOLVED * fabs(step->whole)) {
+        TRY(open_nearly_held(step, &left, &opens));
         longest = INFINITY;
       }
       if (opens || longest < INFINITY)
@@ -941,7 +935,6 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
 #if EVENTS_CONTROLLED
     if (status == OK && control && run->t != t_end)
       status = is_rounded(&step, &before, size, shorter.tolerance, &rounded);
-    rounded |= watch->creeps > 8 * CHANGE_CREEPS;
     if (status == STATUS(STEP_SIZE_UNDERFLOW) || rounded)
       status = take_rounded_step(run, &before, t_end, &shorter, &step, &size, &count);
 #endif
