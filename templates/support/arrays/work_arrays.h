@@ -18,6 +18,7 @@ typedef struct work_arrays {
 #endif
   double *inverse_size, *dq, *dp; /* sizes of coordinates; increments, low words behind those of q */
   double *own_q, *own_p, *nothing, *q, *p, *moved, *changes; /* comparison with parts of a step */
+  double *last, *last_two; /* parts before its end */
 } work_arrays;
 
 static void *next_array(double **rest, long long count)
@@ -32,7 +33,7 @@ static work_arrays bind_work_arrays(const run_memory *run, long long n)
   work_arrays of = {.n = n};
   double *rest = run->work;
   double **const vectors[] = {&of.inverse_size, &of.own_p, &of.nothing, &of.q, &of.p, &of.moved,
-      &of.changes, &of.dp};
+      &of.changes, &of.last, &of.last_two, &of.dp};
   of.X = next_array(&rest, X_VECTORS * POINTS * n);
   for (int k = 0; k < 3; k++)
     of.F[k] = next_array(&rest, F_VECTORS * POINTS * n);

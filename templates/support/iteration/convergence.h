@@ -19,6 +19,7 @@
                                  * decreasing */
 #define SUDDEN_CONVERGENCE 1e-3 /* an iteration reduces the change at most 30 times more than the previous one; more is
                                  * accidental */
+#define STATE 1.0 /* largest change that shows a rate */
 #define DIVERGED 1e6 /* changes above a thousand times the state: iterations are abandoned among the first, too */
 #define LARGEST_CHANGE 1e75 /* the fourth power of a larger change may overflow */
 #define ROUNDING_LEVEL LEVEL(1e-25) /* changes below 3e-13 of the state may be rounding errors */
@@ -51,15 +52,18 @@ static inline double scale_of(double size)
  * change is change r / (1 - r), with r the convergence rate estimated from the previous change `last`, which is
  * infinite at first. Squared, 1 / (1 - r) is at most 2 / (1 - r^2); the 4 is part of MARGIN. The inequality is
  * multiplied out because a division costs as much as an iteration. If the eigenvalues of the iteration are complex, its
- * rate varies, so r is at least 1/30 of the rate that follows from the change `before` the last one. */
+ * rate varies, so r is at least 1/30 of the rate that follows from the change `before` the last one. A change of the
+ * size of the state shows the rate up to a factor of order 1, a larger one no more than it: where forces are bounded,
+ * the first change may be of any size, and the next one is not. */
 static inline int is_small_remainder(double change, double last, double before, const solver_options *options,
     double margin)
 {
   const double tolerance = options->tolerance * options->tolerance, rest = margin * change;
-  const double seen = smaller(larger(change, FASTEST_CONVERGENCE * last), SLOWEST_CONVERGENCE * last);
-  const double gap = last - seen, expected = SUDDEN_CONVERGENCE * last;
-  const int rests = rest * seen * (FINAL_ITERATIONS ? seen : last) <= tolerance * (gap * gap);
-  const int sure = rest * expected * (FINAL_ITERATIONS ? expected : before) <= tolerance * (before * before);
+  const double former = smaller(last, STATE), earlier = smaller(before, STATE);
+  const double seen = smaller(larger(change, FASTEST_CONVERGENCE * former), SLOWEST_CONVERGENCE * former);
+  const double gap = former - seen, expected = SUDDEN_CONVERGENCE * former;
+  const int rests = rest * seen * (FINAL_ITERATIONS ? seen : former) <= tolerance * (gap * gap);
+  const int sure = rest * expected * (FINAL_ITERATIONS ? expected : earlier) <= tolerance * (earlier * earlier);
   if (options->absolute)
     return change <= tolerance;
   return last < LARGEST_CHANGE ? rests & sure : rest <= tolerance;

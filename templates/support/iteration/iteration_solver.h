@@ -13,7 +13,8 @@
 #else
 #include "../newton/newton_from_line.h"
 
-/* Fallback to Newton's method when the fixed-point iteration fails. */
+/* Fallback to Newton's method when the fixed-point iteration fails. A trial follows no branch of solutions (hundreds of
+ * updates): what is not near the line at its size is at a smaller one. */
 
 static int fall_back(int status, const step_data *step, double *dq, double *dp, const solver_options *options,
     solver_report *report, double *workspace, const error_measure *measure)
@@ -25,7 +26,7 @@ static int fall_back(int status, const step_data *step, double *dq, double *dp, 
   if (step->points)
     ((solved_step *)step->points)->by_iteration = 0;
 #endif
-  status = newton_from_line(step, newtons, dp, &keep, options, report);
+  status = (measure->share == EACH ? newton_on_line : newton_from_line)(step, newtons, dp, &keep, options, report);
   gather(END_POSITION, 1, step->h, newtons->z, M, dq, 0, 1);
   memset(dq + M, 0, sizeof(double) * M);
   memset(dp + M, 0, sizeof(double) * M);

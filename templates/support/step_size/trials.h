@@ -31,6 +31,7 @@
 #define PARTS_OF_LEAP 16
 #define BEYOND_END REAL(0.125) /* of the step: part behind its end whose force is examined */
 #define OTHER_FORCE REAL(0.5) /* relative difference beyond which another force sets in */
+#define GROWTH_OF_TREND 2 /* of that of a force which goes on, from part to part: 1 of a straight one */
 #define NO_FORCE REAL(1e-12) /* impulse relative to the largest momentum: coordinates that motion has not reached yet */
 #define PARTS_OF_RUN 256 /* of the time that is left: a pulse between the points of a leap is seen by parts as short */
 
@@ -682,12 +683,12 @@ static inline int needs_momenta(const run_memory *run, const trial *now)
 }
 
 /* Returns 1 if the force beyond the end of a flight is another one: a wall, or a force that sets in, may lie between
- * the last point of a step and the first of the next. A smaller impulse than NO_FORCE is what rounding
+ * the last point of a step and the first of the next. The force of a smooth motion goes on as it changed before the
+ * end: by as much from part to part, also where it passes zero. A smaller impulse than NO_FORCE is what rounding
  * leaves, and so is one that displaces by no more: at rest on constraints all are. */
 static SELDOM int force_sets_in(const trial *now, const solver_options *options)
 {
   const step_data *step = &now->step;
-  step_data part = part_of_step(step);
   real largest, least, rounded;
   sums all;
   VECTORS(nothing, 1, step);
@@ -695,21 +696,30 @@ static SELDOM int force_sets_in(const trial *now, const solver_options *options)
   VECTORS(p, 1, step);
   VECTORS(moved, 1, step);
   VECTORS(changes, 1, step);
+  VECTORS(last, 1, step);
+  VECTORS(last_two, 1, step);
   MEMORY_OF_PARTS(memory, step);
-  set_zero(step, nothing), set_zero(step, moved), set_zero(step, changes);
-  begin_part(&part, step, now->dq, now->dp, q, p, nothing);
-  part.h = BEYOND_END * step->h;
-  part.t = step->t + step->h;
-  if (add_part(&part, memory, 0, options, moved, changes) != OK)
-    return 0;
+  real *const impulses[] = {last_two, last, changes};
+  const real lengths[] = {-2 * BEYOND_END, -BEYOND_END, BEYOND_END};
+  set_zero(step, nothing);
+  for (int k = 0; k < 3; k++) {
+    step_data part = part_of_step(step);
+    set_zero(step, moved), set_zero(step, impulses[k]);
+    begin_part(&part, step, now->dq, now->dp, q, p, nothing);
+    part.h = lengths[k] * step->h;
+    part.t = step->t + step->h;
+    if (add_part(&part, memory, 0, options, moved, impulses[k]) != OK)
+      return 0;
+  }
   least = largest_change(step, p, now->dp, &largest);
   least = NO_FORCE * (least + largest);
   rounded = size_by_constraints(step);
   EACH_BLOCK (all, step) {
     int sets_in = 0;
     for (long long i = all.here.first; i < all.here.end; i++) {
-      const real change = MATH(fabs)(changes[i] / BEYOND_END - now->dp[i]);
-      sets_in |= change > OTHER_FORCE * MATH(fabs)(now->dp[i]) &&
+      const real before = -last[i] / BEYOND_END, trend = 2 * MATH(fabs)(before + last_two[i] / (2 * BEYOND_END));
+      const real change = MATH(fabs)(changes[i] / BEYOND_END - before);
+      sets_in |= change > OTHER_FORCE * MATH(fabs)(before) + GROWTH_OF_TREND * trend &&
           change > SPURIOUS * (MATH(fabs)(p[i]) + MATH(fabs)(now->dp[i])) + least &&
           MATH(fabs)(moved[i]) * BEYOND_END * change >
               2 * ROUNDING_OF_PARTS * MATH(fabs)(p[i]) * (MATH(fabs)(q[i]) + rounded);
@@ -764,17 +774,12 @@ static inline int confirm_step(run_memory *run, trial *now, const solver_options
 
 /* Largest change of level after the iterations of a step. Where they are many, as in lattices whose waves are fast, the
  * time that a unit of time takes grows with the step size (cf. Gustafsson & Soederlind, SIAM J. Sci. Comput. 18 (1997)
- * 23). If a smaller step needs as many, the step size is not their cause, and the rule is suspended. Newton's method
- * needs hundreds where it follows a branch of solutions: the next steps in its place are smaller. */
+ * 23). If a smaller step needs as many, the step size is not their cause, and the rule is suspended. */
 static inline int limit_by_iterations(run_memory *run, const trial *now)
 {
   const long long iterations = now->iterations;
   int most = MOST_UP;
-  if (by_newton(now)) {
-    most = iterations > TOO_MANY_ITERATIONS ? -1 : run->suspended > 0 ? 0
-                                                                      : most;
-    run->suspended = most < 0 ? AVOIDED : run->suspended - (most == 0);
-  } else if (run->suspended > 0) {
+  if (run->suspended > 0) {
     run->suspended--;
   } else if (run->many > 0 && iterations >= run->many) {
     run->many = 0;

@@ -97,7 +97,7 @@ FOURIER_VECTORS = 2
 """Further vectors: Fourier transforms (templates/support/arrays/preconditioner.h)."""
 PLAN_VECTORS, TRANSFORM_VECTORS, TRANSFORM_ALIGNMENT = 7, 4, 8
 """Further vectors: plan of each circulant matrix, transforms and their alignment (support/arrays/circulant.h)."""
-STEP_VECTORS = 12
+STEP_VECTORS = 14
 """Further vectors: inverse sizes, parts of a step, its increments (templates/support/arrays/work_arrays.h)."""
 
 
