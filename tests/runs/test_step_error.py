@@ -1,5 +1,7 @@
 """The error estimate of a step compared with the error, also where a coefficient of the curve passes through zero."""
 
+import math
+
 import numpy as np
 import pytest
 from notation import lagrange
@@ -82,3 +84,35 @@ def test_worst_step_starts_at_the_perihelion():
         run = stepper.integrate([1.6, 0.0], [0.0, 0.5], h=0.05, steps=120, t=start)
         assert abs(run.worst_step_time - (start + np.pi)) < 2 * 0.05
         assert np.abs(run.t - run.worst_step_time).min() < 1e-12
+
+
+def behind_wall(k: float, width: float, x: float, v: float, t: float) -> tuple[float, float]:
+    """Return position and velocity of a particle that meets the potential k min(max(x, 0), width)^2/2 at x = 0."""
+    omega, after, height = math.sqrt(k), t + x / v, k * width**2 / 2
+    if after <= 0:
+        return x + v * t, v
+    passes = v * v / 2 > height
+    inside = (math.asin(min(1.0, width * omega / v)) if passes else math.pi) / omega
+    if after < inside:
+        return v / omega * math.sin(omega * after), v * math.cos(omega * after)
+    beyond = math.sqrt(v * v - 2 * height) if passes else -v
+    return (width if passes else 0.0) + beyond * (after - inside), beyond
+
+
+@pytest.mark.second
+def test_parts_of_a_step_beside_kinks_are_judged() -> None:
+    """100 thin stiff walls, of which some reflect what should pass: the error of a step is that of all its parts."""
+    wall = lagrange("wall", "x", "x_dot**2/2 - k*max(0, min(x, width))**2/2", k=1e8, width=1e-4)
+    stepper = sc.compile_stepper(wall, "svi:2")
+    wrong = 0
+    for number in range(100):
+        random = np.random.default_rng([number])
+        values = {"k": 10 ** random.uniform(3, 9), "width": 10 ** random.uniform(-4.5, -1.5)}
+        x, v = -random.uniform(0.1, 1), random.uniform(0.2, 2)
+        exact = behind_wall(values["k"], values["width"], x, v, 2.0)
+        for h in (0.05, 0.25, 0.5):
+            run = stepper.integrate([x], velocity=[v], h=h, t_end=2.0, parameters=values)
+            error = max(abs(run.q[-1, 0] - exact[0]), abs(run.velocity[-1, 0] - exact[1]))
+            wrong += error > 1e-2
+            assert error < 1e-2 or run.step_error > 1e-3, (number, h)
+    assert wrong > 0

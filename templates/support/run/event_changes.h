@@ -447,6 +447,28 @@ static int judge_slips(const event_step *step, const event_sample *left, const e
 }
 #endif
 
+#ifdef EVENT_KINKS
+/* Lets the error of a run contain that of a part of a fixed step, which is that of all of its parts, relative to the
+ * motion of the part: a short one in a stiff wall may change the velocity of all that follows. */
+static int observe_part(event_run *run, const event_step *step, const event_sample *left, real part)
+{
+  event_run own = *run;
+  real t, *const q = step->memory, *const p = q + M;
+  int iterations;
+  solver_report report;
+  set_run(&own, left->t, left);
+  own.h = part;
+  own.t_low = own.error = own.largest_motion = 0.0;
+  const int status = NAME(advance)(&own, 1, 1, step->parameters, step->options, &t, q, p, &iterations, &report,
+      step->workspace);
+  if (status == OK && own.error > run->error) {
+    run->error = own.error;
+    run->error_t = left->t;
+  }
+  return status;
+}
+#endif
+
 /* Sets the state of a run after a change: of an adaptive step, or of the last part of a fixed one. */
 static void end_at_change(event_run *run, const event_run *before, const event_sample *at, int ends, int adaptive)
 {
@@ -561,6 +583,10 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
 #if defined(CONTACTS_VARY) && EVENTS_CONTROLLED
     if (adaptive)
       TRY(judge_slips(step, &left, acts || step->watch->ended ? &at : &right, part, control->tolerance));
+#endif
+#ifdef EVENT_KINKS
+    if (!adaptive && (changes > 0 || acts))
+      TRY(observe_part(run, step, &left, part));
 #endif
     step->watch->time += part;
     cut &= !acts && !step->watch->ended;
