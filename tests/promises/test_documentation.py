@@ -73,6 +73,10 @@ def test_no_paragraph_of_the_guide_exceeds_80_words_and_no_page_2000():
     assert {name for name, page in PAGES.items() if len(page.split()) > 2000} <= set(GENERATED)
 
 
+def test_pages_of_the_gallery_have_index_words_by_which_they_are_found():
+    assert [name for name, page in PAGES.items() if name.startswith("gallery/") and "<!-- index: " not in page] == []
+
+
 def test_the_reference_contains_every_public_name_once():
     pages = "".join(page for name, page in PAGES.items() if name.startswith("reference/"))
     assert sorted(re.findall(r"^\.\. auto\w+:: (\w+)", pages, re.MULTILINE)) == sorted(scvi_codegen.__all__)
