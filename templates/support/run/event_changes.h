@@ -410,14 +410,16 @@ static int may_be_halved(const event_step *step, int status, real part, real pac
 #endif
 
 #if defined(CONTACTS_VARY) && EVENTS_CONTROLLED
-/* Compares changes of slips whose friction varies, in a part of an adaptive step up to `at`, with moments of their
- * second rates, integral of w' dt = w(T) - w(0) and of t/T w' dt = w(T) - mean of w, by a quadrature of more points than
- * those of the part, and both ends: stages do not see the friction of slow slips just before a stop. One moment may be
- * right by chance. Rounding is that of forces that cancel. */
+/* Compares changes of the speeds of slips whose friction varies, in a part of an adaptive step up to `at`, with moments
+ * of their rates, integral of s' dt = s(T) - s(0) and of t/T s' dt = s(T) - mean of s, by a quadrature of more points
+ * than those of the part, and both ends: stages do not see the friction of slow slips just before a stop. One moment
+ * may be right by chance. Errors are relative to the slip of the part, in space to the fastest so far: near a stop its
+ * direction turns like a power of the time that is left, which no part resolves. Rounding is that of forces that
+ * cancel. */
 static int judge_slips(const event_step *step, const event_sample *left, const event_sample *at, real part,
     real tolerance)
 {
-  real missed[2][CONTACT_ROWS] = {{0.0}}, size[CONTACT_ROWS] = {0.0}, rounding[CONTACT_ROWS] = {0.0};
+  real missed[EVENT_CONTACTS][2] = {{0.0}}, fastest[EVENT_CONTACTS] = {0.0}, rounding[EVENT_CONTACTS] = {0.0};
   real force[CONTACT_ROWS], second[CONTACT_ROWS];
   contact_mode mode[EVENT_CONTACTS];
   contact_terms of;
@@ -429,20 +431,25 @@ static int judge_slips(const event_step *step, const event_sample *left, const e
     TRY(terms_at(step, starts ? left : ends ? at : &knot, &of));
     modes_at(&of, step->watch->mode, mode);
     solve_contacts(&of, mode, of.second, force, second, NULL);
-    for (int r = 0; r < CONTACT_ROWS; r++) {
-      missed[0][r] += CONTACT_WEIGHT[j] * part * second[r] + (starts - ends) * of.rate[r];
-      missed[1][r] += CONTACT_WEIGHT[j] * (CONTACT_KNOT[j] * part * second[r] + of.rate[r]) - ends * of.rate[r];
-      size[r] = fmax(size[r], fabs(of.rate[r]));
-      rounding[r] = fmax(rounding[r], CHANGE_SAFETY * DBL_EPSILON * of.second_terms[r] * fabs(part));
+    for (int k = 0; k < EVENT_CONTACTS; k++) {
+      const int first = CONTACTS[k].tangential, is_judged = CONTACTS[k].varies && mode[k].closed && !mode[k].sticks;
+      const real speed = is_judged ? length_of(of.rate + first, CONTACTS[k].slips) : 0.0;
+      real rate = 0.0;
+      for (int i = 0; is_judged && i < CONTACTS[k].slips; i++) {
+        rate += (speed > 0.0 ? of.rate[first + i] / speed : mode[k].direction[i]) * second[first + i];
+        rounding[k] = fmax(rounding[k], CHANGE_SAFETY * DBL_EPSILON * of.second_terms[first + i] * fabs(part));
+      }
+      missed[k][0] += CONTACT_WEIGHT[j] * part * rate + (starts - ends) * speed;
+      missed[k][1] += CONTACT_WEIGHT[j] * (CONTACT_KNOT[j] * part * rate + speed) - ends * speed;
+      fastest[k] = fmax(fastest[k], speed);
     }
   }
-  for (int k = 0; k < EVENT_CONTACTS; k++)
-    for (int i = 0; CONTACTS[k].varies && mode[k].closed && !mode[k].sticks && i < CONTACTS[k].slips; i++) {
-      const int r = CONTACTS[k].tangential + i;
-      const real allowed = fmax(tolerance, CHANGE_SAFETY * DBL_EPSILON) * size[r] + rounding[r];
-      if (fmax(fabs(missed[0][r]), fabs(missed[1][r])) > allowed)
-        return 0.5 * fabs(part) > CONTACT_UNSOLVED * step->watch->pace ? NOT_CONVERGED : OK;
-    }
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const real size = fmax(CONTACTS[k].slips > 1 ? step->watch->fastest[k] : 0.0, fastest[k]);
+    const real allowed = fmax(tolerance, CHANGE_SAFETY * DBL_EPSILON) * size + rounding[k];
+    if (fmax(fabs(missed[k][0]), fabs(missed[k][1])) > allowed)
+      return 0.5 * fabs(part) > CONTACT_UNSOLVED * step->watch->pace ? NOT_CONVERGED : OK;
+  }
   return OK;
 }
 #endif
