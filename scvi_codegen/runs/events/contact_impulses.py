@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.common.errors import EventWarning, StateError, warn
 from scvi_codegen.runs.events.contact_changes import ROUNDING, SAME_IMPULSE, SAME_MOMENTUM, Part, Rows
-from scvi_codegen.runs.results.recomputation import changes_by_events
+from scvi_codegen.runs.results.recomputation import BeforeChange, before_changes
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.projection import projected, roots_of_masses
 from scvi_codegen.systems.contacts.rows import ContactMode
@@ -92,9 +92,9 @@ def _directions(run: Any) -> Directions:
 def _impacts(run: Any) -> Impacts:
     contacts = run.stepper.interface.contacts
     at_impacts = [
-        (t, k, impulse)
-        for row, (t, before, closing) in sorted(_before_transitions(run).items())
-        for k, impulse in _impulses_at(run, row, t, before, closing)
+        (before.t, k, impulse)
+        for row, before in sorted(before_changes(run, run.energy()).items())
+        for k, impulse in _impulses_at(run, row, before)
     ]
     impulses = np.zeros((len(at_impacts), max(1 + item.slips for item in contacts)))
     for number, (_, _, impulse) in enumerate(at_impacts):
@@ -103,30 +103,14 @@ def _impacts(run: Any) -> Impacts:
     return Impacts(np.array(times, float), np.array(numbers, np.int64), impulses)
 
 
-def _before_transitions(run: Any) -> dict[int, tuple[float, Array, set[int]]]:
-    """Return by row of the saved state after transitions their time, the state before them, their contacts."""
-    energy, changes = run.energy(), dict[int, float]()
-    result: dict[int, tuple[float, Array, set[int]]] = {}
-    for crossings, rows in changes_by_events(run):
-        if not isinstance(event := crossings.event, Transition):
-            continue
-        for row, q, p, t in zip(rows.tolist(), crossings.q, crossings.p, crossings.t.tolist(), strict=True):
-            parameters = run.parameters_on_sides(float(run.t[row - 1]))
-            change = abs(float(run.stepper.energy(q, p, t, parameters)) - energy[row - 1])
-            before, numbers = np.concatenate([q, p]), {event.contact}
-            if row in result:
-                numbers |= result[row][2]
-                before = before if change < changes[row] else result[row][1]
-            changes[row] = min(change, changes.get(row, change))
-            result[row] = t, before, numbers
-    return result
-
-
-def _impulses_at(run: Any, row: int, t: float, before: Array, closing: set[int]) -> list[tuple[int, Array]]:
-    """Return the contacts with impulses at a saved state after transitions, and these impulses."""
+def _impulses_at(run: Any, row: int, before: BeforeChange) -> list[tuple[int, Array]]:
+    """Return the contacts with impulses at a saved state after changes, and these impulses."""
+    closing, t = {event.contact for event in before.events if isinstance(event, Transition)}, before.t
+    if not closing:
+        return []
     stepper, after = run.stepper, np.concatenate([run.q[row], run.p[row]])
     old, new = (run.parameters_on_sides(float(run.t[k])) for k in (row - 1, row))
-    q, p, _ = projected(stepper, before[: stepper.dimension], before[stepper.dimension :], t, old)
+    q, p, _ = projected(stepper, before.q, before.p, t, old)
     start = Rows.at(stepper, np.concatenate([q, p]), t, old)
     extent = np.abs(start.gradients) @ np.abs(np.asarray(run.q)).max(axis=0)
     parts = [
