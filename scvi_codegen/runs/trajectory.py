@@ -25,6 +25,7 @@ from scvi_codegen.runs.accuracy.run_error import RunError, WithErrors
 from scvi_codegen.runs.accuracy.size import relative
 from scvi_codegen.runs.derivatives.actions import actions_until, shadow_energy
 from scvi_codegen.runs.derivatives.trajectory_derivatives import TrajectoryDerivatives
+from scvi_codegen.runs.events.contact_impulses import ContactModes
 from scvi_codegen.runs.events.contacts import contact_forces, contact_modes
 from scvi_codegen.runs.events.refinement import crossings_of
 from scvi_codegen.runs.forwarding import OfRuns
@@ -391,10 +392,14 @@ class Trajectory(
         return tuple(of for of in self.transitions if isinstance(of.event, Kink))
 
     @property
-    def contact_modes(self) -> list[tuple[float, tuple[str, ...]]]:
-        """Times from which contacts have modes, ``"open"``, ``"stick"`` or ``"slip"`` of each, with these modes."""
+    def contact_modes(self) -> ContactModes:
+        """Times from which contacts have modes, ``"open"``, ``"stick"`` or ``"slip"`` of each, with these modes.
+
+        The list has the ``directions`` of slips, and ``impacts`` with their impulses.
+        """
         changes = [change for run in self._runs for change in contact_modes(run)]
-        return [change for k, change in enumerate(changes) if not k or change[1] != changes[k - 1][1]]
+        kept = (change for k, change in enumerate(changes) if not k or change[1] != changes[k - 1][1])
+        return ContactModes(kept, self._runs)
 
     @property
     def _by_steps(self) -> ContactsBySteps:

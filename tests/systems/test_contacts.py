@@ -536,6 +536,10 @@ RESTS = sc.LagrangianSystem.from_text("rests", ["y"], "y_dot**2/2 - y", contacts
         (lambda: of(PLANE, "x y", [sc.contact("z")], "svi:2"), "z"),
         (lambda: of(PLANE, "x y", [sc.contact("y + x_dot")], "svi:2"), "gap=.*x_dot"),
         (lambda: of(PLANE, "x y", [sc.friction("x_dot**2", limit=1)], "svi:2"), "slip=.*linear in velocities.*x_dot"),
+        (
+            lambda: of(PLANE, "x y", [sc.friction("x_dot", limit="lambda_1")], "svi:2"),
+            "lambda_1' in limit=.*contact.-g",
+        ),
         (lambda: of(PLANE, "x y", [sc.contact("y")], "gauss:4"), "contacts|constraints"),
         (lambda: of("x_dot**2/2", "x", [sc.friction("x_dot", limit=1)], "composition:4"), "curves are not polynomials"),
         (lambda: sc.compile_stepper(TURNS, contacts=[sc.contact("z + R_w")]), "R_w"),
@@ -567,6 +571,28 @@ RESTS = sc.LagrangianSystem.from_text("rests", ["y"], "y_dot**2/2 - y", contacts
 def test_what_is_refused_is_named(make: Any, message: str) -> None:
     with pytest.raises(sc.ScviCodegenError, match=message):
         make()
+
+
+@pytest.mark.second
+def test_friction_of_a_constraint_by_its_force_is_that_of_two_contacts() -> None:
+    """The remedy of the message: a bead on a ring in the plane, whose normal force changes its sign."""
+    gap, friction = "1 - sqrt(x**2 + y**2)", {"slip": "x*y_dot - y*x_dot", "friction": "mu"}
+    ring = [sc.contact(gap, **friction), sc.contact(f"-({gap})", **friction)]
+    stepper = of(f"{PLANE} - y", "x y", ring, "svi:3", mu=0.2)
+    for number in range(8):
+        mu, speed = np.random.default_rng([97, number]).uniform([0.05, 1.0], [0.3, 2.8])
+
+        def rates(t: float, u: Any, mu: float = mu) -> list[float]:
+            return [u[1], -np.sin(u[0]) - mu * abs(u[1] ** 2 + np.cos(u[0])) * np.sign(u[1])]
+
+        def rests(t: float, u: Any) -> float:
+            return float(u[1])
+
+        rests.terminal, rests.direction = True, -1  # type: ignore[attr-defined]
+        true = solve_ivp(rates, (0, 1.8), [0, speed], "DOP853", rtol=1e-12, atol=1e-13, max_step=2e-3, events=rests)
+        t_end, angle = true.t[-2], true.y[0, -2]  # before it rests
+        run = stepper.integrate([0, -1], velocity=[speed, 0], h=t_end / 60, t_end=t_end, parameters={"mu": mu})
+        assert np.abs(run.q[-1] - [np.sin(angle), -np.cos(angle)]).max() < 1e-9, number
 
 
 MODEL = """

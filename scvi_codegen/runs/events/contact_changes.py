@@ -31,8 +31,9 @@ Change = Callable[[Array, Array, float, Array], Array]
 
 
 class Rows(NamedTuple):
-    """Rates of the rows of all contacts, second rates without forces, G M^-1 G^T, G, (mu, mu_s, e) of each."""
+    """Values, rates, second rates without forces of the rows of all contacts, G M^-1 G^T, G, (mu, mu_s, e) of each."""
 
+    value: Array
     rate: Array
     second: Array
     inverse_masses: Array
@@ -52,8 +53,10 @@ class Rows(NamedTuple):
         blocks = map(binding.pointer, (state[:m], state[m:], idle, imposed, numbers))
         if status := binding.function("contact_terms")(t, *blocks, binding.workspace()):
             raise StateError(f"the contacts at t = {t:.17g}, q = {state[:m]} are undefined: {REASONS[status]}")
-        _, rate, second, _, _, inverse, gradients, others = np.split(numbers, np.cumsum([k, k, k, k, k, k * k, k * m]))
-        return cls(rate, second, inverse.reshape(k, k), gradients.reshape(k, m), others.reshape(2, -1, 3)[0])
+        value, rate, second, _, _, inverse, gradients, others = np.split(
+            numbers, np.cumsum([k, k, k, k, k, k * k, k * m])
+        )
+        return cls(value, rate, second, inverse.reshape(k, k), gradients.reshape(k, m), others.reshape(2, -1, 3)[0])
 
 
 class Part(NamedTuple):

@@ -7,7 +7,7 @@ equations; recomputed steps that do not end in the next saved state raise an err
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from scvi_codegen.runs.results.dense_output import whole_steps
 from scvi_codegen.runs.results.saved_states import ROUNDINGS, STEP_END_TOLERANCE, Array, SavedStates
 from scvi_codegen.runs.stepping.projection import linearised, multipliers
 from scvi_codegen.runs.stepping.step_plan import FixedSteps
-from scvi_codegen.systems.event import Crossings, Transition
+from scvi_codegen.systems.event import Crossings, Event, Transition
 
 REACTIONS = 4
 """Number of states of a run whose constraint forces are computed."""
@@ -172,19 +172,37 @@ def work_until(states: SavedStates) -> Array:
     return impacts + work_and_impulses_until(states)[:, 0] if interface.exchange_names else impacts
 
 
+class BeforeChange(NamedTuple):
+    """State before the changes at a time, with its energy, and the events that change it."""
+
+    t: float
+    q: Array
+    p: Array
+    energy: float
+    events: tuple[Event, ...]
+
+
+def before_changes(states: SavedStates, energy: Array) -> dict[int, BeforeChange]:
+    """Return by row of the saved state after changes that before the first one, with the energy of the row before."""
+    result: dict[int, BeforeChange] = {}
+    for crossings, rows in changes_by_events(states):
+        for row, q, p, t in zip(rows.tolist(), crossings.q, crossings.p, crossings.t.tolist(), strict=True):
+            value = states.stepper.energy(q, p, t, states.parameters_on_sides(float(states.t[row - 1])))
+            now, other = BeforeChange(t, q, p, value, (crossings.event,)), result.get(row)
+            if other is not None:
+                later = abs(value - energy[row - 1]) >= abs(other.energy - energy[row - 1])  # NaN: no
+                now = (other if later else now)._replace(events=(*other.events, crossings.event))
+            result[row] = now
+    return result
+
+
 def _exchanged_at_events(states: SavedStates, energy: Array, *, by_contacts: bool) -> Array:
     """Return (n,) energy exchanged until each state at transitions of contacts, or at other events."""
-    stepper, touching = states.stepper, np.zeros(len(energy), bool)
-    before = stepper._states.missing((len(energy),))  # before the first event at a time
-    for crossings, rows in changes_by_events(states):
-        touching[rows] |= isinstance(crossings.event, Transition)
-        states_before = zip(rows.tolist(), crossings.q, crossings.p, crossings.t.tolist(), strict=True)
-        for row, q, p, t in states_before:
-            value = stepper.energy(q, p, t, states.parameters_on_sides(float(states.t[row - 1])))
-            if not abs(value - energy[row - 1]) >= abs(before[row] - energy[row - 1]):  # NaN: none
-                before[row] = value
-    here = np.isfinite(before) & (touching == by_contacts)
-    total: Array = np.cumsum(np.where(here, energy - before, 0.0))
+    changes = np.zeros_like(energy)
+    for row, before in before_changes(states, energy).items():
+        if by_contacts == any(isinstance(event, Transition) for event in before.events) and np.isfinite(before.energy):
+            changes[row] = energy[row] - before.energy
+    total: Array = np.cumsum(changes)
     return total
 
 

@@ -7,6 +7,7 @@ the functions of transitions are 1 in modes that they do not end. Runs choose th
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from fractions import Fraction
@@ -147,6 +148,7 @@ class _Binding:
 
         if not isinstance(item, Contact | Friction):
             raise SystemDefinitionError(f"contacts are made by contact(..) and friction(..), not {item!r}")
+        mapped(item, self._check_multipliers)
         formula = item.gap if isinstance(item, Contact) else slips_of(item)[0]
         first = str(formula)
         loops, arrays, indices = "".join(LOOPS.findall(first)), self.system.arrays, self.system.indices
@@ -180,6 +182,17 @@ class _Binding:
                 element["where"] = tuple(self.sympy.Ge(part, 0, evaluate=False) for part in element["where"])
             elements.append(replace(cast("Any", item), **element))
         return elements
+
+    def _check_multipliers(self, formula: Formula, role: str) -> Formula:
+        """Raise for multipliers, which friction changes: they are unknowns of the contact problem, no numbers in it."""
+        for name in re.findall(r"\blambda_\d+\b", str(formula)):
+            if name not in self.names:
+                raise SystemDefinitionError(
+                    f"'{name}' in {role}='{formula}' of a contact of '{self.system.name}' is a multiplier, which "
+                    "contacts do not contain: in place of the constraint g give contact(g, slip=.., friction=..) and "
+                    "contact(-g, ..) with the same slip and friction: its limit is friction times the constraint force"
+                )
+        return formula
 
     def _read(self, item: ContactLike, formula: Formula, role: str) -> Expr:
         """Return a formula in the names of rotations and directions."""
