@@ -493,6 +493,58 @@ static void end_at_change(event_run *run, const event_run *before, const event_s
 #endif
 }
 
+/* Crossings of a part of a step up to a state. */
+static int search_crossings(const event_step *step, const event_sample *left, const event_sample *right)
+{
+  TRY(evaluate_functions(step, right, values_at(step, EVENT_DEGREE)));
+#ifdef EVENT_KINKS
+  if (kinks_are_far(step, left, right))
+    return OK;
+#endif
+  TRY(search_step(step, left, right));
+#ifdef EVENT_KINKS
+  note_rates(step);
+#endif
+  return OK;
+}
+
+/* Changes a state at the crossings from `first` on: by impacts, then sides of kinks and modes of contacts. */
+static int change_at(const event_step *step, long long first, event_sample *at)
+{
+  TRY(change_at_crossings(step, first, at));
+#ifdef EVENT_KINKS
+  TRY(change_sides(step, first, at));
+#endif
+#ifdef EVENT_CONTACTS
+  TRY(change_contacts(step, first, at));
+#endif
+#ifdef EVENT_KINKS
+  TRY(renew_sides(step, first, at));
+#endif
+  return OK;
+}
+
+/* Fails if a step ends behind a wall, on another side of a kink, or in a gap, without a crossing. */
+static int check_end(const event_step *step, const event_sample *left, const event_sample *right)
+{
+  TRY(check_walls(step, left, right));
+#ifdef EVENT_KINKS
+  TRY(check_sides(step, right));
+#endif
+#ifdef EVENT_CONTACTS
+  TRY(check_gaps(step, right));
+#endif
+  return OK;
+}
+
+/* First of the crossings from `first` on that have the state of the last one, at which a part of a step ends. */
+static long long last_state(const event_step *step, long long first)
+{
+  while (step->found[first].fraction != step->found[*step->filled - 1].fraction)
+    first++;
+  return first;
+}
+
 /* Searches a step of a run that was at `before`, changes the state at crossings and continues the step: one of an
  * adaptive run with `control`. */
 static int change_in_step(const event_run *before, event_run *run, event_step *step, const step_control *control,
@@ -528,7 +580,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
   for (int changes = starts;; changes++) {
     event_sample at = {.q = states + 4 * M, .p = states + 5 * M};
     real part = length;
-    int acts = 0, far = 0, ends, cut = 0, status = OK;
+    int acts = 0, ends, cut = 0, status = OK;
 #ifdef EVENT_CONTACTS
     if (!adaptive)
       status = shorten_part(step, &left, &right, run, changes, longest, &part);
@@ -542,12 +594,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     step->q = left.q;
     step->p = left.p;
     if (status == OK)
-      status = evaluate_functions(step, &right, values_at(step, EVENT_DEGREE));
-#ifdef EVENT_KINKS
-    far = status == OK && kinks_are_far(step, &left, &right);
-#endif
-    if (status == OK && !far)
-      status = search_step(step, &left, &right);
+      status = search_crossings(step, &left, &right);
 #ifdef EVENT_CONTACTS
     longest = INFINITY;
     if (!adaptive && may_be_halved(step, status, part, 0.0)) {
@@ -561,10 +608,6 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       if (opens || longest < INFINITY)
         continue;
     }
-#endif
-#ifdef EVENT_KINKS
-    if (status == OK && !far)
-      note_rates(step);
 #endif
     step->rounding_known |= !step->watch->started;
 #ifdef EVENT_CONTACTS
@@ -582,8 +625,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     for (long long i = first; i < *step->filled; i++)
       acts |= step->watch->acts[step->found[i].function];
     if (acts || step->watch->ended) {
-      while (step->found[group].fraction != step->found[*step->filled - 1].fraction)
-        group++;
+      group = last_state(step, first);
       part *= step->found[group].fraction;
       TRY(refine_crossing(step, group, &right, &at, &part));
     }
@@ -604,31 +646,15 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       step->watch->started = 1;
       if (changes > 0)
         set_run(run, run->t, &right);
-      TRY(check_walls(step, &left, &right));
-#ifdef EVENT_KINKS
-      TRY(check_sides(step, &right));
-#endif
-#ifdef EVENT_CONTACTS
-      TRY(check_gaps(step, &right));
-#endif
+      TRY(check_end(step, &left, &right));
       return store_state(to, &right, length, iterations, run->step, step->report);
     }
     if (EVENTS > EVENT_FEW && !step->rounding_known) {
       TRY(rounding_of(step, &left));
       step->rounding_known = 1;
     }
-    if (!cut) {
-      TRY(change_at_crossings(step, group, &at));
-#ifdef EVENT_KINKS
-      TRY(change_sides(step, group, &at));
-#endif
-#ifdef EVENT_CONTACTS
-      TRY(change_contacts(step, group, &at));
-#endif
-#ifdef EVENT_KINKS
-      TRY(renew_sides(step, group, &at));
-#endif
-    }
+    if (!cut)
+      TRY(change_at(step, group, &at));
     length -= part;
     ends = fabs(length) <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->whole);
     at.t = ends && !step->watch->ended ? run->t : at.t; /* which output times may equal */
@@ -865,6 +891,99 @@ static int take_rounded_step(event_run *run, event_run *before, real t_end, cons
 }
 #endif
 
+#ifdef EVENT_CONTACTS
+/* One step of a run with contacts, if its start is settled with status OK: a fixed one that is longer than slips allow,
+ * or not solved, with open contacts, since its parts follow. */
+static int take_contact_step(int status, event_run *run, event_run *before, real t_end, const step_control *control,
+    const event_step *step, real longest, real *size, int *iterations)
+{
+  if (status == OK && (control || longest >= fabs(run->h)))
+    status = take_step(run, t_end, control, step, size, iterations);
+  else if (status == OK)
+    status = NOT_CONVERGED;
+#if EVENTS_CONTROLLED
+  int rounded = 0;
+  if (status == OK && control && run->t != t_end)
+    status = is_rounded(step, before, *size, control->tolerance, &rounded);
+  if (status == STATUS(STEP_SIZE_UNDERFLOW) || rounded)
+    status = take_rounded_step(run, before, t_end, control, step, size, iterations);
+#endif
+  if (status == OK && control)
+    step->watch->pace = fmax(step->watch->pace, CONTACT_PACE * *size);
+#ifdef CONTACTS_IN_SPACE
+  step->watch->is_cut = *size * exp2(0.25) >= longest; /* by a level of sizes */
+#endif
+  if (step->watch->begun && !control && may_be_halved(step, status, run->h, 0.0)) { /* by parts: only time advances */
+    put_in_all(CONTACT_IS_OPEN, step->own);
+    copy_run(run, before);
+    status = take_step(run, t_end, control, step, size, iterations);
+  }
+  return status;
+}
+#endif
+
+#if defined(EVENT_CONTACTS) && EVENTS_CONTROLLED
+/* Opens a contact that others nearly hold, if time hardly advances by adaptive steps, or none is taken: as where no
+ * part of a fixed step is solved. Not twice at a time. */
+static int open_where_creeps(int status, event_run *run, const event_run *before, event_step *step, real *opened,
+    int *opens)
+{
+  event_watch *const watch = step->watch;
+  watch->creeps = run->t - before->t < CONTACT_UNSOLVED * watch->pace ? watch->creeps + 1 : 0;
+  if (*opened == before->t ||
+      !(status == OK ? watch->creeps > CHANGE_CREEPS : status == STATUS(STEP_SIZE_UNDERFLOW)))
+    return status;
+  if (status != OK)
+    copy_run(run, before);
+  event_sample at = {.t = *opened = before->t, .q = run->q, .p = run->p};
+  step->whole = watch->pace / CONTACT_PACE;
+  run->error_before = 0.0;
+  const int changed = open_nearly_held(step, &at, opens);
+  return changed == OK && !*opens ? status : changed;
+}
+#endif
+
+#ifdef EVENT_KINKS
+/* Sides of kinks at the start of a step, by a trial of it where they are unknown, and its length to the first of the
+ * powers that it enters. */
+static int begin_at_kinks(event_run *run, event_run *before, event_step *step, real t_end, const step_control *control,
+    real *size)
+{
+  const event_sample start = {.t = run->t, .q = before->q, .p = before->p};
+  int unknown = 0, count;
+  step->h = control ? t_end - run->t : run->h; /* whose direction counts */
+  int status = settle_sides(step, &start, &unknown), tried = unknown;
+#if defined(EVENT_POWERS) && EVENTS_CONTROLLED
+  tried |= control && enters_power(step);
+  step->watch->first = INFINITY;
+#endif
+  if (status == OK && tried && control)
+    status = take_step(run, t_end, control, step, size, &count);
+  if (status == OK && unknown)
+    status = sides_after_start(step, &start, *size);
+  if (tried)
+    copy_run(run, before);
+  if (status != OK && unknown) {
+    *size = control ? INFINITY : run->h;
+    status = sides_at_jump(step, &start, step->h);
+  }
+#ifdef EVENT_POWERS
+  step->watch->first = tried ? fabs(*size) : INFINITY;
+#endif
+  return status;
+}
+#endif
+
+/* Undoes the changes of a step that is taken again, which are the crossings from `first` on. */
+static void undo_changes(const event_step *step, const event_watch *before, long long first)
+{
+  for (long long i = *step->filled - 1; i >= first; i--)
+    if (step->found[i].acted)
+      step->watch->history[FUNCTION_OF(step->found + i)] = step->found[i].before;
+  *step->watch = *before;
+  *step->filled = first;
+}
+
 int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, const step_control *control,
     long long steps, const real *parameters, const solver_options *options, long long states, real *t, real *q, real *p,
     real *length, int *iterations, long long *number, long long room, event_crossing *found, long long *filled,
@@ -922,36 +1041,14 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
 #endif
     keep_run(&before, run, step.values + (long long)EVENT_VALUES * EVENTS);
 #ifdef EVENT_KINKS
-    event_sample start = {.t = run->t, .q = before.q, .p = before.p};
-    int unknown = 0;
-    step.h = control ? t_end - run->t : run->h; /* whose direction counts */
-    if (status == OK)
-      status = settle_sides(&step, &start, &unknown);
     size = run->h;
-    int tried = unknown;
-#if defined(EVENT_POWERS) && EVENTS_CONTROLLED
-    tried |= control && enters_power(&step);
-    watch->first = INFINITY;
-#endif
-    if (status == OK && tried && control)
-      status = take_step(run, t_end, control, &step, &size, &count);
-    if (status == OK && unknown)
-      status = sides_after_start(&step, &start, size);
-    if (tried)
-      copy_run(run, &before);
-    if (status != OK && unknown) {
-      size = control ? INFINITY : run->h;
-      status = sides_at_jump(&step, &start, control ? t_end - run->t : run->h);
-    }
-#ifdef EVENT_POWERS
-    watch->first = tried ? fabs(size) : INFINITY;
-#endif
+    if (status == OK)
+      status = begin_at_kinks(run, &before, &step, t_end, control, &size);
 #endif
     const step_control *limited = control;
 #ifdef EVENT_CONTACTS
 #if EVENTS_CONTROLLED
     step_control shorter;
-    int rounded = 0;
     if (control) {
       shorter = *control;
       shorter.max_step = fmin(shorter.max_step, fmin(longest, unsolved));
@@ -961,26 +1058,7 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
       limited = &shorter;
     }
 #endif
-    if (status == OK && (control || longest >= fabs(run->h)))
-      status = take_step(run, t_end, limited, &step, &size, &count);
-    else if (status == OK)
-      status = NOT_CONVERGED;
-#if EVENTS_CONTROLLED
-    if (status == OK && control && run->t != t_end)
-      status = is_rounded(&step, &before, size, shorter.tolerance, &rounded);
-    if (status == STATUS(STEP_SIZE_UNDERFLOW) || rounded)
-      status = take_rounded_step(run, &before, t_end, &shorter, &step, &size, &count);
-#endif
-    if (status == OK && control)
-      watch->pace = fmax(watch->pace, CONTACT_PACE * size);
-#ifdef CONTACTS_IN_SPACE
-    watch->is_cut = size * exp2(0.25) >= longest; /* by a level of sizes */
-#endif
-    if (watch->begun && !control && may_be_halved(&step, status, run->h, 0.0)) { /* by parts: only time advances */
-      put_in_all(CONTACT_IS_OPEN, own);
-      copy_run(run, &before);
-      status = take_step(run, t_end, limited, &step, &size, &count);
-    }
+    status = take_contact_step(status, run, &before, t_end, limited, &step, longest, &size, &count);
 #else
     if (status == OK)
       status = take_step(run, t_end, control, &step, &size, &count);
@@ -991,20 +1069,11 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
     if (ENERGY_DECREASES && status == OK && control)
       status = check_energy(&step, &before, run, watched.begun ? watched.mode : watch->mode,
           fmax(control->tolerance, CHANGE_FAIR));
-    watch->creeps = control && run->t - before.t < CONTACT_UNSOLVED * watch->pace ? watch->creeps + 1 : 0;
-    if (control && opened != before.t &&
-        (status == OK ? watch->creeps > CHANGE_CREEPS : status == STATUS(STEP_SIZE_UNDERFLOW))) {
-      int opens; /* as where no part of a fixed step is solved */
-      if (status != OK)
-        copy_run(run, &before);
-      event_sample at = {.t = opened = before.t, .q = run->q, .p = run->p};
-      step.whole = watch->pace / CONTACT_PACE;
-      run->error_before = 0.0;
-      const int changed = open_nearly_held(&step, &at, &opens);
-      status = changed == OK && !opens ? status : changed;
-      if (status == OK && opens)
-        continue;
-    }
+    int opens = 0;
+    if (control)
+      status = open_where_creeps(status, run, &before, &step, &opened, &opens);
+    if (status == OK && opens)
+      continue;
 #endif
     if (status != OK) {
       int again = 0;
@@ -1019,11 +1088,7 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
       copy_run(run, &before);
       report->stored = kept;
       if (status == EVENT_NO_ROOM || again) {
-        for (long long i = *filled - 1; i >= crossed; i--)
-          if (found[i].acted)
-            watch->history[FUNCTION_OF(found + i)] = found[i].before;
-        *watch = watched;
-        *filled = crossed;
+        undo_changes(&step, &watched, crossed);
         status = OK;
         if (again)
           continue;
