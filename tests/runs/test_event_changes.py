@@ -717,3 +717,14 @@ def test_backward_runs_invert_impacts_and_apply_changes_as_written():
         returned.append(float(back.q[-1, 0]))
     assert returned[0] == pytest.approx(1.0, abs=1e-12)
     assert abs(returned[1] - 1.0) > 0.1
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("steps", [{"h": 0.1}, {"tolerance": 1e-8}], ids=["fixed", "adaptive"])
+def test_walls_that_a_start_touches_have_derivatives(steps: dict[str, float]) -> None:
+    """A free body from a wall that it approaches: x = e (x0 + v t) behind it, as from beside it."""
+    body = sc.LagrangianSystem.from_text("body", ["x"], "x_dot**2/2")
+    stepper = sc.compile_stepper(body, "svi:2", events=[sc.Event("x", direction=-1, restitution=0.5)])
+    run = stepper.integrate([0.0], velocity=[-1.0], t_end=1.0, **steps)
+    assert run.q[-1, 0] == pytest.approx(0.5, rel=1e-14)
+    assert run.tangent(np.eye(2))[-1] == pytest.approx(np.array([[-0.5, -0.5], [0.0, -0.5]]), abs=1e-9)

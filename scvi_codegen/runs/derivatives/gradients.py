@@ -205,6 +205,7 @@ def starts_of(states: SavedStates, first: int, last: int) -> tuple[Starts, NDArr
     count = 1 if taken else steps_between(length, span)
     if count == 1:
         h = steps_after(states, first, last)
+        h[h == 0.0] = np.finfo(float).eps * (states.t[-1] - states.t[0])  # to a wall that a start touches: its rates
         piece = slice(first, last + 1)
         starts = Starts(states.t[first:last].copy(), h, states.q[piece].copy(), states.p[piece].copy())
         return starts, np.arange(first, last + 1)

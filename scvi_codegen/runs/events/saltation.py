@@ -181,7 +181,8 @@ def _check_grazes(states: SavedStates, numbers: NDArray[np.intp], changed: Array
     for row, k in np.argwhere(least).tolist():
         event, ends, scale = events[k], t[row : row + 3 : 2], size[row : row + 3, k].max()
         closes = not isinstance(event, Transition) or event.kind == "closes"
-        if np.isin(t[row : row + 3], changed).any() or event.where or not (event.changes_state and closes):
+        near_change = np.isin(t[row : row + 3], changed).any() or not np.diff(t[row : row + 3]).all()
+        if near_change or event.where or not (event.changes_state and closes):
             continue
         near = np.array([math.inf, scale])
         while near.min() > TOUCH * scale and near[[0, -1]].min() >= RISES * near.min() * (len(near) > 2):
