@@ -642,8 +642,8 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
 }
 
 /* Returns 1 for a free flight in doubt, as the error of its curve is rounding: one that is much larger than the step
- * before, or smaller, or after a step that was wrong. Estimates see forces only at the points of a step, and a wall or a
- * pulse may lie between them. */
+ * before, or smaller, or after a step that was wrong. Estimates see forces only at the points of a step, and a wall or
+ * a pulse may lie between them. */
 static inline int is_leap(const run_memory *run, const trial *now)
 {
   const int changes = run->step == 0 || now->change >= LEAP || now->change < 0;
