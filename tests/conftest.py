@@ -105,10 +105,10 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Distribute the quick and the second tier by file, so that shared fixtures are made once."""
     if config.option.markexpr not in UNOPTIMISED_TIERS or config.args_source is not config.ArgsSource.TESTPATHS:
         return None
-    from xdist.scheduler import LoadFileScheduling
+    from distribution import FilesOnce
 
     config.option.loadscopereorder = False  # the order of `long_ones_first`
-    return LoadFileScheduling(config, log)
+    return FilesOnce(config, log)
 
 
 @pytest.fixture(scope="module")
