@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from scvi_codegen.codegen.ir.variants import BY_STEPS
 from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.codegen.native.binding import ON_CONSTRAINTS
 from scvi_codegen.codegen.native.option_table import LOCATED, OPTION
@@ -115,7 +116,7 @@ class Stepper(OfSteppers, Integrator):
             reason=self._reason,
             looser=self._looser,
         )
-        further: dict[str, Any] = {"by_steps": True} if self.by_steps else {}
+        further: dict[str, Any] = {"by_steps": self.by_steps}
         if self._finer is not None:
             further["_finer"] = self._finer
         if self._doubles is not None and self.events:
@@ -152,7 +153,7 @@ class Stepper(OfSteppers, Integrator):
         action: bool = False,
         seed: int = 0,
         metropolis: bool = False,
-        transitions: str = LOCATED,
+        transitions: str | None = None,
     ) -> Trajectory:
         """Integrate ``steps`` steps of h, or to t_end, and save every ``save_every``-th state and the initial one.
 
@@ -213,7 +214,7 @@ class Stepper(OfSteppers, Integrator):
                 of the seed, the trajectory, the number of the step and the coordinate.
             metropolis: accept or reject each step, so that averages have no error of the step size.
             transitions: of contacts, ``"located"`` or ``"by steps"`` of a fixed size h without transitions, by svi:1,
-                for feet and piles (docs/contacts.md).
+                for feet and piles (docs/contacts.md); by default those that the stepper was compiled for.
 
         Returns:
             A :class:`Trajectory` of steps // save_every + 1 states, fewer if an event ended it; with inputs states
@@ -227,7 +228,7 @@ class Stepper(OfSteppers, Integrator):
         """
         if type(save_every) is not int or save_every != 1:
             save_every = checked_count(save_every, "save_every", least=1)
-        is_plain = events is None and not action and transitions == LOCATED
+        is_plain = events is None and not action and transitions is None
         stepper: Stepper = self if is_plain else self._for_run(events, action=action, transitions=transitions)
         interface, inputs = self.interface, inputs or None
         noise = stepper._noise(seed, metropolis, inputs) if seed != 0 or metropolis else None
@@ -291,7 +292,7 @@ class Stepper(OfSteppers, Integrator):
         return partial(integrated, self)
 
     def _for_run(
-        self, events: EventLike | Sequence[EventLike] | None, *, action: bool, transitions: str = LOCATED
+        self, events: EventLike | Sequence[EventLike] | None, *, action: bool, transitions: str | None = None
     ) -> Self:
         """Return the stepper of runs with these events, ``None`` for its own, that sum the action if requested."""
         stepper = self.with_events(events).by_transitions(transitions)
@@ -300,14 +301,18 @@ class Stepper(OfSteppers, Integrator):
         require(stepper, "action")
         return stepper.acting
 
-    def by_transitions(self, transitions: str) -> Self:
+    def by_transitions(self, transitions: str | None) -> Self:
         """Return the stepper whose runs locate transitions of contacts, ``"located"``, or take steps, ``"by steps"``.
 
         Raises:
-            MethodError: if the stepper has no steps of contacts, as those of other methods than svi:1.
+            MethodError: if the stepper has no steps of contacts, as those of other methods than svi:1, or these alone.
         """
-        OPTION["transitions"].checked(transitions)
-        return self if transitions == LOCATED else self.with_steps_of_contacts
+        if transitions is None:
+            return self
+        steps = OPTION["transitions"].checked(transitions) == BY_STEPS
+        if self.by_steps and not steps:
+            raise MethodError(f"transitions='{LOCATED}' is not available with a stepper by steps: compile another")
+        return self.with_steps_of_contacts if steps else self
 
     def _at_tolerance(self, tolerance: float | None) -> Self:
         """Return the stepper of adaptive runs of a tolerance, whose degree follows it unless the method was named."""
@@ -521,7 +526,7 @@ class Stepper(OfSteppers, Integrator):
         seed: int = 0,
         metropolis: bool = False,
         precision: str = "double",
-        transitions: str = LOCATED,
+        transitions: str | None = None,
     ) -> EnsembleTrajectory:
         """Run k trajectories on all cores, with common fixed steps (SIMD lanes) or with adaptive steps for each.
 

@@ -238,6 +238,8 @@ def test_quantities_of_located_runs_are_refused_after_steps() -> None:
     for ask in (run.sensitivity, run.work, run.energy_error, lambda: run.error, lambda: run.crossings("a")):
         with pytest.raises((sc.MethodError, sc.StateError)):
             ask()
+    with pytest.raises(sc.MethodError, match="stepper by steps"):
+        puck().integrate([0.0, 1.0], velocity=[0, 0], h=0.01, t_end=0.1, transitions="located")
     with pytest.raises(sc.StateError, match="by steps"):
         _ = box().integrate([0.0, 1.0, 0.0], velocity=[0, 0, 0], h=0.01, t_end=0.1).compliance
 
@@ -387,6 +389,26 @@ def test_robots_of_files_rest_on_their_limits(tmp_path: Path) -> None:
         assert run.p[-1] @ run.velocity[-1] < RESTS * np.ptp(run.energy())
         assert abs(run["hip"]).max() < np.pi / 3 + PENETRATES
         assert run.contact_residual < 1e-6
+
+
+@pytest.mark.second
+def test_problems_have_the_near_contacts_alone() -> None:
+    """In a bowl of 120 planes as in its three nearest ones; 240 rows are too many for located transitions."""
+    point = sc.LagrangianSystem.from_text("point", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - 9.81*y")
+    normals = [(np.sin(a), np.cos(a)) for a in np.arange(-60, 60) * np.deg2rad(3)]
+    planes = [
+        sc.contact(f"1 + {s}*x + {c}*y", slip=f"{c}*x_dot - {s}*y_dot", friction=0.3, restitution=0.5)
+        for s, c in normals
+    ]
+    settings: dict[str, Any] = {"q": [0.01, 0.0], "velocity": [0.1, 0.0], "h": 0.01, "t_end": 3.0}
+    all_of_them, near = (
+        sc.compile_stepper(point, "svi:1", contacts=some, **BY_STEPS).integrate(**settings)
+        for some in (planes, planes[57:64])
+    )
+    assert np.allclose(all_of_them.q, near.q, rtol=0, atol=1e-12)
+    assert abs(near.velocity[-1]).max() < 1e-12
+    with pytest.raises(sc.MethodError, match="240 gaps and slips"):
+        sc.compile_stepper(point, "svi:1", contacts=planes)
 
 
 def test_a_step_that_fails_leaves_the_run_as_it_was() -> None:

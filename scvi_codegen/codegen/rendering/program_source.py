@@ -170,7 +170,7 @@ class EventSearch:
         impacts: 1 for each event that is the wall of an impact, else 0.
         conditional: 1 for each event with conditions, else 0.
         controlled: whether the integrator has adaptive steps.
-        by_steps: whether runs may have contacts by steps.
+        by_steps, steps_alone: whether runs may have contacts by steps, and no others.
         changes_states: whether crossings change the state of a run.
         kernels: the functions at u = (q, p, v); conditions; values of variables that crossings change, gradient and
             restitution of impacts.
@@ -209,6 +209,7 @@ class EventSearch:
     conditional: tuple[int, ...]
     controlled: bool
     by_steps: bool
+    steps_alone: bool
     changes_states: bool
     kernels: tuple[Kernel, ...]
     uses_velocity: bool
