@@ -62,7 +62,7 @@ def _measured(file: Path, throws: int) -> dict[str, Any]:
     """Return the times of a step, mean and worst, the largest residual, and medians of the speeds at the end."""
     robot = LagrangianSystem.from_mjcf(file, limits="contact", contacts="planes")
     stepper = compile_stepper(robot, "svi:1", transitions="by steps")
-    engine = import_module("mujoco") if find_spec("mujoco") else None
+    engine: Any = import_module("mujoco") if find_spec("mujoco") else None
     times: dict[str, list[float]] = {"ours": [], "MuJoCo": []}
     residuals, speeds, single = [], [], []
     for number in range(throws):

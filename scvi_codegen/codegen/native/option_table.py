@@ -256,6 +256,9 @@ class RunOptions:
         default=LOCATED,
         common=False,
     )
+    strict_energy: bool = option(
+        "run", SWITCH, "", "Shrink velocities where a step by steps raises energy.", default=False, common=False
+    )
     metropolis: bool = option(
         "run", SWITCH, "", "Accept or reject each step in a heat bath.", default=False, common=False
     )

@@ -129,7 +129,7 @@ class ExampleRun:
         end: of a run with inputs.
         arrays: of a system whose array sizes are known at run time; ``outputs`` is then the number of steps.
         events: of the run, also of its source.
-        by_steps: whether contacts act in steps, without transitions.
+        by_steps, strict_energy: whether contacts act in steps, without transitions, and none may raise energy.
     """
 
     q: tuple[float, ...]
@@ -152,6 +152,7 @@ class ExampleRun:
     arrays: ExampleArrays | None = None
     events: tuple[Any, ...] = ()
     by_steps: bool = False
+    strict_energy: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -128,6 +128,7 @@ class CompiledMethod:
         self._with_action: Self | None = None
         self.sums_action = False  # whether runs sum the action of their steps
         self.by_steps = interface.solver == BY_STEPS  # whether contacts of runs act in steps, without transitions
+        self.strict_energy = False  # whether none of these steps may raise energy
         self._entries: dict[Event, tuple[Event, ...]] = {}
         self._plain = cast(Source, source)
         self._states = layout_of(interface)

@@ -329,3 +329,14 @@ def refusal_of(stepper: Any, operation: str, *together: str) -> ScviCodegenError
         if applies:
             return refusal(operation, property_, stepper.title)
     return None
+
+
+def check_strict_energy(interface: Any, *, by_steps: bool) -> None:
+    """Raise :class:`MethodError` where steps that may not raise energy are not available."""
+    if not by_steps:
+        raise MethodError(in_words("{strict_energy} requires contacts by steps: give {transitions} 'by steps'"))
+    if not interface.dissipates:
+        raise MethodError(
+            in_words("{strict_energy} is not available where forces or moving surfaces may supply energy, as in ")
+            + f"'{interface.system}': omit it"
+        )

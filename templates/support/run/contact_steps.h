@@ -379,13 +379,35 @@ static real work_of_surfaces(const contact_step *in, const row_terms *rows, cons
   return work;
 }
 
+/* Kinetic energy at the end of a step with the energy before it. */
+static int energy_before(const contact_step *in, const real *v, real *room, real *workspace)
+{
+  real p[M], energy;
+  TRY(NAME(energy)(in->t, in->q, in->p, in->idle, room, workspace));
+  TRY(NAME(momentum)(in->t + in->h, in->q1, v, in->idle, p, workspace));
+  TRY(NAME(energy)(in->t + in->h, in->q1, p, in->idle, &energy, workspace));
+  *room -= energy - half_product(in, v, v);
+  return OK;
+}
+
+/* Velocities with at most the energy before the step: all of them shrink together. */
+static int limit_energy(const contact_step *in, real *v, real *workspace)
+{
+  const real kinetic = half_product(in, v, v);
+  real room;
+  TRY(energy_before(in, v, &room, workspace));
+  for (int i = 0; i < M && kinetic > room; i++)
+    v[i] *= sqrt(fmax(room, 0.0) / kinetic);
+  return OK;
+}
+
 /* Restitution of contacts that f1 closed, with rates e times those before the step: v += s (v_e - v) with the largest s
  * in [0, 1] for which the energy is that before at most, with the work of moving surfaces in f1 and here. */
 static int rebound(contact_step *in, const contact_memory *from, real by_surfaces, const real *before, real *v,
     real *workspace)
 {
   cone_problem *const of = &in->problem;
-  real f[CONTACT_ROWS], w[M], p[M], energy, room, part = 1.0;
+  real f[CONTACT_ROWS], w[M], room, part = 1.0;
   int bounces = 0;
   memcpy(f, of->f, BYTES(of->rows));
   for (int i = 0; i < of->contacts; i++) {
@@ -398,10 +420,8 @@ static int rebound(contact_step *in, const contact_memory *from, real by_surface
   }
   if (!bounces)
     return OK;
-  TRY(NAME(energy)(in->t, in->q, in->p, in->idle, &room, workspace));
-  TRY(NAME(momentum)(in->t + in->h, in->q1, v, in->idle, p, workspace));
-  TRY(NAME(energy)(in->t + in->h, in->q1, p, in->idle, &energy, workspace));
-  room -= energy - half_product(in, v, v) - by_surfaces;
+  TRY(energy_before(in, v, &room, workspace));
+  room += by_surfaces;
   if (!solve_cone_within(of, STEP_POINTS))
     return NOT_CONVERGED;
   memcpy(w, before, sizeof w);
@@ -471,6 +491,8 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   memcpy(v, before, sizeof v);
   add_responses(&in->response, 1.0, of->f, v);
   TRY(rebound(in, &from, by_surfaces, before, v, workspace));
+  if (to->is_strict)
+    TRY(limit_energy(in, v, workspace));
   to->residual = fmax(to->residual, of->residual);
   to->compliance = fmax(to->compliance, of->compliance);
   to->lost_energy -= work + half_product(in, v, v) - half_product(in, before, before);

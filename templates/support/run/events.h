@@ -91,7 +91,7 @@ typedef struct {
   real *own; /* the parameters, with the modes of kinks */
 } event_step;
 
-#if defined(EVENT_CONTACTS) && !CONTACTS_ALONE
+#ifdef CONTACTS_LOCATED
 static int rounding_of_contact(const event_step *step, int event, const event_sample *at, real *rounding);
 #endif
 
@@ -523,7 +523,7 @@ static int search_function(const event_step *step, int e, const event_sample *le
   if (IS_IMPACT[EVENT_OF(e)] && step->watch->history[e].hits > 0 && largest <= step->watch->history[e].slack)
     return OK; /* at zero since an impact without restitution */
 #endif
-#if defined(EVENT_CONTACTS) && !CONTACTS_ALONE
+#ifdef CONTACTS_LOCATED
   if (is_transition(EVENT_OF(e))) {
     real *const noise = values_at(step, EVENT_DEGREE + 2) + e, rounding;
     TRY(rounding_of_contact(step, EVENT_OF(e), left, &rounding));
