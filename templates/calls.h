@@ -364,17 +364,18 @@ int NAME(call_errors)(NAME(call) *c, long long count, const double *t, const dou
   double error[2 * M], last[2 * M];
   const NAME(options) exact = c->options ? *c->options : NAME(default_options)();
   NAME(options) options = exact;
-  c->options = &options;
+  NAME(call) at = *c; /* the caller may call again, with its own options */
+  at.options = &options;
   memcpy(error, before, sizeof error);
   NAME(start)(c->run, t[0], h[0], q, p);
   for (long long k = 0; k < count; k++, q += M, p += M) {
     memcpy(last, error, sizeof last);
-    int parts = NAME(call_parts)(c, t[k], h[k], by_newton, q, p, size, limits, error, &least, &follows);
+    int parts = NAME(call_parts)(&at, t[k], h[k], by_newton, q, p, size, limits, error, &least, &follows);
     c->steps = k;
     if (least > MOST_PARTS) {
       NAME(start)(c->run, t[k], h[k], q, p);
       least = by_newton = 1;
-      parts = NAME(call_parts)(c, t[k], h[k], by_newton, q, p, size, limits, error, &least, &follows);
+      parts = NAME(call_parts)(&at, t[k], h[k], by_newton, q, p, size, limits, error, &least, &follows);
       least = 1;
     }
     if (parts <= 0)

@@ -16,6 +16,7 @@ from notation import lagrange
 from scipy.integrate import solve_ivp
 
 import scvi_codegen as sc
+from scvi_codegen.codegen.native.binding import Binding
 from scvi_codegen.runs.accuracy.run_error import with_uncertainty
 
 PAGE = Path(__file__).parents[2] / "docs" / "theory" / "steps.md"
@@ -145,6 +146,27 @@ def test_error_of_a_slice_is_that_since_its_first_state():
     run = kepler().integrate(**start_of(0.2), t_end=12.0, tolerance=1e-6)
     assert not run[5:].error.q[0].any()
     assert np.array_equal(run[:6].error.q, run.error.q[:6])
+
+
+def test_a_call_that_is_made_again_has_the_same_options(monkeypatch):
+    """Where Newton's method is loaded, a call is made twice; the options that it refers to are those of the caller."""
+    kept, function_of = {}, Binding.call
+
+    def call(self, name, call):
+        function, before = function_of(self, name, call), call.options
+
+        def checked(*arguments):
+            status = function(*arguments)
+            kept[name] = call.options == before
+            return status
+
+        return checked
+
+    monkeypatch.setattr(Binding, "call", call)
+    run = kepler().integrate(**start_of(0.2), t_end=2.0, tolerance=1e-6)
+    assert run.error.q[-1].any()
+    assert kept["errors"]
+    assert all(kept.values())
 
 
 def test_uncertain_digits():

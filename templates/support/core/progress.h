@@ -7,7 +7,7 @@ typedef trajectory_progress progress;
 
 static inline progress before_iterations(void)
 {
-  return (progress){.last = INFINITY, .before = INFINITY, .earlier = INFINITY};
+  return (progress){.last = INFINITY, .before = INFINITY, .earlier = INFINITY, .unmeasured = FINAL_ITERATIONS};
 }
 
 #define needs_iteration(now) ((now)->status == 0)
@@ -15,7 +15,7 @@ static inline progress before_iterations(void)
 static inline void take_change(progress *now, double change, const solver_options *options, int k,
     solver_report *report)
 {
-  now->status = iteration_status(change, now->last, now->before, options, k);
+  now->status = iteration_status(change, now->last, now->before, options, k, now->unmeasured);
   now->first = k == 0 ? change : now->first;
   now->earlier = now->before;
   now->before = now->last;

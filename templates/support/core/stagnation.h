@@ -4,10 +4,10 @@
 
 /* Progress of the iteration of a step of one trajectory: the first change, the last three; the change that was
  * amplified by AMPLIFICATION, if any, and the number of iterations since; by_largest: 1 if changes are relative to the
- * largest coordinate. */
+ * largest coordinate; unmeasured: the number of iterations after the last one that is measured. */
 typedef struct {
   double first, last, before, earlier, amplified;
-  int status, since, by_largest;
+  int status, since, by_largest, unmeasured;
 } trajectory_progress;
 
 /* factor by which the last change is amplified; it has to decrease to about its former size */

@@ -1,7 +1,7 @@
 #include "../core/numbers.h"
 
 /* Convergence criterion of the fixed-point iteration. Requires: FINAL_ITERATIONS, the number of iterations after the
- * last one that is measured. Changes are squared, and so are the thresholds here. */
+ * last one that is measured, in a step with low words. Changes are squared, and so are the thresholds here. */
 
 #ifdef SINGLE_PRECISION
 #define LEVEL(squared) ((squared) * 2.9e17) /* the same number of round-off units */
@@ -54,16 +54,17 @@ static inline double scale_of(double size)
  * multiplied out because a division costs as much as an iteration. If the eigenvalues of the iteration are complex, its
  * rate varies, so r is at least 1/30 of the rate that follows from the change `before` the last one. A change of the
  * size of the state shows the rate up to a factor of order 1, a larger one no more than it: where forces are bounded,
- * the first change may be of any size, and the next one is not. */
+ * the first change may be of any size, and the next one is not. An iteration that follows `unmeasured` is expected to
+ * gain another r. */
 static inline int is_small_remainder(double change, double last, double before, const solver_options *options,
-    double margin)
+    double margin, int unmeasured)
 {
   const double tolerance = options->tolerance * options->tolerance, rest = margin * change;
   const double former = smaller(last, STATE), earlier = smaller(before, STATE);
   const double seen = smaller(larger(change, FASTEST_CONVERGENCE * former), SLOWEST_CONVERGENCE * former);
   const double gap = former - seen, expected = SUDDEN_CONVERGENCE * former;
-  const int rests = rest * seen * (FINAL_ITERATIONS ? seen : former) <= tolerance * (gap * gap);
-  const int sure = rest * expected * (FINAL_ITERATIONS ? expected : earlier) <= tolerance * (earlier * earlier);
+  const int rests = rest * seen * (unmeasured ? seen : former) <= tolerance * (gap * gap);
+  const int sure = rest * expected * (unmeasured ? expected : earlier) <= tolerance * (earlier * earlier);
   if (options->absolute)
     return change <= tolerance;
   return last < LARGEST_CHANGE ? rests & sure : rest <= tolerance;
@@ -72,9 +73,10 @@ static inline int is_small_remainder(double change, double last, double before, 
 /* Returns 1 if the iteration that changed the points by sqrt(change) relative to the state is accepted: the remaining
  * change is below a quarter of the tolerance, or rounding stops the decrease; 0: continue; -1: it converges too slowly
  * or not at all. Branch-free, so that it vectorises over trajectories. */
-static inline int iteration_status(double change, double last, double before, const solver_options *options, int k)
+static inline int iteration_status(double change, double last, double before, const solver_options *options, int k,
+    int unmeasured)
 {
-  const int small = is_small_remainder(change, last, before, options, MARGIN);
+  const int small = is_small_remainder(change, last, before, options, MARGIN, unmeasured);
   const int stagnated = (change < CERTAIN_ROUNDING) | ((change < ROUNDING_LEVEL) & (change >= STAGNATION * before));
   const int stopped = (change == 0.0) | ((k > 0) & (change >= last) & stagnated);
   const double least = k > FIRST_ITERATIONS ? PROGRESS_LEVEL : DIVERGED;

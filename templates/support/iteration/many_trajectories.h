@@ -86,7 +86,7 @@ static inline void take_change(progress *now, lanes change, const solver_options
   int pending = 0, converged = 0;
   memcpy(active.lane, report->active, sizeof active);
   for (int j = 0; j < LANES; j++) {
-    const double found = iteration_status(after.lane[j], last.lane[j], before.lane[j], &wanted, k);
+    const double found = iteration_status(after.lane[j], last.lane[j], before.lane[j], &wanted, k, FINAL_ITERATIONS);
     const double first = active.lane[j] > 0.0 ? found : -2.0;
     status.lane[j] = status.lane[j] == 0.0 ? first : status.lane[j];
     pending += status.lane[j] == 0.0;

@@ -530,9 +530,9 @@ static void refine_forces(const step_points *w)
 #endif
 
 #ifndef NEWTON_KRYLOV
-/* Computes the increments of one step and their low words. The points X are iterated until they converge, then once
- * more with double-double coefficients; the forces are stored for the predictor. implicit: 1 if equations are solved
- * for the linear part of the forces; rough: 1 without low words. On failure the increments are undefined. */
+/* Computes the increments of one step and their low words. The points X are iterated until they converge, then, unless
+ * `rough`, once more with double-double coefficients; the forces are stored for the predictor. implicit: 1 if equations
+ * are solved for the linear part of the forces; rough: 1 without low words. On failure the increments are undefined. */
 HOT int iterate(const step_data *step, const iteration_data *data, history past, long long *steps, number *dq,
     number *dp, const solver_options *options, solver_report *report, int implicit, int rough)
 {
@@ -561,6 +561,9 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
   progress now = before_iterations();
   int measures;
   w.remainder = &remainder;
+#ifdef ROUGH
+  now.unmeasured = !rough; /* a loose step may contract by rates of all kinds, so that its last change is measured, too */
+#endif
   first_points(&w, past, *steps);
   forces(&w);
   measure_points(&w, options);
@@ -596,13 +599,10 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
   measures = unmeasured && w.former;
   if (implicit)
     refine_forces(&w);
-  else {
+  else if (!rough) {
     if (measures)
       keep_iterate(&w);
-    if (rough)
-      improve(&w);
-    else
-      refine_points(&w, own);
+    refine_points(&w, own);
 #ifdef ARRAYS
     improve_velocities(&w, own);
 #endif

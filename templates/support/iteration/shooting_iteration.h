@@ -115,7 +115,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
       for (int i = 0; i < M; i++)
         curve.z[0][i] += AMPLIFICATION * corrected[i];
     if (settled && now.status == 0) {
-      now.status = is_small_remainder(total, last, before, options, ROUNDING_MARGIN);
+      now.status = is_small_remainder(total, last, before, options, ROUNDING_MARGIN, FINAL_ITERATIONS);
     } else if (now.status > 0 && !settled) { /* one more iteration: the convergence rate is known late */
       settled = 1;
       now.status = 0;
