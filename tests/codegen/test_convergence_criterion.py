@@ -90,7 +90,7 @@ static double number_of(double x) {{ return x; }}
 int verdict(double change, double last, double before, double tolerance, int absolute, int k)
 {{
   const solver_options options = {{tolerance, 40, absolute}};
-  return iteration_status(change * change, last * last, before * before, &options, k);
+  return iteration_status(change * change, last * last, before * before, &options, k, FINAL_ITERATIONS);
 }}
 int continued(long long steps, double change) {{ return (int)steps_to_continue(steps, change * change); }}
 void scales(double absolute, double *size)

@@ -562,7 +562,7 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
   int measures;
   w.remainder = &remainder;
 #ifdef ROUGH
-  now.unmeasured = !rough; /* a loose step may contract by rates of all kinds, so that its last change is measured, too */
+  now.unmeasured = !rough; /* rates of loose steps vary: their last change is measured, too */
 #endif
   first_points(&w, past, *steps);
   forces(&w);
