@@ -1,5 +1,6 @@
 """Contacts by steps: what rests does not creep, gaps stay, friction has its angle; random bodies and units."""
 
+import math
 import pickle
 from functools import cache
 from pathlib import Path
@@ -213,6 +214,16 @@ def test_runs_continue_from_checkpoints_and_end_at_events() -> None:
     turned = box().integrate(q, velocity=-v, t_end=4 * of.time, events=end, **settings, **BY_STEPS)
     assert abs(turned.q[-1, 2]) < 1e-14
     assert turned.ended_by == end
+
+
+def test_a_ball_that_no_step_may_give_energy_slides_to_rest() -> None:
+    """At rest, the energy that is left for velocities may be below 0 by rounding."""
+    ball = sc.LagrangianSystem.from_text("ball", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - 9.81*y")
+    floor = sc.contact("y", slip="x_dot", friction=0.3)
+    settings = BY_STEPS | {"h": 2e-3, "t_end": 2.0, "strict_energy": True}
+    run = sc.compile_stepper(ball, "svi:1", contacts=[floor]).integrate([0, 1], velocity=[1, 0], **settings)
+    assert run.q[-1] == pytest.approx([math.sqrt(2 / 9.81), 0], abs=2e-3)
+    assert abs(run.velocity[-1]).max() < 1e-14
 
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {

@@ -396,8 +396,9 @@ static int limit_energy(const contact_step *in, real *v, real *workspace)
   const real kinetic = half_product(in, v, v);
   real room;
   TRY(energy_before(in, v, &room, workspace));
+  room = fmax(room, 0.0);
   for (int i = 0; i < M && kinetic > room; i++)
-    v[i] *= sqrt(fmax(room, 0.0) / kinetic);
+    v[i] *= sqrt(room / kinetic);
   return OK;
 }
 
