@@ -36,6 +36,7 @@ from benchmarks.comparison import run_race
 from benchmarks.contenders.peers import PEERS
 from benchmarks.digits import run_digits
 from benchmarks.errors import run_errors
+from benchmarks.falls import run_falls
 from benchmarks.families import run_families
 from benchmarks.machine import machine
 from benchmarks.report import LEGEND, PRECISION, CaseResult, ResultTable, degree_table, header_lines
@@ -62,6 +63,7 @@ SCHEMA = 2
 
 SECTIONS: Mapping[str, Callable[[Plan, ReportActivity], CaseResult | ResultTable]] = {
     **{name: partial(run_race, build) for name, build in BUILDERS.items()},
+    "contact:falls": run_falls,
     "digits": run_digits,
     "drift": run_drift,
     "families": run_families,

@@ -48,6 +48,7 @@ def main(
       robots:chain:2, :5, :10, :30, :quadruped, :four-bar                   multibody systems; MuJoCo, Pinocchio, Exudyn
       robots:tree:18:1, :tree:18:10, :tree:35:1, .., :tree:49:10            degrees of freedom and span, on a free base
       contact:rolling, :oscillator, :block, :bounces, :ladder               contact, dry friction; MuJoCo, Siconos
+      contact:falls             a step of falling robots beside MuJoCo's
       mechanisms:2, :5, :10, :20                                            SymPy mechanisms; lambdify and PyDy
       fields:breather, :wave-2d, :schroedinger                              partial differential equations; py-pde
       lattices:ring:1000, ..    array systems; C by hand, REBOUND, OpenMM

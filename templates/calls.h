@@ -245,7 +245,7 @@ int NAME(call_abscissae)(double *abscissae, int *count)
   (void)abscissae;
   *count = 0;
 #endif
-  return OK;
+  return 0;
 }
 
 /* Copies these values, M of each point, of a step that the iteration solved; NaN: there are none. Returns the next. */

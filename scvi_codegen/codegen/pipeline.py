@@ -33,6 +33,7 @@ from scvi_codegen.codegen.ir.derivatives import PointDerivatives
 from scvi_codegen.codegen.ir.equations import Control
 from scvi_codegen.codegen.ir.program import ArrayProgram, Program
 from scvi_codegen.codegen.ir.variants import (
+    BY_STEPS,
     Acting,
     Crossings,
     Derivatives,
@@ -114,24 +115,16 @@ def program_of(
     lanes: bool = True,
     fallback: bool = True,
     without_modes: MechanicalSystem | None = None,
-    by_steps: bool = False,
 ) -> Program:
     """Return the lowered program of an integrator; other arguments as of :func:`compile_stepper`.
 
-    ``without_modes`` is the same system with kinks by its formulas, whose symmetries are sought. ``lanes``,
-    ``fallback`` and ``by_steps`` are those of :func:`~scvi_codegen.codegen.lowering.program.lower`.
+    ``without_modes`` is the same system with kinks by its formulas, whose symmetries are sought. ``lanes``
+    and ``fallback`` are those of :func:`~scvi_codegen.codegen.lowering.program.lower`.
     """
     name = c_identifier(prefix or f"{system.name}_{method.name}")
     tracked = all_symmetries(without_modes or system, symmetries)
     program_part = partial(
-        lower,
-        method=method,
-        prefix=name,
-        solver=solver,
-        symmetries=tracked,
-        lanes=lanes,
-        fallback=fallback,
-        by_steps=by_steps,
+        lower, method=method, prefix=name, solver=solver, symmetries=tracked, lanes=lanes, fallback=fallback
     )
     parts = roll_terms(system)
     rolled = with_sums(program_part(parts.rest), parts) if parts else None
@@ -261,8 +254,13 @@ def _arrays_of(system: MechanicalSystem) -> tuple[str, ...]:
 
 
 def _solver_of(program: Program) -> str:
-    kinds = {"explicit": program.splitting, "rattle": program.rattle, "fixed-point": program.fixed_point}
-    return next((name for name, part in kinds.items() if part), "newton")
+    kinds: dict[str, Any] = {
+        "explicit": program.splitting,
+        "rattle": program.rattle,
+        "fixed-point": program.fixed_point,
+    }
+    kinds["newton"] = program.equations.stage_groups
+    return next((name for name, part in kinds.items() if part), BY_STEPS)
 
 
 class Sources:
@@ -280,10 +278,8 @@ class Sources:
         precision: str = "double",
         *,
         locates: bool = False,
-        by_steps: bool = False,
     ) -> None:
         self.method, self.solver, self.g, self.precision = method, solver, g, precision
-        self.by_steps = by_steps
         self._arguments = system, method, solver, prefix, symmetries, g, controller
         self._locates = locates and g is None and system.bath is None
         self.symmetries = symmetries
@@ -311,7 +307,6 @@ class Sources:
             solver=solver,
             fallback=fallback,
             without_modes=self._without_modes,
-            by_steps=self.by_steps,
         )
         return with_bath(program, self._arguments[0], precision=self.precision, time_transformation=self.g)
 
@@ -364,7 +359,7 @@ class Sources:
             correction = self._correction(program)
             control = control_of(program, self.controller, self.system, self.g) if controlled else None
             return render_double_double(program, correction, control), self.interface
-        control = None if self.by_steps else control_of(program, self.controller, self.system, self.g)
+        control = None if self.solver == BY_STEPS else control_of(program, self.controller, self.system, self.g)
         if control and controlled and not control.density:
             control = self._with_growth(control)
         fallback: Fallback | None = "external" if self.uses_fallback_library else None
@@ -508,7 +503,7 @@ class Sources:
     @without_collection
     def variant(self, variant: Variant) -> Source | None:
         """Return the source of a variant; ``None`` if the method lacks it."""
-        if self.by_steps:
+        if self.solver == BY_STEPS:
             return None
         if self.precision == DOUBLE_DOUBLE:
             return self._variant_in_pairs(variant)

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
 
-from scvi_codegen.codegen.ir.variants import Derivatives, Sums, Variant
+from scvi_codegen.codegen.ir.variants import BY_STEPS, Derivatives, Sums, Variant
 from scvi_codegen.codegen.native.building import TUNED_FLAGS
 from scvi_codegen.codegen.native.compilers import REORDERING_FLAGS
 from scvi_codegen.codegen.native.option_table import LOCATED, OPTION
@@ -45,7 +45,7 @@ from scvi_codegen.methods import (
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.compiled_method import Variants
-from scvi_codegen.systems.contact import ContactLike
+from scvi_codegen.systems.contact import MOST_ROWS, ContactLike
 from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.event import Event, EventLike, as_events, warn_of_formulas
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
@@ -128,13 +128,13 @@ def compile_stepper(
         MethodError: if the method, the solver or another argument is not available for the system.
     """
     check_precision(precision, flags)
+    solver = _solver_of(solver, transitions)
     summed: Sums = OPTION["sums"].checked(sums, MethodError)
-    OPTION["transitions"].checked(transitions)
     of_finer = {"sizes": sizes, "tables": tables, "flags": flags, "precision": precision}
     finer = Once(partial(_finer_stepper, system, method, tuple(contacts), of_finer))
     others = {"precision": precision, "sizes": sizes, "tables": tables, "controller": controller}
     named, stated = DEFAULT_NAME if method is None else method, system
-    system, rows = _with_contacts(system, named, contacts, **others, time_transformation=time_transformation)
+    system, rows = _with_contacts(system, named, contacts, solver, **others, time_transformation=time_transformation)
     precision = "double" if rows else precision  # contacts have no second precision for "auto"
     common: dict[str, Any] = {
         "solver": solver,
@@ -165,11 +165,11 @@ def compile_stepper(
     if sizes is not None or tables is not None:
         system, time_transformation = _at_sizes(system, time_transformation, sizes or {}, tables)
         others = {"precision": precision, "controller": controller, "time_transformation": time_transformation}
-        system, rows = _with_contacts(system, named, (), **others)
+        system, rows = _with_contacts(system, named, (), solver, **others)
     settings = system, as_method(named, system), solver, prefix, symmetries, time_transformation, controller
 
     def made(precision: str, events: tuple[Event, ...] = (), *, locates: bool = False) -> Stepper:
-        sources = CachedSources(*settings, precision, locates=locates, by_steps=transitions != LOCATED)
+        sources = CachedSources(*settings, precision, locates=locates)
         source, interface = sources.integrator()
         interface = replace(interface, layout=replace(interface.layout, **shape), contacts=rows)
         stepper = Stepper(source, interface, variants=sources.variants, flags=flags, events=events, looser=looser)
@@ -217,8 +217,14 @@ def _check_symmetries(symmetries: Any) -> None:
         check_kind(SYMMETRIES, symmetries, "symmetries")
 
 
+def _solver_of(solver: str, transitions: str) -> str:
+    """Return the solver of a stepper, that of contacts by steps alone if no other is named."""
+    alone = OPTION["transitions"].checked(transitions) == BY_STEPS and solver == "auto"
+    return BY_STEPS if alone else solver
+
+
 def _with_contacts(
-    system: MechanicalSystem, method: Method | str, contacts: Sequence[ContactLike], **others: Any
+    system: MechanicalSystem, method: Method | str, contacts: Sequence[ContactLike], solver: str, **others: Any
 ) -> tuple[MechanicalSystem, tuple[ContactRows, ...]]:
     """Return the system with the modes of its contacts as parameters, and their places; ``others`` exclude contacts."""
     passed = [name for name, value in others.items() if value not in (None, "auto", "double")]
@@ -230,7 +236,15 @@ def _with_contacts(
         raise MethodError(f"{passed[0]}={others[passed[0]]!r} is not available with contacts: omit it")
     from scvi_codegen.systems.contacts.modes import bound_contacts
 
-    return bound_contacts(system, (*system.contacts, *contacts))
+    system, rows = bound_contacts(system, (*system.contacts, *contacts))
+    if solver == BY_STEPS:
+        return system, tuple(row.stepped for row in rows)
+    if (count := len(system.reactions)) > MOST_ROWS:
+        raise MethodError(
+            f"'{system.name}' has {count} gaps and slips of contacts, located transitions at most {MOST_ROWS}: compile "
+            f"it with transitions='{BY_STEPS}', of whose steps that is the number of near ones, or leave some out"
+        )
+    return system, rows
 
 
 def _compile_arrays(
@@ -325,13 +339,12 @@ class CachedSources:
         precision: str = "double",
         *,
         locates: bool = False,
-        by_steps: bool = False,
     ) -> None:
-        self.precision, self.locates, self.by_steps = precision, locates, by_steps
+        self.precision, self.locates = precision, locates
         self.system, self.method, self.solver, self.prefix = system, method, solver, prefix
         self.symmetries, self.g, self.controller = symmetries, g, controller
         choices = (solver, prefix, tuple(symmetries), g, controller, *([precision] if precision != "double" else []))
-        choices = (*choices, *(["located"] if locates else []), *(["by steps"] if by_steps else []))
+        choices = (*choices, *(["located"] if locates else []))
         self.key = (*system.key(), *method.key(), key_of(choices))
 
     @cached_property
@@ -340,7 +353,7 @@ class CachedSources:
         from scvi_codegen.codegen.pipeline import Sources
 
         choices = self.solver, self.prefix, self.symmetries, self.g, self.controller, self.precision
-        return Sources(self.system, self.method, *choices, locates=self.locates, by_steps=self.by_steps)
+        return Sources(self.system, self.method, *choices, locates=self.locates)
 
     @property
     def variants(self) -> Variants:

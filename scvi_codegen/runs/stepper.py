@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from scvi_codegen.codegen.ir.variants import BY_STEPS
 from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.codegen.native.binding import ON_CONSTRAINTS
 from scvi_codegen.codegen.native.option_table import LOCATED, OPTION
@@ -31,7 +32,7 @@ from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import Array, Parameters, States, check_step_given
 from scvi_codegen.runs.states.words import check_doubles, hashed
 from scvi_codegen.runs.stepping.compiled_method import Variants
-from scvi_codegen.runs.stepping.features import check_together, require
+from scvi_codegen.runs.stepping.features import check_strict_energy, check_together, require
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.projection import consistent, constraint_values, multipliers, projected
 from scvi_codegen.runs.stepping.step_plan import (
@@ -77,7 +78,7 @@ class Stepper(OfSteppers, Integrator):
     def _copy(self, events: tuple[Event, ...], source: Source | None = None) -> Self:
         copy = super()._copy(events, source)
         copy._precise, copy._doubles, copy._finer = self._precise, self._doubles, self._finer
-        copy.by_steps = self.by_steps
+        copy.by_steps, copy.strict_energy = self.by_steps, self.strict_energy
         return copy
 
     @property
@@ -115,7 +116,7 @@ class Stepper(OfSteppers, Integrator):
             reason=self._reason,
             looser=self._looser,
         )
-        further: dict[str, Any] = {"by_steps": True} if self.by_steps else {}
+        further: dict[str, Any] = {"by_steps": self.by_steps, "strict_energy": self.strict_energy}
         if self._finer is not None:
             further["_finer"] = self._finer
         if self._doubles is not None and self.events:
@@ -152,7 +153,8 @@ class Stepper(OfSteppers, Integrator):
         action: bool = False,
         seed: int = 0,
         metropolis: bool = False,
-        transitions: str = LOCATED,
+        transitions: str | None = None,
+        strict_energy: bool = False,
     ) -> Trajectory:
         """Integrate ``steps`` steps of h, or to t_end, and save every ``save_every``-th state and the initial one.
 
@@ -213,7 +215,9 @@ class Stepper(OfSteppers, Integrator):
                 of the seed, the trajectory, the number of the step and the coordinate.
             metropolis: accept or reject each step, so that averages have no error of the step size.
             transitions: of contacts, ``"located"`` or ``"by steps"`` of a fixed size h without transitions, by svi:1,
-                for feet and piles (docs/contacts.md).
+                for feet and piles (docs/contacts.md); by default those that the stepper was compiled for.
+            strict_energy: by steps, shrink all velocities together where a step would raise the energy, those of bodies
+                that touch nothing, too; rises of the others are of the order h^3.
 
         Returns:
             A :class:`Trajectory` of steps // save_every + 1 states, fewer if an event ended it; with inputs states
@@ -227,8 +231,9 @@ class Stepper(OfSteppers, Integrator):
         """
         if type(save_every) is not int or save_every != 1:
             save_every = checked_count(save_every, "save_every", least=1)
-        is_plain = events is None and not action and transitions == LOCATED
-        stepper: Stepper = self if is_plain else self._for_run(events, action=action, transitions=transitions)
+        is_plain = events is None and not action and transitions is None and not strict_energy
+        way = {"transitions": transitions, "strict_energy": strict_energy}
+        stepper: Stepper = self if is_plain else self._for_run(events, action=action, **way)
         interface, inputs = self.interface, inputs or None
         noise = stepper._noise(seed, metropolis, inputs) if seed != 0 or metropolis else None
         if not (inputs is None and t_eval is None and observe is None and tables is None and threads is None):
@@ -290,24 +295,37 @@ class Stepper(OfSteppers, Integrator):
 
         return partial(integrated, self)
 
-    def _for_run(
-        self, events: EventLike | Sequence[EventLike] | None, *, action: bool, transitions: str = LOCATED
-    ) -> Self:
+    def _for_run(self, events: EventLike | Sequence[EventLike] | None, *, action: bool, **way: Any) -> Self:
         """Return the stepper of runs with these events, ``None`` for its own, that sum the action if requested."""
-        stepper = self.with_events(events).by_transitions(transitions)
+        stepper = self.with_events(events).by_transitions(**way)
         if not action:
             return stepper
         require(stepper, "action")
         return stepper.acting
 
-    def by_transitions(self, transitions: str) -> Self:
+    def by_transitions(self, transitions: str | None = None, *, strict_energy: bool = False) -> Self:
         """Return the stepper whose runs locate transitions of contacts, ``"located"``, or take steps, ``"by steps"``.
 
+        The latter raise no energy if ``strict_energy``; both are those of :meth:`integrate`.
+
         Raises:
-            MethodError: if the stepper has no steps of contacts, as those of other methods than svi:1.
+            MethodError: if the stepper has no steps of contacts, as those of other methods than svi:1, or these alone.
         """
-        OPTION["transitions"].checked(transitions)
-        return self if transitions == LOCATED else self.with_steps_of_contacts
+        if strict_energy:
+            return self.by_transitions(transitions)._with_strict_energy()
+        if transitions is None:
+            return self
+        steps = OPTION["transitions"].checked(transitions) == BY_STEPS
+        if self.by_steps and not steps:
+            raise MethodError(f"transitions='{LOCATED}' is not available with a stepper by steps: compile another")
+        return self.with_steps_of_contacts if steps else self
+
+    def _with_strict_energy(self) -> Self:
+        """Return the stepper by steps none of which may raise energy."""
+        check_strict_energy(self.interface, by_steps=self.by_steps)
+        stepper = self._copy(self.events)
+        stepper.strict_energy = True
+        return stepper
 
     def _at_tolerance(self, tolerance: float | None) -> Self:
         """Return the stepper of adaptive runs of a tolerance, whose degree follows it unless the method was named."""
@@ -521,7 +539,8 @@ class Stepper(OfSteppers, Integrator):
         seed: int = 0,
         metropolis: bool = False,
         precision: str = "double",
-        transitions: str = LOCATED,
+        transitions: str | None = None,
+        strict_energy: bool = False,
     ) -> EnsembleTrajectory:
         """Run k trajectories on all cores, with common fixed steps (SIMD lanes) or with adaptive steps for each.
 
@@ -551,7 +570,7 @@ class Stepper(OfSteppers, Integrator):
                 float32 with compensated sums, so that states have some 45 bits, and are float64. The step size,
                 parameters, constants and the time in forces are rounded to 24 bits (docs/ensembles.md). A trajectory
                 whose step fails is continued in double precision.
-            transitions: of contacts, as of :meth:`integrate`.
+            transitions, strict_energy: of contacts, as of :meth:`integrate`.
 
         Returns:
             An :class:`EnsembleTrajectory`; states equal those of :meth:`integrate` to round-off. A trajectory that
@@ -564,7 +583,7 @@ class Stepper(OfSteppers, Integrator):
         from scvi_codegen.runs.ensembles.ensemble import EnsembleSettings, settings_in
 
         settings = EnsembleSettings(*settings_in(locals()))
-        stepper = self.by_transitions(transitions)
+        stepper = self.by_transitions(transitions, strict_energy=strict_energy)
         runs = stepper.products.ensemble_runs(q, p, settings, velocity=velocity, action=action)
         runs.run(progress=progress, threads=threads)
         return stepper.products.ensemble_result(runs)

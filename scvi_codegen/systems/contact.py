@@ -35,7 +35,7 @@ WORDS = ("name", "impacts")
 
 
 MOST_ROWS = 192
-"""Gaps and slips of a system: runs keep matrices of as many rows and columns, of 295 kB each, on the stack."""
+"""Gaps and slips of a contact problem, by steps of near ones: matrices of 295 kB are on the stack."""
 
 
 def _number(formula: Formula) -> float | None:
@@ -91,7 +91,6 @@ class Contact:
         SystemDefinitionError: for friction without slip or slip without friction, and invalid coefficients.
     """
 
-    MOST_ROWS = MOST_ROWS
     gap: Formula
     slip: Formula | tuple[Formula, ...] | None = None
     friction: Formula | None = None
@@ -120,7 +119,7 @@ class Contact:
 
     @property
     def rows(self) -> int:
-        """Number of gaps and slips, of which a system may have ``MOST_ROWS``."""
+        """Number of gaps and slips, of which a contact problem may have ``MOST_ROWS``."""
         return 1 + len(slips_of(self))
 
     def __post_init__(self) -> None:
@@ -176,7 +175,7 @@ class Friction:
 
     @property
     def rows(self) -> int:
-        """Number of gaps and slips, of which a system may have ``MOST_ROWS``."""
+        """Number of gaps and slips, of which a contact problem may have ``MOST_ROWS``."""
         return len(slips_of(self))
 
     def __post_init__(self) -> None:

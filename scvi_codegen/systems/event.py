@@ -262,6 +262,9 @@ class Transition(Event):
         """True: momenta change at impacts, and constraints with the mode."""
         return True
 
+    def check_function(self, moving: Sequence[str], *, constant: bool) -> None:
+        """Accept the function: it is made by contacts, and a number where they act by steps."""
+
 
 def _is_text(value: Any) -> bool:
     return all(map(_is_text, value)) if isinstance(value, tuple) else isinstance(value, str | int | float | None)

@@ -37,6 +37,7 @@ RUNS = {
     "action": True,
     "seed": 2**64 - 1,
     "metropolis": True,
+    "strict_energy": True,
     "q": [0.5],
     "p": [0.25],
     "velocity": [0.125],

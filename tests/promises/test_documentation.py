@@ -35,7 +35,7 @@ GENERATED = ("features.md",)
 """Pages of one table that a program writes."""
 MINUTES = "scvi-codegen reproduce all"
 """Command that takes minutes of processor time."""
-PICTURE = re.compile(r"!\[[^]]+\]\((\w+\.svg)\)")
+PICTURE = re.compile(r"!\[[^]]+\]\((\w+\.(?:svg|gif))\)")
 """Image that the code of a page draws."""
 PEERS = ("astropy", "casadi", "cupy", "fmpy", "heyoka", "rebound")
 """Optional libraries of pages; a page is skipped if one of them is not installed."""

@@ -252,14 +252,3 @@ def test_outcome_of_a_quaternion_of_length_0(tmp_path):
     written(file, **parts | {"compiler": "", "rest": parts.get("rest", "") + key})
     (turn,) = sc.LagrangianSystem.from_mjcf(file, limits="contact").keyframes["k"]["q"].values()
     assert turn == [1, 0, 0, 0]
-
-
-@pytest.mark.second
-def test_outcome_of_too_many_contacts(tmp_path):
-    file, feet = tmp_path / "robot.xml", "".join(f'<geom size=".1" pos="{k} 0 1"/>' for k in range(65))
-    floor, joint = '<geom type="plane" size="1 1 1"/>', '<joint type="free" limited="true"/>'
-    file.write_text(f"<mujoco><worldbody>{floor}<body>{joint}{feet}</body></worldbody></mujoco>")
-    with pytest.raises(
-        SystemDefinitionError, match="has 195 gaps and slips of contacts, 195 of them of geoms and tend"
-    ):
-        sc.LagrangianSystem.from_mjcf(file, limits="contact", contacts="planes")

@@ -19,6 +19,8 @@ STRUCTURES = f"""
 typedef struct {{ int normal, tangential, slips; }} contact_places;
 typedef struct {{ int is_closed, pushes, sticks; double direction[2]; }} cone_mode;
 typedef struct {{
+  const contact_places *places;
+  int contacts, rows;
   const double *W;
   double b[{ROWS}], terms[{ROWS}], f[{ROWS}];
   int takes_part[{CONTACTS}], rests[{CONTACTS}];

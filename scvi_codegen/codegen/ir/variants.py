@@ -10,6 +10,9 @@ Sums: TypeAlias = Literal["compensated", "plain"]
 
 SUMS: tuple[Sums, ...] = get_args(Sums)
 
+BY_STEPS = "by steps"
+"""Solver of contacts by steps alone, without stage equations, and how these treat transitions."""
+
 
 @dataclass(frozen=True, slots=True)
 class Variant:

@@ -27,7 +27,7 @@ from scvi_codegen.codegen.ir.program import (
     StageCurve,
     StageEquations,
 )
-from scvi_codegen.codegen.ir.variants import Sums
+from scvi_codegen.codegen.ir.variants import BY_STEPS, Sums
 from scvi_codegen.codegen.lowering.arrays import UNSUPPORTED, check_solver_of_arrays, one_coordinate
 from scvi_codegen.codegen.lowering.constraints import constrained_steps, lowered_constraints, rattle_of
 from scvi_codegen.codegen.lowering.loops import rolled_terms
@@ -167,7 +167,7 @@ def summing_splitting(splitting: Splitting, system: MechanicalSystem) -> Splitti
     return replace(splitting, at_rest=kernel)
 
 
-SOLVERS = ("auto", "explicit", "fixed-point", "newton")
+SOLVERS = ("auto", "explicit", "fixed-point", "newton", BY_STEPS)
 
 
 def lower(
@@ -179,7 +179,6 @@ def lower(
     symmetries: Sequence[Symmetry] = (),
     lanes: bool = True,
     fallback: bool = True,
-    by_steps: bool = False,
 ) -> Program:
     """Return the program of one step of ``method`` for ``system``; exported C names begin with ``prefix``.
 
@@ -190,7 +189,6 @@ def lower(
         symmetries: whose momentum maps are included.
         lanes: allow a solver that uses SIMD lanes.
         fallback: include Newton's iteration as a fallback. Systems with integrals along the curve always include it.
-        by_steps: without the stage equations, for contacts by steps alone.
     """
     stages, explicit = discretise(system, method), solver in ("auto", "explicit")
     splitting = splitting_of(system, method) if explicit and not system.integrands else None
@@ -198,7 +196,8 @@ def lower(
     fixed_point = iteration_of(system, stages) if iterated else None
     check_solver(solver, method, SOLVERS, iteration=splitting if solver == "explicit" else fixed_point)
     alone = fixed_point is not None and not fallback and not system.integrands
-    newton = solver in ("auto", "newton") and splitting is None and not alone
+    newton = solver in ("auto", "newton", BY_STEPS) and splitting is None and not alone
+    by_steps = solver == BY_STEPS  # without the stage equations
     in_lanes = bool(fixed_point and "MASS_TERMS" in fixed_point.facts) and not newton and not system.bath
     polynomial = method.exactness.curve != 0
     equations = _equations(

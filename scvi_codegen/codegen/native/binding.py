@@ -24,6 +24,7 @@ from scvi_codegen.codegen.native.options import (
     checked_options,
     step_failure,
 )
+from scvi_codegen.codegen.rendering.c_text import renamed
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.codegen.rendering.text import INPUT_PRECISION, ROUNDING_UNITS
 from scvi_codegen.common.cache import template_folder
@@ -56,6 +57,13 @@ OPTIONAL_FUNCTIONS = frozenset(("advance_to", "set_fallback", "project"))
 """Functions that not all integrators have, HAS_.. in ``calls.h`` like the optional fields of a run."""
 
 
+NAMES_OF_SOURCE = (
+    *("real", "M", "CONSTRAINTS", "CONSTRAINT_ENTRIES", "CONSTRAINT_ENTRY", "MASS_ENTRIES", "MASS_ENTRY"),
+    *("constraints", "legendre"),
+)
+"""Names of a source to which ``calls.h`` and ``error_vectors.h`` refer."""
+
+
 def with_calls(source: Source) -> Source:
     """Return a source of runs with the functions of calls; others unchanged."""
     if "advance" not in source.contents.functions:
@@ -70,6 +78,7 @@ def with_calls(source: Source) -> Source:
         re.sub(r"NAME\((\w+)\)", rf"{source.prefix}_\1", text)
         for text in (_text("calls_declarations") + further, errors + _text("calls"))
     )
+    functions = _in_one_file(functions, source)
     present = [name for name in source.contents.functions if name in OPTIONAL_FUNCTIONS]
     switches += "".join(f"#define HAS_{name.upper()}\n" for name in (*present, *source.contents.run_fields))
     return replace(
@@ -77,6 +86,14 @@ def with_calls(source: Source) -> Source:
         code=f"{source.code}\n{switches}{declarations}\n{functions}",
         declarations=f"{source.declarations}\n{declarations}",
     )
+
+
+def _in_one_file(functions: str, source: Source) -> str:
+    """Return functions with the names to which they refer as a source of one file has them, with its prefix."""
+    if f"{source.prefix}_real" not in source.code:
+        return functions
+    prefix, upper = source.prefix, source.prefix.upper()
+    return renamed(functions, {name: f"{upper if name.isupper() else prefix}_{name}" for name in NAMES_OF_SOURCE})
 
 
 @cache

@@ -13,7 +13,7 @@ from itertools import combinations
 from math import isfinite
 from typing import Any, NamedTuple
 
-from scvi_codegen.codegen.ir.variants import SUMS
+from scvi_codegen.codegen.ir.variants import BY_STEPS, SUMS
 from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.common.errors import FACE, ScviCodegenError, StateError
@@ -252,9 +252,12 @@ class RunOptions:
     )
     transitions: str = option(
         *("run", CHOICE, "", "Contacts [located]; by steps: of a fixed size, by svi:1, for feet and piles."),
-        choices=(LOCATED, "by steps"),
+        choices=(LOCATED, BY_STEPS),
         default=LOCATED,
         common=False,
+    )
+    strict_energy: bool = option(
+        "run", SWITCH, "", "Shrink velocities where a step by steps raises energy.", default=False, common=False
     )
     metropolis: bool = option(
         "run", SWITCH, "", "Accept or reject each step in a heat bath.", default=False, common=False

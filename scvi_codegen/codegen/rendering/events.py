@@ -35,6 +35,7 @@ from sympy.core.function import AppliedUndef
 from scvi_codegen.codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.codegen.ir.kernel import Kernel, RolledKernel, lower_matrix, lower_vector
 from scvi_codegen.codegen.ir.program import Layout
+from scvi_codegen.codegen.ir.variants import BY_STEPS
 from scvi_codegen.codegen.rendering.kernels.loop_nests import Nest, count_text, size_text
 from scvi_codegen.codegen.rendering.program_source import ArrayEventSearch, EventSearch, render_events
 from scvi_codegen.codegen.rendering.reaches import reaches
@@ -352,6 +353,7 @@ def _search(
         "conditional": tuple(int(bool(event.conditions)) for event in events),
         "controlled": controlled,
         "by_steps": by_steps and not interface.modes,
+        "steps_alone": interface.solver == BY_STEPS,
         "changes_states": any(event.changes_state for event in events),
     }
     if interface.layout.coordinates:

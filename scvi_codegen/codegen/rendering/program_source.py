@@ -129,7 +129,7 @@ class ExampleRun:
         end: of a run with inputs.
         arrays: of a system whose array sizes are known at run time; ``outputs`` is then the number of steps.
         events: of the run, also of its source.
-        by_steps: whether contacts act in steps, without transitions.
+        by_steps, strict_energy: whether contacts act in steps, without transitions, and none may raise energy.
     """
 
     q: tuple[float, ...]
@@ -152,6 +152,7 @@ class ExampleRun:
     arrays: ExampleArrays | None = None
     events: tuple[Any, ...] = ()
     by_steps: bool = False
+    strict_energy: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -170,7 +171,7 @@ class EventSearch:
         impacts: 1 for each event that is the wall of an impact, else 0.
         conditional: 1 for each event with conditions, else 0.
         controlled: whether the integrator has adaptive steps.
-        by_steps: whether runs may have contacts by steps.
+        by_steps, steps_alone: whether runs may have contacts by steps, and no others.
         changes_states: whether crossings change the state of a run.
         kernels: the functions at u = (q, p, v); conditions; values of variables that crossings change, gradient and
             restitution of impacts.
@@ -209,6 +210,7 @@ class EventSearch:
     conditional: tuple[int, ...]
     controlled: bool
     by_steps: bool
+    steps_alone: bool
     changes_states: bool
     kernels: tuple[Kernel, ...]
     uses_velocity: bool

@@ -355,7 +355,7 @@ class Model(TimeSpan):
 
             require(stepper, "action")
             stepper = stepper.acting
-        return stepper.with_events(self.events)
+        return stepper.by_transitions(None, strict_energy=self.strict_energy).with_events(self.events)
 
     def momenta(self, stepper: Stepper) -> Array:
         """Return the (m,) initial momenta: ``p``, or the Legendre transform of the velocities."""
@@ -507,6 +507,7 @@ class Model(TimeSpan):
             "controller",
             "observe",
             "transitions",
+            "strict_energy",
         )  # those of the stepper
         arguments = {
             option.field: getattr(self, option.field)

@@ -12,6 +12,7 @@ from scvi_codegen.runs.events.contact_changes import Rows
 from scvi_codegen.runs.results.saved_states import Array, SavedStates
 from scvi_codegen.runs.states.validation import Parameters, States
 from scvi_codegen.runs.stepping.integrator import Integrator
+from scvi_codegen.systems.contact import MOST_ROWS
 from scvi_codegen.systems.contacts.rows import ContactMode
 
 REFUSALS = {
@@ -31,6 +32,8 @@ REFUSALS = {
     8: "steps of all sizes create energy at t = {t:.17g}, at last {value:.3g}: the motion ends there (a collision, a "
     "singularity), or closed contacts nearly depend on each other, as of legs that pass straight. Set t_end before "
     "that time, or give another tolerance, or h (fixed step size)",
+    9: f"more than {MOST_ROWS} gaps and slips are near in a step from t = {{t:.17g}}, of contact {{k}} and others: "
+    "leave some out, or reduce h",
 }
 """Messages by the reasons of contacts.h."""
 NOISE = 1e-9

@@ -73,6 +73,8 @@ class CrossingSearch:
             self.watch.direction[number] = event.direction
             self.watch.acts[number] = terminal and event.changes_state
             self.watch.remaining[number] = terminal and int(event.terminal)
+        if stepper.strict_energy:
+            self.watch.steps.is_strict = 1
         self._bytes, self._buffers = 0, (None, [np.empty(0)])
         self._capacity = min(INITIAL_CAPACITY, max(LEAST_CAPACITY, CROSSING_NUMBERS // stepper.dimension))
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Self, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.codegen.ir.variants import Acting, Derivatives, Lanes, NewtonFallback, Variant, WithEvents
+from scvi_codegen.codegen.ir.variants import BY_STEPS, Acting, Derivatives, Lanes, NewtonFallback, Variant, WithEvents
 from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.native.binding import Binding, with_calls
 from scvi_codegen.codegen.rendering.source import Interface, Source
@@ -127,7 +127,8 @@ class CompiledMethod:
         self._known: dict[Hashable, Self] = {}
         self._with_action: Self | None = None
         self.sums_action = False  # whether runs sum the action of their steps
-        self.by_steps = False  # whether contacts of runs act in steps, without transitions
+        self.by_steps = interface.solver == BY_STEPS  # whether contacts of runs act in steps, without transitions
+        self.strict_energy = False  # whether none of these steps may raise energy
         self._entries: dict[Event, tuple[Event, ...]] = {}
         self._plain = cast(Source, source)
         self._states = layout_of(interface)
@@ -194,6 +195,8 @@ class CompiledMethod:
     def with_steps_of_contacts(self) -> Self:
         """The integrator whose runs have contacts by steps."""
         require(self, "by_steps")
+        if self.by_steps:
+            return self
         stepper = self._copy(self.events)
         stepper.by_steps = True
         return stepper

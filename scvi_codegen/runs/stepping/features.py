@@ -174,10 +174,11 @@ FEATURES = {
             "use runs and ensembles with {h}, or with {t_end} and a {tolerance}, without it",
         ),
         ("with contacts", "crossings", "pass events= to the run"),
+        ("with contacts by steps", "adaptive error recording", "give {h}, or omit {transitions=}"),
         (
             "with contacts by steps",
-            "adaptive error run_error recording tangent pullback sensitivity chaos periodic_orbit fit",
-            "give {h}, or omit {transitions=}",
+            "run_error tangent pullback sensitivity chaos periodic_orbit fit",
+            "locate the transitions: omit {transitions=}",
         ),
         ("with nonholonomic constraints", "by_steps", "locate the transitions"),
         ("with events that change the state", "by_steps", "make them terminal and restart"),
@@ -329,3 +330,14 @@ def refusal_of(stepper: Any, operation: str, *together: str) -> ScviCodegenError
         if applies:
             return refusal(operation, property_, stepper.title)
     return None
+
+
+def check_strict_energy(interface: Any, *, by_steps: bool) -> None:
+    """Raise :class:`MethodError` where steps that may not raise energy are not available."""
+    if not by_steps:
+        raise MethodError(in_words("{strict_energy} requires contacts by steps: give {transitions} 'by steps'"))
+    if not interface.dissipates:
+        raise MethodError(
+            in_words("{strict_energy} is not available where forces or moving surfaces may supply energy, as in ")
+            + f"'{interface.system}': omit it"
+        )

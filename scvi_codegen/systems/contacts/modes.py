@@ -17,7 +17,7 @@ from operator import mul, sub
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.systems.contact import MOST_ROWS, WORDS, Contact, ContactLike, Friction, Impacts, limits_of, slips_of
+from scvi_codegen.systems.contact import WORDS, Contact, ContactLike, Friction, Impacts, limits_of, slips_of
 from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.event import LOOPS, Formula
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
@@ -109,10 +109,6 @@ class _Binding:
         """Return the system with these contacts."""
         expressions, rows = [], []
         elements = [element for item in contacts for element in self._elements(item)]
-        if (count := sum(element.rows for element in elements)) > MOST_ROWS:
-            raise SystemDefinitionError(
-                f"'{self.system.name}' has {count} gaps and slips of contacts, of at most {MOST_ROWS}: leave some out"
-            )
         for number, item in enumerate(elements, 1):
             named = mapped(item, partial(self._read, item))
             if getattr(named, "of", ()):

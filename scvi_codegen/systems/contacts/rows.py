@@ -65,6 +65,12 @@ class ContactRows(NamedTuple):
         return ContactMode.SLIP if slides and Dependence.HELD not in depends else ContactMode.STICK
 
     @property
+    def stepped(self) -> ContactRows:
+        """The contact by steps alone: changes of its mode have no functions, and where it exists is the first's."""
+        kind, _, *where = min(self.transitions, key=lambda transition: transition[0] != "closes")
+        return self._replace(transitions=((kind, "1", *where),), quantities=())
+
+    @property
     def masks(self) -> tuple[str, ...]:
         """Names of the parameters of its mode."""
         return *self.imposing, *self.directions, self.held

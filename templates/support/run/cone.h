@@ -8,8 +8,8 @@
  * 2008): normal forces and rates are not negative, one of them is 0, and friction of at most mu f_n opposes the slip,
  * with mu f_n where that is not 0. Without gap the limit is a given size instead of mu f_n. Second rates b pose forces,
  * rates b impulses, and rates + h second rates those of a step of length h, for which a solution exists for every b and
- * mu if W > 0. Within fewer proximal points the last one is the solution with a compliance R: u = b + (W + R) f up to the
- * change of f by it. Requires: EVENT_CONTACTS, CONTACT_ROWS, CONTACTS. */
+ * mu if W > 0. Within fewer proximal points the last one is the solution with a compliance R: u = b + (W + R) f up to
+ * the change of f by it. Requires: EVENT_CONTACTS, CONTACT_ROWS: the largest numbers; CONTACTS. */
 enum {
   CONE_NEWTON = 12, /* steps of Newton's method */
   CONE_POINTS = 250 /* proximal points */
@@ -29,12 +29,14 @@ typedef struct {
   real direction[2];
 } cone_mode;
 
-/* A problem by the rows of CONTACTS and its solution. Contacts that take part have friction of coefficient mu, until
- * they slip mu_static if `rests`, or limits of that size without a gap. The part |given| of sliding friction is against
- * `given`: all of it of a slip that has that direction. terms: sizes of the terms of b, by whose rounding it differs
- * from 0. Newton's method starts from f. */
+/* A problem of contacts by their places in its rows, and its solution. Contacts that take part have friction of
+ * coefficient mu, until they slip mu_static if `rests`, or limits of that size without a gap. The part |given| of
+ * sliding friction is against `given`: all of it of a slip that has that direction. terms: sizes of the terms of b, by
+ * whose rounding it differs from 0. Newton's method starts from f. */
 typedef struct {
-  const real *W;
+  const contact_places *places;
+  int contacts, rows;
+  const real *W; /* CONTACT_ROWS apart */
   real b[CONTACT_ROWS], terms[CONTACT_ROWS], f[CONTACT_ROWS];
   int takes_part[EVENT_CONTACTS], rests[EVENT_CONTACTS];
   real mu[EVENT_CONTACTS], mu_static[EVENT_CONTACTS], given[EVENT_CONTACTS][2];
@@ -70,9 +72,8 @@ static real length_of(const real *x, int count)
 }
 
 /* Lists the rows of a contact and returns their number. */
-static int rows_of(int k, int *row)
+static int rows_of(const contact_places *at, int *row)
 {
-  const contact_places *const at = CONTACTS + k;
   int count = 0;
   if (at->normal >= 0)
     row[count++] = at->normal;
@@ -84,7 +85,7 @@ static int rows_of(int k, int *row)
 static real cone_rate(const cone_problem *in, int row)
 {
   real rate = in->b[row];
-  for (int j = 0; j < CONTACT_ROWS; j++)
+  for (int j = 0; j < in->rows; j++)
     rate += in->f[j] == 0.0 ? 0.0 : in->W[row * CONTACT_ROWS + j] * in->f[j]; /* rows of others may be undefined */
   return rate;
 }
@@ -219,7 +220,7 @@ static int cone_unknown(cone_block *of, int row, real scale)
 /* Unknowns of a contact. */
 static void cone_part_of(const cone_problem *in, int k, cone_block *of)
 {
-  const contact_places *const at = CONTACTS + k;
+  const contact_places *const at = in->places + k;
   cone_part *const part = of->part + of->parts++;
   real trace = 0.0;
   const real free = fmax(1.0 - length_of(in->given[k], at->slips), 0.0), limit = free * cone_limit(in, k);
@@ -239,16 +240,17 @@ static void cone_part_of(const cone_problem *in, int k, cone_block *of)
 }
 
 /* Marks the contacts that take part and whose forces W connects with those of `first`. */
-static void cone_connect(const real *W, const int *takes_part, int first, int *member)
+static void cone_connect(const contact_places *places, int contacts, const real *W, const int *takes_part, int first,
+    int *member)
 {
   int list[EVENT_CONTACTS] = {first}, count = 1;
   member[first] = 1;
   for (int i = 0; i < count; i++)
-    for (int k = 0; k < EVENT_CONTACTS; k++) {
+    for (int k = 0; k < contacts; k++) {
       int row[3], column[3], meets = 0;
       if (!takes_part[k] || member[k])
         continue;
-      const int rows = rows_of(list[i], row), columns = rows_of(k, column);
+      const int rows = rows_of(places + list[i], row), columns = rows_of(places + k, column);
       for (int r = 0; r < rows; r++)
         for (int c = 0; c < columns; c++)
           meets |= W[row[r] * CONTACT_ROWS + column[c]] != 0.0;
@@ -266,13 +268,13 @@ static void cone_gather(cone_problem *in, const int *member, cone_block *of, rea
   of->count = of->parts = 0;
   of->weight = of->size = 0.0;
   memset(of->near, 0, sizeof of->near);
-  for (int k = 0; k < EVENT_CONTACTS; k++)
+  for (int k = 0; k < in->contacts; k++)
     if (member[k])
       cone_part_of(in, k, of);
   memcpy(start, in->f, sizeof start);
   for (int k = 0; k < of->parts; k++) { /* rates without unknown forces */
     const int contact = of->part[k].contact;
-    const contact_places *const at = CONTACTS + contact;
+    const contact_places *const at = in->places + contact;
     if (at->normal >= 0)
       in->f[at->normal] = 0.0;
     for (int i = 0; i < at->slips; i++) {
@@ -295,7 +297,7 @@ static void cone_gather(cone_problem *in, const int *member, cone_block *of, rea
   }
   for (int k = 0; k < of->parts; k++) {
     const cone_part *const part = of->part + k;
-    const contact_places *const at = CONTACTS + part->contact;
+    const contact_places *const at = in->places + part->contact;
     const real limit = cone_limit(in, part->contact);
     of->part[k].mu /= part->normal < 0 ? of->size : 1.0;
     for (int l = 0; l < at->slips && part->normal >= 0; l++)
@@ -346,11 +348,11 @@ static int cone_solve_block(cone_problem *in, const int *member, cone_block *of)
   for (int i = 0; i < of->count; i++)
     in->f[of->row[i]] = x[i] * of->scale[i] * of->size;
   for (int k = 0; k < of->parts; k++) {
-    const int contact = of->part[k].contact, normal = CONTACTS[contact].normal;
-    for (int i = 0; i < CONTACTS[contact].slips && normal >= 0; i++)
-      in->f[CONTACTS[contact].tangential + i] -= cone_limit(in, contact) * in->given[contact][i] * in->f[normal];
-    for (int i = 0; i < CONTACTS[contact].slips && normal < 0 && of->part[k].slips > 0; i++)
-      in->f[CONTACTS[contact].tangential + i] -= cone_limit(in, contact) * in->given[contact][i];
+    const int contact = of->part[k].contact, normal = in->places[contact].normal;
+    for (int i = 0; i < in->places[contact].slips && normal >= 0; i++)
+      in->f[in->places[contact].tangential + i] -= cone_limit(in, contact) * in->given[contact][i] * in->f[normal];
+    for (int i = 0; i < in->places[contact].slips && normal < 0 && of->part[k].slips > 0; i++)
+      in->f[in->places[contact].tangential + i] -= cone_limit(in, contact) * in->given[contact][i];
   }
   cone_modes(in, of, x);
   return 1;
@@ -359,7 +361,7 @@ static int cone_solve_block(cone_problem *in, const int *member, cone_block *of)
 /* Scaled rate of a slip that is faster than others with the static limit, 0 if it has not this limit. */
 static real cone_static_slip(const cone_problem *in, int k)
 {
-  const int slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
+  const int slip = in->places[k].tangential, slips = in->places[k].slips;
   real rate[2] = {0.0}, trace = 0.0;
   if (!in->is_static[k] || in->mu_static[k] == in->mu[k] || in->mode[k].sticks || !in->mode[k].is_closed)
     return 0.0;
@@ -375,7 +377,7 @@ static int cone_fastest(const cone_problem *in, const int *member)
 {
   real largest = 0.0;
   int fastest = -1;
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
+  for (int k = 0; k < in->contacts; k++) {
     const real rate = member[k] ? cone_static_slip(in, k) : 0.0;
     fastest = rate > largest ? k : fastest;
     largest = fmax(largest, rate);
@@ -393,7 +395,7 @@ static int cone_solve_static(cone_problem *in, const int *member, cone_block *of
     in->is_static[fastest] = 0;
     solved = cone_solve_block(in, member, of);
   }
-  for (int k = 0; k < EVENT_CONTACTS && solved; k++) {
+  for (int k = 0; k < in->contacts && solved; k++) {
     if (!lowered[k] || in->mode[k].sticks)
       continue;
     const cone_problem before = *in;
@@ -412,27 +414,31 @@ static int solve_cone_within(cone_problem *in, int most_points)
   in->most_points = most_points;
   in->newtons = in->points = 0;
   in->compliance = in->residual = 0.0;
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
+  for (int k = 0; k < in->contacts; k++) {
     int row[3];
     in->is_static[k] = in->rests[k];
     in->mode[k] = (cone_mode){0};
-    for (int r = rows_of(k, row) - 1; r >= 0 && !in->takes_part[k]; r--)
+    for (int r = rows_of(in->places + k, row) - 1; r >= 0 && !in->takes_part[k]; r--)
       in->f[row[r]] = 0.0;
     done[k] = !in->takes_part[k];
   }
-  for (int k = 0; k < EVENT_CONTACTS && solved; k++) {
+  for (int k = 0; k < in->contacts && solved; k++) {
     int member[EVENT_CONTACTS] = {0};
     if (done[k])
       continue;
-    cone_connect(in->W, in->takes_part, k, member);
+    cone_connect(in->places, in->contacts, in->W, in->takes_part, k, member);
     solved = cone_solve_static(in, member, &block);
-    for (int j = 0; j < EVENT_CONTACTS; j++)
+    for (int j = 0; j < in->contacts; j++)
       done[j] |= member[j];
   }
   return solved;
 }
 
+/* Solves a problem of the rows of CONTACTS. */
 static int solve_cone(cone_problem *in)
 {
+  in->places = CONTACTS;
+  in->contacts = EVENT_CONTACTS;
+  in->rows = CONTACT_ROWS;
   return solve_cone_within(in, CONE_POINTS);
 }

@@ -123,7 +123,7 @@ static int find_impulses(const event_step *step, const contact_terms *of, const 
       int takes_part[EVENT_CONTACTS] = {0};
       if (!meets[k] || acted[k])
         continue;
-      cone_connect(of->W, may_act, k, takes_part);
+      cone_connect(CONTACTS, EVENT_CONTACTS, of->W, may_act, k, takes_part);
       if (!restitute(step, of, takes_part, last ? NULL : meets, rate, impulse))
         return refuse(step, CONTACT_WITHOUT_IMPULSE, k, 0.0);
       for (int r = 0; r < CONTACT_ROWS; r++)

@@ -1,5 +1,4 @@
-#include "cone.h"
-#include "event_changes.h"
+#include "contact_places.h"
 
 /* Contacts by steps: runs of fixed steps without transitions, two contact problems in each, for svi:1 on two Lobatto
  * points, Ld(q0, q1) = h/2 (L(q0, v) + L(q1, v)), v = (q1 - q0) / h. With the rows G0, G1 of gaps g and slips at its
@@ -16,7 +15,7 @@ enum {
   STEP_HALVINGS = 8,
   STEP_POINTS = 30, /* proximal points of a contact problem, after which forces have a compliance */
   STEP_FIXED = CONTACT_FIRST_ROW, /* constraints, whose forces are free */
-  STEP_ROWS = STEP_FIXED + CONTACT_ROWS,
+  STEP_ROWS = STEP_FIXED + ALL_CONTACT_ROWS,
   STEP_SIZE = M + STEP_FIXED
 };
 
@@ -41,14 +40,14 @@ typedef struct {
   real matrix[STEP_SIZE * STEP_SIZE], pivot[STEP_SIZE];
 } step_matrix;
 
-/* Responses A^-1 G0^T, M0^-1 G0^T or M1^-1 G1^T of the `count` rows `row` of the contacts that take part, a column for
- * each. */
+/* Responses A^-1 G0^T, M0^-1 G0^T or M1^-1 G1^T to the first `count` rows of a problem, a column for each. */
 typedef struct {
-  int count, row[CONTACT_ROWS];
+  int count;
   real x[STEP_SIZE][CONTACT_ROWS];
 } responses;
 
-/* A step of length h from (t, q, p, v) to q1; contacts whose rows are formed, and their responses. */
+/* A step of length h from (t, q, p, v) to q1; contacts that exist, and of all rows the impulses f1. A problem has the
+ * near contacts alone, in the order in which they join: `contact` and `row` are their numbers among all. */
 typedef struct {
   real t, h, q[M], p[M], v[M], q1[M], fastest, curvature;
   const real *idle, *imposed; /* parameters */
@@ -56,7 +55,11 @@ typedef struct {
   row_terms start, end;
   step_matrix moving, resting;
   int solved, continues; /* whether `moving` has the masses at q1, and `resting` had at its start */
-  int is_near[EVENT_CONTACTS], pushes[EVENT_CONTACTS], has_begun[EVENT_CONTACTS];
+  int is_full; /* 1 + the contact that found no room, else 0 */
+  int exists[EVENT_CONTACTS], is_near[EVENT_CONTACTS], pushes[EVENT_CONTACTS], has_begun[EVENT_CONTACTS];
+  real impulse[ALL_CONTACT_ROWS];
+  int contact[EVENT_CONTACTS], row[CONTACT_ROWS];
+  contact_places place[EVENT_CONTACTS];
   responses response, at_start;
   real W[CONTACT_ROWS * CONTACT_ROWS];
   cone_problem problem;
@@ -93,17 +96,14 @@ static void solve_step(const step_matrix *of, real *x)
   back_substitute(of->matrix, &shape, of->pivot, x);
 }
 
-/* Responses to the rows of the contacts that take part: all columns at a time. */
+/* Responses to the rows of a problem: all columns at a time. */
 static void respond(const contact_step *in, const step_matrix *of, const row_terms *rows, responses *to)
 {
   real(*const x)[CONTACT_ROWS] = to->x;
-  to->count = 0;
-  for (int k = 0; k < EVENT_CONTACTS; k++)
-    if (in->problem.takes_part[k])
-      to->count += rows_of(k, to->row + to->count);
+  to->count = in->problem.rows;
   for (int i = 0; i < STEP_SIZE; i++)
     for (int c = 0; c < to->count; c++)
-      x[i][c] = i < M ? rows->G[STEP_FIXED + to->row[c]][i] : 0.0;
+      x[i][c] = i < M ? rows->G[in->row[c]][i] : 0.0;
   for (int k = 0; k < STEP_SIZE; k++) {
     real *const exchanged = x[(int)of->pivot[k]];
     for (int c = 0; c < to->count; c++) {
@@ -122,17 +122,15 @@ static void respond(const contact_step *in, const step_matrix *of, const row_ter
   }
 }
 
-/* W of the contacts that take part, a part of G times responses. */
+/* W of a problem, a part of G times responses. */
 static void pose_matrix(contact_step *in, const row_terms *rows, const responses *of, real part)
 {
   for (int r = 0; r < of->count; r++) {
-    real sum[CONTACT_ROWS] = {0.0}, *const W = in->W + of->row[r] * CONTACT_ROWS;
+    real *const W = in->W + r * CONTACT_ROWS;
+    memset(W, 0, BYTES(of->count));
     for (int i = 0; i < M; i++)
-      subtract(of->x[i], -part * rows->G[STEP_FIXED + of->row[r]][i], 0, of->count, sum);
-    for (int c = 0; c < of->count; c++)
-      W[of->row[c]] = sum[c];
+      subtract(of->x[i], -part * rows->G[in->row[r]][i], 0, of->count, W);
   }
-  in->problem.W = in->W;
 }
 
 /* Terms at the end, and with `first` at the start, at the velocity of the step. */
@@ -147,13 +145,42 @@ static int terms_between(contact_step *in, int first)
   return NAME(row_terms)(in->t + in->h, in->q1, v, in->imposed, in->end.value);
 }
 
-/* Friction of a contact that takes part in a problem, static or that of sliding; without a gap half of the step's. */
-static void pose_limits(contact_step *in, int k, const row_terms *rows, int rests)
+/* A contact joins a problem, from the present impulses and with its friction, static or that of sliding; without a gap
+ * half of the step's. */
+static int join(contact_step *in, int k, const row_terms *rows, int rests)
 {
+  cone_problem *const to = &in->problem;
+  const int n = to->contacts, first = to->rows;
   const real part = CONTACTS[k].normal < 0 ? 0.5 * in->h : 1.0;
-  in->problem.rests[k] = rests;
-  in->problem.mu[k] = part * rows->coefficient[k][0];
-  in->problem.mu_static[k] = part * rows->coefficient[k][1];
+  int row[3];
+  const int count = rows_of(CONTACTS + k, row);
+  if (first + count > CONTACT_ROWS)
+    return in->is_full = k + 1, NOT_CONVERGED;
+  for (int i = 0; i < count; i++) {
+    in->row[first + i] = STEP_FIXED + row[i];
+    to->f[first + i] = in->impulse[row[i]];
+  }
+  in->contact[n] = k;
+  in->is_near[k] = 1;
+  in->place[n] = CONTACTS[k];
+  in->place[n].normal = CONTACTS[k].normal < 0 ? -1 : first;
+  in->place[n].tangential = first + (CONTACTS[k].normal >= 0);
+  to->takes_part[n] = 1;
+  to->rests[n] = rests;
+  to->mu[n] = part * rows->coefficient[k][0];
+  to->mu_static[n] = part * rows->coefficient[k][1];
+  to->contacts++;
+  to->rows += count;
+  return OK;
+}
+
+/* A problem without contacts. */
+static void clear_problem(contact_step *in)
+{
+  in->problem.contacts = in->problem.rows = 0;
+  in->problem.places = in->place;
+  in->problem.W = in->W;
+  memset(in->is_near, 0, sizeof in->is_near);
 }
 
 /* Change x of q1 without contacts that satisfies the linearised step, in x also the forces of constraints. */
@@ -173,14 +200,16 @@ static int linearise_step(contact_step *in, real *x)
   return OK;
 }
 
-/* Contacts join whose gap after the change x is below the path of the fastest row: those whose rows are formed. */
-static void find_near(contact_step *in, const real *x)
+/* Contacts join that have no gap, pushed in the last step, or have a gap within reach after a change x of positions. */
+static int find_near(contact_step *in, const contact_memory *from, const real *x, real reach)
 {
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
-    in->problem.takes_part[k] |= in->is_near[k] &&
-        (normal < 0 || in->end.value[row] + times_row(in->end.G[row], x) < in->h * in->fastest);
+    if (in->exists[k] && !in->is_near[k] && (normal < 0 || from->pushes[k] ||
+        in->end.value[row] + times_row(in->end.G[row], x) < reach))
+      TRY(join(in, k, &in->start, from->sticks[k]));
   }
+  return OK;
 }
 
 /* Rates b + W f of the first problem at a change x, at first static friction where slips rest; *slow: whether a row
@@ -190,45 +219,45 @@ static int solve_positions(contact_step *in, const contact_memory *from, const r
   cone_problem *const of = &in->problem;
   const responses *const at = &in->at_start;
   real force[CONTACT_ROWS];
-  memcpy(force, of->f, sizeof force);
+  memcpy(force, of->f, BYTES(of->rows));
   respond(in, &in->moving, &in->start, &in->response);
-  if (first || at->count != in->response.count) /* contacts only join */
+  if (first || at->count != of->rows) /* contacts only join */
     respond(in, &in->resting, &in->start, &in->at_start);
   pose_matrix(in, &in->end, &in->response, 1.0 / in->h);
   *slow = 0;
-  for (int c = 0; c < at->count; c++) {
+  for (int r = 0; r < of->rows; r++) {
     real yields = 0.0;
     for (int i = 0; i < M; i++)
-      yields += in->start.G[STEP_FIXED + at->row[c]][i] * at->x[i][c];
-    *slow |= in->W[at->row[c] * (CONTACT_ROWS + 1)] < STEP_YIELDS * yields;
+      yields += in->start.G[in->row[r]][i] * at->x[i][r];
+    *slow |= in->W[r * (CONTACT_ROWS + 1)] < STEP_YIELDS * yields;
   }
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
+  for (int k = 0; k < of->contacts; k++) {
     int row[3];
-    for (int i = of->takes_part[k] ? rows_of(k, row) - 1 : -1; i >= 0; i--) {
-      const int all = STEP_FIXED + row[i], is_gap = row[i] == CONTACTS[k].normal;
+    for (int i = rows_of(in->place + k, row) - 1; i >= 0; i--) {
+      const int r = row[i], all = in->row[r], is_gap = r == in->place[k].normal;
       real b = is_gap ? in->end.value[all] : 0.0;
       for (int m = 0; m < M; m++)
         b += in->end.G[all][m] * x[m] +
             (is_gap ? 0.0 : 0.5 * (in->start.G[all][m] + in->end.G[all][m]) * (in->q1[m] - in->q[m]));
-      of->b[row[i]] = b / in->h + (is_gap ? 0.0 : 0.5 * (in->start.drift[all] + in->end.drift[all]));
-      of->terms[row[i]] = fabs(of->b[row[i]]);
+      of->b[r] = b / in->h + (is_gap ? 0.0 : 0.5 * (in->start.drift[all] + in->end.drift[all]));
+      of->terms[r] = fabs(of->b[r]);
     }
   }
   if (*slow) { /* b + W f of the present forces stays */
-    for (int c = 0; c < at->count; c++)
-      of->b[at->row[c]] = cone_rate(of, at->row[c]);
+    for (int r = 0; r < of->rows; r++)
+      of->b[r] = cone_rate(of, r);
     pose_matrix(in, &in->start, at, 1.0);
-    for (int r = 0; r < at->count; r++)
-      for (int c = 0; c < at->count; c++)
-        of->b[at->row[r]] -= in->W[at->row[r] * CONTACT_ROWS + at->row[c]] * force[at->row[c]];
+    for (int r = 0; r < of->rows; r++)
+      for (int c = 0; c < of->rows; c++)
+        of->b[r] -= in->W[r * CONTACT_ROWS + c] * force[c];
   }
   if (!solve_cone_within(of, STEP_POINTS))
     return NOT_CONVERGED;
   int reverses = 0;
-  for (int k = 0; k < EVENT_CONTACTS && first; k++) { /* which stop in between have static friction */
-    const int turns = of->takes_part[k] && CONTACTS[k].slips > 0 && !of->rests[k] && !of->mode[k].sticks &&
-        of->mu_static[k] > of->mu[k] &&
-        of->mode[k].direction[0] * from->direction[k][0] + of->mode[k].direction[1] * from->direction[k][1] < 0.0;
+  for (int k = 0; k < of->contacts && first; k++) { /* which stop in between have static friction */
+    const real *const now = of->mode[k].direction, *const before = from->direction[in->contact[k]];
+    const int turns = in->place[k].slips > 0 && !of->rests[k] && !of->mode[k].sticks && of->mu_static[k] > of->mu[k] &&
+        now[0] * before[0] + now[1] * before[1] < 0.0;
     of->rests[k] |= turns;
     reverses |= turns;
   }
@@ -245,34 +274,31 @@ static real norm_of(const contact_step *in, const real *x)
   return sqrt(fmax(sum, 0.0));
 }
 
-/* Rates of the row of a gap or a slip at a state. */
+/* Rate of a row at a state. */
 static real rate_of(const row_terms *rows, int row, const real *v)
 {
-  return times_row(rows->G[STEP_FIXED + row], v) + rows->drift[STEP_FIXED + row];
+  return times_row(rows->G[row], v) + rows->drift[row];
 }
 
 /* Limits of friction, which the first solution of a problem chooses, for its further ones. */
 static void keep_limits(contact_step *in, const contact_memory *from)
 {
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    in->has_begun[k] = from->sticks[k] && in->problem.takes_part[k] && !in->problem.is_static[k];
+  for (int k = 0; k < in->problem.contacts; k++) {
+    in->has_begun[in->contact[k]] = from->sticks[in->contact[k]] && !in->problem.is_static[k];
     in->problem.mu[k] = cone_limit(&in->problem, k);
     in->problem.rests[k] = 0;
   }
 }
 
-/* Contacts join whose gaps only the forces of others close; returns whether there is one. */
-static int find_missed(contact_step *in)
+/* Notes the impulses f1 of all rows, and contacts that push. */
+static void note_impulses(contact_step *in)
 {
-  int missed = 0;
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const int is_missed = in->is_near[k] && !in->problem.takes_part[k] &&
-        in->end.value[STEP_FIXED + CONTACTS[k].normal] < 0.0;
-    in->problem.takes_part[k] |= is_missed;
-    missed |= is_missed;
-    in->pushes[k] = CONTACTS[k].normal >= 0 && in->problem.takes_part[k] && in->problem.mode[k].pushes;
-  }
-  return missed;
+  memset(in->impulse, 0, sizeof in->impulse);
+  memset(in->pushes, 0, sizeof in->pushes);
+  for (int r = 0; r < in->problem.rows; r++)
+    in->impulse[in->row[r] - STEP_FIXED] = in->problem.f[r];
+  for (int k = 0; k < in->problem.contacts; k++)
+    in->pushes[in->contact[k]] = in->place[k].normal >= 0 && in->problem.mode[k].pushes;
 }
 
 /* y += part X f with responses X. */
@@ -280,19 +306,18 @@ static void add_responses(const responses *of, real part, const real *f, real *y
 {
   for (int i = 0; i < M; i++)
     for (int c = 0; c < of->count; c++)
-      y[i] += part * of->x[i][c] * f[of->row[c]];
+      y[i] += part * of->x[i][c] * f[c];
 }
 
 /* Solves the first problem for q1 and the impulses f1: Newton's method on both, a contact problem an iteration. */
 static int find_positions(contact_step *in, const contact_memory *from)
 {
-  real size = 0.0, before = 0.0, *const f = in->problem.f;
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    in->problem.takes_part[k] = in->is_near[k] && (CONTACTS[k].normal < 0 || from->pushes[k]);
-    pose_limits(in, k, &in->start, from->sticks[k]);
-  }
-  for (int r = 0; r < CONTACT_ROWS; r++)
-    f[r] = in->h * from->force[r];
+  const real still[M] = {0.0};
+  real size = 0.0, before = 0.0;
+  clear_problem(in);
+  memset(in->has_begun, 0, sizeof in->has_begun);
+  for (int r = 0; r < ALL_CONTACT_ROWS; r++)
+    in->impulse[r] = in->h * from->force[r];
   for (int i = 0; i < M; i++) {
     const real bend = (from->steady > 0 ? from->bend[i] : 0.0) + (from->steady > 1 ? from->turn[i] : 0.0);
     in->q1[i] = in->q[i] + in->h * (in->v[i] + in->h * bend);
@@ -305,14 +330,14 @@ static int find_positions(contact_step *in, const contact_memory *from)
     if (iteration == 0 && !in->continues)
       TRY(factorise_step(NULL, &in->first, &in->start, &in->start, &in->resting));
     TRY(linearise_step(in, x));
-    find_near(in, x);
+    TRY(find_near(in, from, x, in->h * in->fastest));
     for (int i = 0; i < M; i++)
       rounding[i] = in->h * in->v[i];
     size = iteration == 0 ? STEP_UPDATE * (norm_of(in, rounding) + norm_of(in, x)) : size;
     TRY(solve_positions(in, from, x, iteration == 0, &slow));
     if (iteration == 0)
       keep_limits(in, from);
-    add_responses(&in->response, 1.0, f, x);
+    add_responses(&in->response, 1.0, in->problem.f, x);
     for (int i = 0; i < M; i++) {
       in->q1[i] += x[i];
       rounding[i] = CONTACT_LOWEST * DBL_EPSILON * fabs(in->q1[i]);
@@ -327,7 +352,9 @@ static int find_positions(contact_step *in, const contact_memory *from)
     for (int i = 0; i < M; i++) /* L_v is linear in v */
       in->first.momentum[i] += times_row(in->first.by_state[i] + M, x) / in->h;
     TRY(terms_between(in, 0));
-    if (!find_missed(in))
+    const int contacts = in->problem.contacts; /* those join whose gaps only the forces of others close */
+    TRY(find_near(in, from, still, 0.0));
+    if (contacts == in->problem.contacts)
       return OK;
   }
   return NOT_CONVERGED;
@@ -343,52 +370,74 @@ static real half_product(const contact_step *in, const real *v, const real *w)
   return sum;
 }
 
-/* Work of moving surfaces by impulses of the rows of a state. */
-static real work_of_surfaces(const row_terms *rows, const real *f)
+/* Work of moving surfaces by impulses f of a problem with the rows of a state. */
+static real work_of_surfaces(const contact_step *in, const row_terms *rows, const real *f)
 {
   real work = 0.0;
-  for (int r = 0; r < CONTACT_ROWS; r++)
-    work -= f[r] * rows->drift[STEP_FIXED + r];
+  for (int r = 0; r < in->problem.rows; r++)
+    work -= f[r] * rows->drift[in->row[r]];
   return work;
 }
 
+/* Kinetic energy at the end of a step with the energy before it. */
+static int energy_before(const contact_step *in, const real *v, real *room, real *workspace)
+{
+  real p[M], energy;
+  TRY(NAME(energy)(in->t, in->q, in->p, in->idle, room, workspace));
+  TRY(NAME(momentum)(in->t + in->h, in->q1, v, in->idle, p, workspace));
+  TRY(NAME(energy)(in->t + in->h, in->q1, p, in->idle, &energy, workspace));
+  *room -= energy - half_product(in, v, v);
+  return OK;
+}
+
+/* Velocities with at most the energy before the step: all of them shrink together. */
+static int limit_energy(const contact_step *in, real *v, real *workspace)
+{
+  const real kinetic = half_product(in, v, v);
+  real room;
+  TRY(energy_before(in, v, &room, workspace));
+  room = fmax(room, 0.0);
+  for (int i = 0; i < M && kinetic > room; i++)
+    v[i] *= sqrt(room / kinetic);
+  return OK;
+}
+
 /* Restitution of contacts that f1 closed, with rates e times those before the step: v += s (v_e - v) with the largest s
- * in [0, 1] for which the energy is that before at most, with the work of moving surfaces. */
-static int rebound(contact_step *in, const contact_memory *from, const real *f1, const real *before, real *v,
+ * in [0, 1] for which the energy is that before at most, with the work of moving surfaces in f1 and here. */
+static int rebound(contact_step *in, const contact_memory *from, real by_surfaces, const real *before, real *v,
     real *workspace)
 {
   cone_problem *const of = &in->problem;
-  real f[CONTACT_ROWS], w[M], p[M], energy, room, part = 1.0;
+  real f[CONTACT_ROWS], w[M], room, part = 1.0;
   int bounces = 0;
-  memcpy(f, of->f, sizeof f);
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
+  memcpy(f, of->f, BYTES(of->rows));
+  for (int i = 0; i < of->contacts; i++) {
+    const int k = in->contact[i], r = in->place[i].normal;
     if (!in->pushes[k] || from->is_closed[k])
       continue;
-    const real target = in->start.coefficient[k][2] * fmin(rate_of(&in->start, CONTACTS[k].normal, in->v), 0.0);
-    of->b[CONTACTS[k].normal] += target;
+    const real target = in->start.coefficient[k][2] * fmin(rate_of(&in->start, in->row[r], in->v), 0.0);
+    of->b[r] += target;
     bounces |= target < 0.0;
   }
   if (!bounces)
     return OK;
-  TRY(NAME(energy)(in->t, in->q, in->p, in->idle, &room, workspace));
-  TRY(NAME(momentum)(in->t + in->h, in->q1, v, in->idle, p, workspace));
-  TRY(NAME(energy)(in->t + in->h, in->q1, p, in->idle, &energy, workspace));
-  room -= energy - half_product(in, v, v) - work_of_surfaces(&in->start, f1);
+  TRY(energy_before(in, v, &room, workspace));
+  room += by_surfaces;
   if (!solve_cone_within(of, STEP_POINTS))
     return NOT_CONVERGED;
   memcpy(w, before, sizeof w);
   add_responses(&in->response, 1.0, of->f, w);
   for (int i = 0; i < M; i++)
     w[i] -= v[i];
-  const real plastic = work_of_surfaces(&in->end, f);
+  const real plastic = work_of_surfaces(in, &in->end, f);
   const real square = half_product(in, w, w);
-  const real linear = 2.0 * half_product(in, v, w) - work_of_surfaces(&in->end, of->f) + plastic;
+  const real linear = 2.0 * half_product(in, v, w) - work_of_surfaces(in, &in->end, of->f) + plastic;
   const real rest = half_product(in, v, v) - plastic - room;
   if (square + linear + rest > 0.0)
     part = rest >= 0.0 ? 0.0 : fmin(1.0, (-linear + sqrt(linear * linear - 4.0 * square * rest)) / (2.0 * square));
   for (int i = 0; i < M; i++)
     v[i] += part * w[i];
-  for (int r = 0; r < CONTACT_ROWS; r++)
+  for (int r = 0; r < of->rows; r++)
     of->f[r] = f[r] + part * (of->f[r] - f[r]);
   return OK;
 }
@@ -404,13 +453,14 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
 {
   cone_problem *const of = &in->problem;
   const contact_memory from = *to;
-  real x[STEP_SIZE], f1[CONTACT_ROWS], before[M], v[M], work = 0.0, fastest = 0.0;
+  real x[STEP_SIZE], before[M], v[M], work = 0.0, fastest = 0.0;
+  const real by_surfaces = work_of_surfaces(in, &in->start, of->f);
   int changes = 0;
-  memcpy(f1, of->f, sizeof f1);
+  note_impulses(in);
   memcpy(v, in->v, sizeof v); /* the mean of those before and after f1 */
-  add_responses(&in->at_start, 0.5, f1, v);
-  for (int r = 0; r < CONTACT_ROWS; r++)
-    work += f1[r] == 0.0 ? 0.0 : f1[r] * times_row(in->start.G[STEP_FIXED + r], v);
+  add_responses(&in->at_start, 0.5, of->f, v);
+  for (int r = 0; r < of->rows; r++)
+    work += of->f[r] * times_row(in->start.G[in->row[r]], v);
   for (int i = 0; i < M; i++) {
     x[i] = 0.5 * (in->h * in->last.force[i] + in->first.momentum[i] - in->last.momentum[i]);
     for (int j = 0; j < M; j++)
@@ -421,16 +471,17 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   TRY(factorise_step(NULL, &in->last, &in->end, &in->end, &in->moving));
   solve_step(&in->moving, x);
   memcpy(before, x, sizeof before);
+  clear_problem(in);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
-    of->takes_part[k] = in->is_near[k] && (normal < 0 || in->pushes[k] ||
-        in->end.value[row] <= CONTACT_LOWEST * DBL_EPSILON * size_by_position(in->end.G[row], in->q1));
-    pose_limits(in, k, &in->end, from.sticks[k] && !in->has_begun[k]);
+    if (in->exists[k] && (normal < 0 || in->pushes[k] ||
+        in->end.value[row] <= CONTACT_LOWEST * DBL_EPSILON * size_by_position(in->end.G[row], in->q1)))
+      TRY(join(in, k, &in->end, from.sticks[k] && !in->has_begun[k]));
   }
   respond(in, &in->moving, &in->end, &in->response);
   pose_matrix(in, &in->end, &in->response, 1.0);
-  for (int r = 0; r < CONTACT_ROWS; r++) {
-    of->b[r] = rate_of(&in->end, r, before);
+  for (int r = 0; r < of->rows; r++) {
+    of->b[r] = rate_of(&in->end, in->row[r], before);
     of->terms[r] = fabs(of->b[r]);
     fastest = fmax(fastest, of->terms[r]);
   }
@@ -440,23 +491,28 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
     return NOT_CONVERGED;
   memcpy(v, before, sizeof v);
   add_responses(&in->response, 1.0, of->f, v);
-  TRY(rebound(in, &from, f1, before, v, workspace));
+  TRY(rebound(in, &from, by_surfaces, before, v, workspace));
+  if (to->is_strict)
+    TRY(limit_energy(in, v, workspace));
   to->residual = fmax(to->residual, of->residual);
   to->compliance = fmax(to->compliance, of->compliance);
   to->lost_energy -= work + half_product(in, v, v) - half_product(in, before, before);
   memcpy(to->v, v, sizeof v);
-  for (int r = 0; r < CONTACT_ROWS; r++)
-    to->force[r] = f1[r] / in->h;
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const int normal = CONTACTS[k].normal;
-    const real rate = normal < 0 ? 0.0 : rate_of(&in->end, normal, v);
-    changes |= from.pushes[k] != in->pushes[k];
-    to->pushes[k] = in->pushes[k];
-    to->is_closed[k] = of->takes_part[k] && rate <= CONTACT_ROUNDING * fastest;
-    to->sticks[k] = to->is_closed[k] && of->mode[k].sticks;
-    memcpy(to->direction[k], of->mode[k].direction, sizeof *to->direction);
-    changes |= has_changed(&from, to, k);
+  for (int r = 0; r < ALL_CONTACT_ROWS; r++)
+    to->force[r] = in->impulse[r] / in->h;
+  memcpy(to->exists, in->exists, sizeof to->exists);
+  memcpy(to->pushes, in->pushes, sizeof to->pushes);
+  memset(to->is_closed, 0, sizeof to->is_closed);
+  memset(to->sticks, 0, sizeof to->sticks);
+  memset(to->direction, 0, sizeof to->direction);
+  for (int i = 0; i < of->contacts; i++) {
+    const int k = in->contact[i], r = in->place[i].normal;
+    to->is_closed[k] = r < 0 || rate_of(&in->end, in->row[r], v) <= CONTACT_ROUNDING * fastest;
+    to->sticks[k] = to->is_closed[k] && of->mode[i].sticks;
+    memcpy(to->direction[k], of->mode[i].direction, sizeof *to->direction);
   }
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    changes |= from.pushes[k] != to->pushes[k] || has_changed(&from, to, k);
   for (int i = 0; i < M; i++) {
     to->bend[i] = ((in->q1[i] - in->q[i]) / in->h - in->v[i]) / in->h;
     to->turn[i] = to->bend[i] - from.bend[i];
@@ -479,23 +535,23 @@ static void take_state(contact_step *in, const contact_memory *memory, real t, r
   memcpy(in->v, memory->v, BYTES(M));
 }
 
-/* Rows at the start, and contacts whose conditions hold there and whose surface it is not behind. */
-static int find_existing(contact_step *in, real *workspace)
+/* Rows at the start, and contacts whose conditions hold there: those that existed, and those that it is not behind. */
+static int find_existing(contact_step *in, const contact_memory *from, real *workspace)
 {
   TRY(NAME(row_terms)(in->t, in->q, in->v, in->imposed, in->start.value));
   in->fastest = 0.0;
-  for (int r = 0; r < CONTACT_ROWS; r++)
-    in->fastest = fmax(in->fastest, fabs(rate_of(&in->start, r, in->v)));
+  for (int r = 0; r < ALL_CONTACT_ROWS; r++)
+    in->fastest = fmax(in->fastest, fabs(rate_of(&in->start, STEP_FIXED + r, in->v)));
   for (int k = 0; k < EVENT_CONTACTS; k++)
-    in->is_near[k] = 1;
+    in->exists[k] = 1;
   for (int i = 0; i < TRANSITIONS; i++) {
     const int event = FIRST_TRANSITION + i, k = TRANSITION[i][0], row = STEP_FIXED + CONTACTS[k].normal;
     int exists;
     if (TRANSITION[i][1] != CONTACT_CLOSES || !IS_CONDITIONAL[event])
       continue;
     TRY(conditions(EVENT_FIRST[event], in->t, in->q, in->p, in->idle, &exists, workspace));
-    in->is_near[k] = exists &&
-        in->start.value[row] >= -CONTACT_PENETRATION * size_by_position(in->start.G[row], in->q);
+    in->exists[k] = exists && (from->exists[k] ||
+        in->start.value[row] >= -CONTACT_PENETRATION * size_by_position(in->start.G[row], in->q));
   }
   return OK;
 }
@@ -507,7 +563,7 @@ static int step_by_steps(contact_step *in, contact_memory *memory, real t, real 
   contact_memory next = *memory;
   int status;
   take_state(in, memory, t, h, q, p);
-  TRY(find_existing(in, workspace));
+  TRY(find_existing(in, memory, workspace));
   status = find_positions(in, memory);
   if (status == OK)
     status = find_velocities(in, &next, workspace);
@@ -545,26 +601,27 @@ static int begin_by_steps(contact_step *in, event_run *run, event_watch *watch, 
   contact_memory *const memory = &watch->steps;
   TRY(NAME(velocity)(run->t, run->q, run->p, in->idle, memory->v, workspace));
   take_state(in, memory, run->t, run->h, run->q, run->p);
-  TRY(find_existing(in, workspace));
+  TRY(find_existing(in, memory, workspace));
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
     const real size = normal < 0 ? 0.0 : size_by_position(in->start.G[row], run->q);
     const real gap = normal < 0 ? 0.0 : in->start.value[row];
     real w[2] = {0.0};
-    if (in->is_near[k] && gap < -CONTACT_PENETRATION * size) {
+    if (in->exists[k] && gap < -CONTACT_PENETRATION * size) {
       watch->refusal = CONTACT_PENETRATES;
       watch->refused = k + 1;
       watch->behind = gap;
       return NOT_CONVERGED;
     }
     for (int i = 0; i < CONTACTS[k].slips; i++)
-      w[i] = rate_of(&in->start, CONTACTS[k].tangential + i, memory->v);
+      w[i] = rate_of(&in->start, STEP_FIXED + CONTACTS[k].tangential + i, memory->v);
     const real speed = length_of(w, 2);
-    memory->is_closed[k] = in->is_near[k] && gap <= CONTACT_ROUNDING * size;
+    memory->is_closed[k] = in->exists[k] && gap <= CONTACT_ROUNDING * size;
     memory->sticks[k] = memory->is_closed[k] && CONTACTS[k].slips > 0 && speed <= CONTACT_ROUNDING * in->fastest;
     for (int i = 0; i < 2; i++)
       memory->direction[k][i] = w[i] / fmax(speed, DBL_MIN);
   }
+  memcpy(memory->exists, in->exists, sizeof memory->exists);
   memory->begun = 1;
   put_memory(memory, watch->mode);
   return OK;
@@ -656,6 +713,8 @@ int NAME(advance_by_steps)(event_run *run, event_watch *watch, real t_end, const
     const int status = step_by_steps(&in, &watch->steps, run->t, h, right.q, right.p, 0, workspace);
     if (status != OK) { /* the first of two halves may have been solved */
       watch->steps = before;
+      watch->refusal = in.is_full ? CONTACT_CROWDS : watch->refusal;
+      watch->refused = in.is_full;
       return status;
     }
     set_run(run, run->t, &right);

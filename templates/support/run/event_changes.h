@@ -18,7 +18,6 @@ enum {
 };
 
 #define CHANGE_APPROACH 8.0 /* roundings of a rate that is no approach: gaps stay within CHANGE_SAFETY for 8 impacts */
-#define CHANGE_WHOLE 1e-9 /* relative to a step: a difference of its end from t_end that is rounding */
 #define CHANGE_RATIO 1e-3 /* relative spread of the ratios of intervals that accumulate */
 #define CHANGE_PACE 1e-3 /* least time of so many changes, relative to that mean */
 #define CHANGE_REST 1e-8 /* relative to the time since the first of them: remaining time at which a contact closes */
@@ -295,38 +294,6 @@ static int change_at_start(const event_step *step, event_sample *at, int *change
     TRY(change_contacts(step, first, at));
 #endif
   return OK;
-}
-
-/* Arrays for the states of a call. */
-typedef struct {
-  long long states, *number;
-  real *t, *q, *p, *length;
-  int *iterations;
-} stored_states;
-
-static int store_state(const stored_states *to, const event_sample *at, real length, int iterations, long long number,
-    solver_report *report)
-{
-  const long long k = report->stored;
-  if (k == to->states)
-    return EVENT_NO_ROOM;
-  to->t[k] = at->t;
-  to->length[k] = length;
-  to->iterations[k] = iterations;
-  to->number[k] = number;
-  copy_state(to->q + k * M, to->p + k * M, at->q, at->p);
-  report->stored++;
-  return OK;
-}
-
-/* Sets the state of a run, without predictor and compensation terms. */
-static void set_run(event_run *run, real t, const event_sample *at)
-{
-  run->t = t;
-  copy_state(run->q, run->p, at->q, at->p);
-  memset(run->carry_q, 0, BYTES(M));
-  memset(run->carry_p, 0, BYTES(M));
-  run->guess = 0;
 }
 
 /* State after a part of a step. */

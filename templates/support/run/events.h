@@ -91,7 +91,7 @@ typedef struct {
   real *own; /* the parameters, with the modes of kinks */
 } event_step;
 
-#ifdef EVENT_CONTACTS
+#ifdef CONTACTS_LOCATED
 static int rounding_of_contact(const event_step *step, int event, const event_sample *at, real *rounding);
 #endif
 
@@ -523,7 +523,7 @@ static int search_function(const event_step *step, int e, const event_sample *le
   if (IS_IMPACT[EVENT_OF(e)] && step->watch->history[e].hits > 0 && largest <= step->watch->history[e].slack)
     return OK; /* at zero since an impact without restitution */
 #endif
-#ifdef EVENT_CONTACTS
+#ifdef CONTACTS_LOCATED
   if (is_transition(EVENT_OF(e))) {
     real *const noise = values_at(step, EVENT_DEGREE + 2) + e, rounding;
     TRY(rounding_of_contact(step, EVENT_OF(e), left, &rounding));
@@ -679,3 +679,39 @@ int NAME(crossings)(event_watch *watch, long long count, const real *h, const re
   }
   return OK;
 }
+
+#ifdef EVENT_CHANGES
+#define CHANGE_WHOLE 1e-9 /* relative to a step: a difference of its end from t_end that is rounding */
+
+/* Arrays for the states of a call. */
+typedef struct {
+  long long states, *number;
+  real *t, *q, *p, *length;
+  int *iterations;
+} stored_states;
+
+static inline int store_state(const stored_states *to, const event_sample *at, real length, int iterations,
+    long long number, solver_report *report)
+{
+  const long long k = report->stored;
+  if (k == to->states)
+    return EVENT_NO_ROOM;
+  to->t[k] = at->t;
+  to->length[k] = length;
+  to->iterations[k] = iterations;
+  to->number[k] = number;
+  copy_state(to->q + k * M, to->p + k * M, at->q, at->p);
+  report->stored++;
+  return OK;
+}
+
+/* Sets the state of a run, without predictor and compensation terms. */
+static inline void set_run(event_run *run, real t, const event_sample *at)
+{
+  run->t = t;
+  copy_state(run->q, run->p, at->q, at->p);
+  memset(run->carry_q, 0, BYTES(M));
+  memset(run->carry_p, 0, BYTES(M));
+  run->guess = 0;
+}
+#endif

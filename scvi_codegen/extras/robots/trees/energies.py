@@ -420,7 +420,6 @@ def system_of_tree(
             raise SystemDefinitionError(f"{problem}, or integrate it as it is written by check_inertias=False")
         warn(problem, SystemDefinitionWarning)
     contacts = *tree.contacts(law), *touching
-    check_rows(contacts, touching)
 
     def made(**fields: Any) -> Any:
         members = fields.get("rotations", ())
@@ -444,17 +443,6 @@ def system_of_tree(
                 f"joint '{idle[0]}' moves no mass: give a link that it carries an <inertial>, or fix the joint"
             ) from error
         raise
-
-
-def check_rows(contacts: Sequence[Contact | Friction], touching: Sequence[Contact | Friction]) -> None:
-    """Raise :class:`SystemDefinitionError` for more gaps and slips, some of parts that touch, than a step can have."""
-    rows, of_parts = (sum(item.rows for item in some) for some in (contacts, touching))
-    if rows > Contact.MOST_ROWS:
-        raise SystemDefinitionError(
-            f"the robot has {rows} gaps and slips of contacts, {of_parts} of them of geoms and tendons, of at "
-            f"most {Contact.MOST_ROWS}: leave some out by contype='0' conaffinity='0' or condim='1' of geoms, "
-            "<exclude>, limits='ignore' or friction='ignore'"
-        )
 
 
 def _in_quaternions(

@@ -17,7 +17,7 @@ from scvi_codegen.interfaces.models.input_tables import tables_of_example
 from scvi_codegen.interfaces.models.model import Model
 from scvi_codegen.interfaces.models.options import RUN_FIELDS
 from scvi_codegen.runs.stepping.array_interface import read_state, table_limits
-from scvi_codegen.runs.stepping.features import refusal
+from scvi_codegen.runs.stepping.features import check_strict_energy, refusal
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.event import Event
 from scvi_codegen.systems.formulas.expressions import evaluate
@@ -96,6 +96,8 @@ def example_of(model: Model, interface: Interface, *, controlled: bool) -> Examp
         tolerance = abs(model.h)  # the step size in tau
     save_every = math.ceil(steps / OUTPUTS)
     outputs = math.ceil(steps / save_every)
+    if model.strict_energy:
+        check_strict_energy(interface, by_steps=model.transitions != LOCATED)
     return ExampleRun(
         q=model.q,
         p=momenta,
@@ -116,6 +118,7 @@ def example_of(model: Model, interface: Interface, *, controlled: bool) -> Examp
         end=model.end if inputs else 0.0,
         events=interface.searched(model.events),
         by_steps=model.transitions != LOCATED,
+        strict_energy=model.strict_energy,
     )
 
 
