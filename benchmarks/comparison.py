@@ -88,6 +88,8 @@ def _peer_contenders(
 PEER_ERRORS = (ArithmeticError, AttributeError, ImportError, OSError, RuntimeError, TypeError, ValueError)
 """Errors that a peer of an unknown version, or without its compiler, may raise; they are reported."""
 
+SHORT = 1e-3
+"""Seconds of calls that are timed after one of their own, which takes what it needs into the caches."""
 PATIENCE = 1.0
 """Seconds per round over all states above which a contender is timed only once."""
 
@@ -104,6 +106,8 @@ class _Record:
         taken, final = [], []
         size = self.contender.trajectories
         for index in range(self.contender.starts if size == 1 else 1):
+            if self.is_short():  # as in a loop: code and tables of other contenders have left the caches
+                self.contender.prepare(index)()
             integrate = self.contender.prepare(index)
             began = time.process_time()
             q = integrate()
@@ -111,6 +115,9 @@ class _Record:
             final.append(q() if callable(q) else q)
         self.seconds.append(taken)
         self.final = final
+
+    def is_short(self) -> bool:
+        return bool(self.seconds) and max(self.seconds[-1]) * self.contender.trajectories < SHORT
 
     def wants_more(self) -> bool:
         return not self.failure and (not self.seconds or sum(self.seconds[0]) * self.contender.trajectories < PATIENCE)
