@@ -1031,6 +1031,28 @@ static int begin_step(event_run *run, event_run *before, event_step *step, real 
   return status;
 }
 
+/* Returns to the start of a step that failed. Whether it is taken again, as an adaptive one of that size was not solved;
+ * if not, *status becomes OK where no crossing has room. */
+static int returns_to(const event_step *step, event_run *run, const event_run *before, const event_watch *watched,
+    long long crossed, real size, int *status)
+{
+  int again = 0;
+#ifdef EVENT_CONTACTS
+  again = may_be_halved(step, *status, size, step->watch->pace);
+  if (step->watch->gain > 0.0 && !again)
+    refuse(step, CONTACT_CREATES_ENERGY, -1, step->watch->gain);
+#endif
+  (void)size;
+  copy_run(run, before);
+  if (again || *status == EVENT_NO_ROOM) {
+    undo_changes(step, watched, crossed);
+    *status = OK;
+  } else {
+    *step->filled = crossed;
+  }
+  return again;
+}
+
 int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, const step_control *control,
     long long steps, const real *parameters, const solver_options *options, long long states, real *t, real *q, real *p,
     real *length, int *iterations, long long *number, long long room, event_crossing *found, long long *filled,
@@ -1097,25 +1119,12 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
       continue;
 #endif
     if (status != OK) {
-      int again = 0;
-#ifdef EVENT_CONTACTS
-#if EVENTS_CONTROLLED
+      report->stored = kept;
+#if defined(EVENT_CONTACTS) && EVENTS_CONTROLLED
       unsolved = 0.5 * size;
 #endif
-      again = control && may_be_halved(&step, status, size, watch->pace);
-      if (watch->gain > 0.0 && !again)
-        refuse(&step, CONTACT_CREATES_ENERGY, -1, watch->gain);
-#endif
-      copy_run(run, &before);
-      report->stored = kept;
-      if (status == EVENT_NO_ROOM || again) {
-        undo_changes(&step, &watched, crossed);
-        status = OK;
-        if (again)
-          continue;
-        return OK;
-      }
-      *filled = crossed;
+      if (returns_to(&step, run, &before, &watched, crossed, control ? size : 0.0, &status))
+        continue;
       if (status > STATUS(SPURIOUS_SOLUTION))
         *watch = initial; /* the call is repeated */
       return status;
