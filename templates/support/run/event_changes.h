@@ -1031,8 +1031,8 @@ static int begin_step(event_run *run, event_run *before, event_step *step, real 
   return status;
 }
 
-/* Returns to the start of a step that failed. Whether it is taken again, as an adaptive one of that size was not solved;
- * if not, *status becomes OK where no crossing has room. */
+/* Returns to the start of a step that failed. Whether it is taken again, as an adaptive one of that size was not
+ * solved; if not, *status becomes OK where no crossing has room. */
 static int returns_to(const event_step *step, event_run *run, const event_run *before, const event_watch *watched,
     long long crossed, real size, int *status)
 {
