@@ -158,11 +158,12 @@ class Drawn(NamedTuple):
 
 
 def draw_slide(random: np.random.Generator) -> Drawn:
-    """Return a random slide: a sixth begins on the plane and rests there, or slides; thirds have a plane far away."""
+    """Return a random slide: a third begins on the plane and rests there, or slides; two thirds have it far away."""
     unit, g, m = 10 ** random.uniform(-6, 6), 10 ** random.uniform(-2, 2), 10 ** random.uniform(-2, 2)
-    speed, lands = np.sqrt(g * unit), random.random() > 1 / 6
+    speed, lands = np.sqrt(g * unit), random.random() > 1 / 3
     e, mu = random.choice([0, 1, random.uniform(0, 0.9)], p=[0.3, 0.1, 0.6]), random.uniform(0, 1.5)
-    static, pull = mu * random.choice([1, random.uniform(1, 1.5)]), g * random.uniform(-1.5, 1.5) * random.integers(2)
+    static = mu * random.choice([1, random.uniform(1, 1.5)])
+    pull = g * random.choice([0, random.uniform(-1.5, 1.5), random.uniform(-mu, mu), random.uniform(mu, static)])
     rate, slip, u, w = speed * random.uniform(-1, 1, 4) * random.integers(2, size=4) * [lands, 1, 1, 1]
     o = unit * random.choice([0, 1, -1]) * 10 ** random.uniform(0, 6)
     slide = Slide(g, pull, mu, static, e, unit * random.uniform(0.3, 3) * lands, rate, slip)
