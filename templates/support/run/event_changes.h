@@ -537,7 +537,7 @@ static int settle_part(const event_step *step, long long first, const event_samp
 }
 
 /* Fails if errors of a part up to `at` are too large; notes those of parts of a fixed step. */
-static int judge_part(const event_step *step, event_run *run, const event_sample *left, const event_sample *at,
+static int judge_end(const event_step *step, event_run *run, const event_sample *left, const event_sample *at,
     real part, const step_control *control, int changes)
 {
 #if defined(CONTACTS_VARY) && EVENTS_CONTROLLED
@@ -651,7 +651,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       part *= step->found[group].fraction;
       TRY(refine_crossing(step, group, &right, &at, &part));
     }
-    TRY(judge_part(step, run, &left, stops ? &at : &right, part, control, changes > 0 || acts));
+    TRY(judge_end(step, run, &left, stops ? &at : &right, part, control, changes > 0 || acts));
     step->watch->time += part;
     cut &= !stops;
     if (cut) {
@@ -846,6 +846,8 @@ static int check_energy(const event_step *step, event_run *before, event_run *ru
   contact_terms of;
   contact_mode mode[EVENT_CONTACTS];
   real force[CONTACT_ROWS], after[CONTACT_ROWS], first, last, power = 0.0, allowed, *const v = step->memory + 3 * M;
+  if (!ENERGY_DECREASES)
+    return OK;
   TRY(NAME(energy)(left.t, left.q, left.p, step->own, &first, step->workspace));
   TRY(NAME(energy)(run->t, run->q, run->p, step->own, &last, step->workspace));
   TRY(NAME(velocity)(run->t, run->q, run->p, step->own, v, step->workspace));
@@ -996,6 +998,18 @@ static void undo_changes(const event_step *step, const event_watch *before, long
   *step->filled = first;
 }
 
+#if defined(EVENT_CONTACTS) && EVENTS_CONTROLLED
+/* Control of a step of at most some size, whose tolerance returns to that of the run after one that missed it. */
+static const step_control *limit_step(event_watch *watch, const step_control *control, real most, step_control *limited)
+{
+  *limited = *control;
+  limited->max_step = fmin(control->max_step, most);
+  watch->tolerance *= watch->tolerance > DBL_EPSILON ? 0.5 : 0.0;
+  limited->tolerance = fmax(control->tolerance, watch->tolerance);
+  return limited;
+}
+#endif
+
 /* Begins a step: first modes of a run, slips in space, which allow a *longest step, and sides of kinks. */
 static int begin_step(event_run *run, event_run *before, event_step *step, real t_end, const step_control *control,
     real *longest, real *size)
@@ -1092,14 +1106,8 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
 #ifdef EVENT_CONTACTS
 #if EVENTS_CONTROLLED
     step_control shorter;
-    if (control) {
-      shorter = *control;
-      shorter.max_step = fmin(shorter.max_step, fmin(longest, unsolved));
-      unsolved = INFINITY;
-      watch->tolerance *= watch->tolerance > DBL_EPSILON ? 0.5 : 0.0;
-      shorter.tolerance = fmax(control->tolerance, watch->tolerance);
-      limited = &shorter;
-    }
+    limited = control ? limit_step(watch, control, fmin(longest, unsolved), &shorter) : NULL;
+    unsolved = INFINITY;
 #endif
     status = take_contact_step(status, run, &before, t_end, limited, &step, longest, &size, &count);
 #else
@@ -1109,7 +1117,7 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
     if (status == OK)
       status = change_in_step(&before, run, &step, limited, size, count, &to);
 #if defined(EVENT_CONTACTS) && EVENTS_CONTROLLED
-    if (ENERGY_DECREASES && status == OK && control)
+    if (status == OK && control)
       status = check_energy(&step, &before, run, watched.begun ? watched.mode : watch->mode,
           fmax(control->tolerance, CHANGE_FAIR));
     int opens = 0;
