@@ -1,10 +1,11 @@
-"""Points that fall on a floor come to rest on it, in any units: 200 random falls, beside closed forms."""
+"""Bodies that fall on a plane slide or come to rest on it, in any units: 300 random falls, beside closed forms."""
 
 from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from slides import Slide
 
 import scvi_codegen as sc
 
@@ -123,3 +124,84 @@ def test_rods_that_fall_flat_without_friction_come_to_rest(start: tuple[float, f
     run = rod().integrate(start, velocity=[0, 0], **by)
     assert abs(run.q[-1]).max() <= RESTS
     assert abs(run.velocity[-1]).max() <= RESTS
+
+
+POINTS = {1: 8, 2: 1, 3: 2, 8: 3}
+"""Points of a body that touch together, by the degree of the method."""
+CLEAR = 1e-9
+"""Change of a motion, relative to its size, by a change of 1e-12 of its numbers, above which it is not compared."""
+
+
+@cache
+def sliding_stepper(degree: int) -> Any:
+    """Return the stepper of a body that does not turn, above a plane at o + w t, which moves along itself with u."""
+    contacts = [
+        sc.contact(f"y + d{k} - o - w*t", slip="x_dot - u", friction="mu", static_friction="held", restitution="e")
+        for k in range(POINTS[degree])
+    ]
+    parts = {f"d{k}": 0.0 for k in range(POINTS[degree])}
+    numbers = dict.fromkeys(("o", "w", "u", "mu", "held", "e", "pull"), 0.0) | {"m": 1.0, "g": 1.0} | parts
+    text = "m*(x_dot**2 + y_dot**2)/2 - m*g*y + m*pull*x"
+    body = sc.LagrangianSystem.from_text("body", ["x", "y"], text, parameters=numbers, contacts=contacts)
+    return sc.compile_stepper(body, f"svi:{degree}")
+
+
+class Drawn(NamedTuple):
+    """A slide with its unit of length, the mass of the body, the place of the plane and its velocity."""
+
+    slide: Slide
+    unit: float
+    m: float
+    o: float
+    u: float
+    w: float
+
+
+def draw_slide(random: np.random.Generator) -> Drawn:
+    """Return a random slide: a third begins on the plane and rests there, or slides; two thirds have it far away."""
+    unit, g, m = 10 ** random.uniform(-6, 6), 10 ** random.uniform(-2, 2), 10 ** random.uniform(-2, 2)
+    speed, lands = np.sqrt(g * unit), random.random() > 1 / 3
+    e, mu = random.choice([0, 1, random.uniform(0, 0.9)], p=[0.3, 0.1, 0.6]), random.uniform(0, 1.5)
+    static = mu * random.choice([1, random.uniform(1, 1.5)])
+    pull = g * random.choice([0, random.uniform(-1.5, 1.5), random.uniform(-mu, mu), random.uniform(mu, static)])
+    rate, slip, u, w = speed * random.uniform(-1, 1, 4) * random.integers(2, size=4) * [lands, 1, 1, 1]
+    o = unit * random.choice([0, 1, -1]) * 10 ** random.uniform(0, 6)
+    slide = Slide(g, pull, mu, static, e, unit * random.uniform(0.3, 3) * lands, rate, slip)
+    return Drawn(slide, unit, m, o, u, w)
+
+
+@pytest.mark.second
+@pytest.mark.filterwarnings("ignore:the contacts depend")
+@pytest.mark.parametrize("degree", POINTS)
+def test_bodies_fall_slide_and_rest_on_planes_that_move(degree: int) -> None:
+    """25 each, fixed steps and adaptive ones (not of svi:1), in ensembles too, from any origin, beside closed forms."""
+    random, stepper, compared = np.random.default_rng(degree), sliding_stepper(degree), 0
+    for k in range(25):
+        drawn = draw_slide(random)
+        slide, unit, m, o, u, w = drawn
+        duration = np.sqrt(2 * unit / slide.g) * random.uniform(1, 8)
+        numbers = {"g": slide.g, "pull": slide.pull, "mu": slide.mu, "held": slide.static, "e": slide.e}
+        numbers |= {"m": m, "o": o, "u": u, "w": w}
+        start = {"q": [0.0, o + slide.height], "velocity": [slide.slip + u, slide.rate + w]}
+        slide = slide._replace(height=start["q"][1] - o)
+        by = {"h": duration / random.integers(5, 40)} if degree == 1 or k % 2 else {}
+        run = stepper.integrate(**start, parameters=numbers, t_end=duration, **by)
+        x, rate, height = slide.after(duration)
+        way = abs(slide.slip + u) * duration + slide.g * duration**2 + unit
+        nudged = slide._replace(**{name: value * (1 + 1e-12) for name, value in slide._asdict().items()})
+        case = f"{drawn}, {by}, {duration}"
+        lowest = np.min(run.q[:, 1] - o - w * run.t)
+        within = TAIL * np.sqrt(1 + (abs(o) + abs(w) * duration) / unit)
+        assert lowest >= -within * unit, case
+        assert len(run) < 1e5, case
+        if np.max(np.abs(np.subtract(nudged.after(duration), (x, rate, height)))) > CLEAR * way:
+            continue
+        compared += 1
+        assert abs(run.q[-1, 0] - x - u * duration) <= within * way, case
+        assert abs(run.q[-1, 1] - o - w * duration - height) <= within * way, case
+        if k % 5 == 0:
+            member = stepper.integrate_ensemble(
+                [start["q"]], velocity=[start["velocity"]], parameters=numbers, t_end=duration, **by
+            )[0]
+            assert np.array_equal(member.q[-1], run.q[-1]), case
+    assert compared >= 0.7 * 25

@@ -298,50 +298,65 @@ static int keeps_direction(const real *start, const real *w)
   return length_of(start, 2) > length_of(w, 2) * length_of(w, 2);
 }
 
+/* Sets what the state allows a contact, and whether a slip keeps its `present` direction: friction would jump to that
+ * of the rate. Fails where a coefficient is impossible. */
+static int allow_present(const event_step *step, const contact_terms *of, const contact_change *now,
+    const contact_mode *present, int k, contact_roles *in, int *directed)
+{
+  const real *const start = step->watch->mode + CONTACTS[k].direction + 1, *const d = present->direction;
+  const int slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
+  real impossible = 0.0;
+  allow_modes(of, k, now, step->watch->fastest[k], in);
+  const int is_still = in->is_slow[k] && length_of(of->rate + slip, slips) <= CONTACT_ROUNDING * of->speed[slip];
+  const int reason = in->is_free[k] ? 0 : impossible_reason(of, k, is_still, 0, &impossible);
+  if (reason)
+    return refuse(step, reason, k, impossible);
+  *directed = slips == 2 && in->role[k].closed && !in->is_slow[k] && start[-1] != 0.0 && !present->held &&
+      keeps_direction(start, of->rate + slip);
+  for (int i = 0; *directed && i < 2; i++)
+    in->role[k].direction[i] = d[i] / length_of(d, 2);
+  return OK;
+}
+
+/* The mode of a contact with the rows that are imposed, of which others determine the rest, and its second rates. */
+static contact_mode mode_by_rows(const contact_terms *of, contact_mode mode, int k, const int *imposed,
+    const real *second)
+{
+  const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, all = (1 << CONTACTS[k].slips) - 1;
+  int sticks = 0;
+  for (int i = 0; i < CONTACTS[k].slips && mode.sticks; i++)
+    sticks |= imposed[slip + i] << i;
+  if (!mode.closed && normal >= 0 && second[normal] > rounding_at_row(of, second, normal))
+    mode.held = 0; /* leaves, as straight legs bend */
+  if (mode.closed && normal >= 0 && !imposed[normal])
+    mode.held |= CONTACT_LOADED;
+  if (mode.sticks && sticks != all)
+    mode.held |= CONTACT_STUCK;
+  mode.sticks = sticks;
+  return mode;
+}
+
 /* Sets the consistent modes at a state that stick most, of redundant contacts those near given forces. */
 static int choose_modes(const event_step *step, const contact_terms *of, const contact_change *now, real *force)
 {
   contact_roles in = {.lifts = now->lifts};
-  contact_mode best[EVENT_CONTACTS], other[EVENT_CONTACTS];
-  real second[CONTACT_ROWS], impossible = 0.0;
+  contact_mode present[EVENT_CONTACTS], best[EVENT_CONTACTS], other[EVENT_CONTACTS];
+  real second[CONTACT_ROWS];
   int imposed[CONTACT_ROWS] = {0}, directed[EVENT_CONTACTS] = {0};
-  contact_mode present[EVENT_CONTACTS];
   modes_at(of, step->watch->mode, present);
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    allow_modes(of, k, now, step->watch->fastest[k], &in);
-    const real *const start = step->watch->mode + CONTACTS[k].direction + 1, *const d = present[k].direction;
-    const int slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
-    const int is_still = in.is_slow[k] && length_of(of->rate + slip, slips) <= CONTACT_ROUNDING * of->speed[slip];
-    const int reason = in.is_free[k] ? 0 : impossible_reason(of, k, is_still, 0, &impossible);
-    if (reason)
-      return refuse(step, reason, k, impossible);
-    directed[k] = slips == 2 && in.role[k].closed && !in.is_slow[k] && start[-1] != 0.0 && !present[k].held &&
-        keeps_direction(start, of->rate + slip);
-    for (int i = 0; directed[k] && i < 2; i++)
-      in.role[k].direction[i] = d[i] / length_of(d, 2); /* friction would jump to that of the rate */
-  }
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    TRY(allow_present(step, of, now, present + k, k, &in, directed + k));
   if (!solve_modes(of, &in, force, best))
     return refuse(step, CONTACT_WITHOUT_MODE, -1, 0.0);
   solve_contacts(of, best, of->second, force, second, imposed);
   step->watch->ambiguous |= find_others(of, &in, best, second, other);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential;
-    const int is_slow = in.is_slow[k];
+    const int slip = CONTACTS[k].tangential, is_slow = in.is_slow[k];
     real speed = slip < 0 ? 0.0 : of->speed[slip]; /* and that by forces that cancel */
-    int sticks = 0;
-    for (int i = 0; i < CONTACTS[k].slips && best[k].sticks; i++)
-      sticks |= imposed[slip + i] << i;
-    if (!best[k].closed && normal >= 0 && second[normal] > rounding_at_row(of, second, normal))
-      best[k].held = 0; /* leaves, as straight legs bend */
-    if (best[k].closed && normal >= 0 && !imposed[normal])
-      best[k].held |= CONTACT_LOADED;
-    if (best[k].sticks && sticks != (1 << CONTACTS[k].slips) - 1)
-      best[k].held |= CONTACT_STUCK;
-    best[k].sticks = sticks;
     for (int j = 0; j < CONTACT_ROWS && slip >= 0; j++)
       speed += fabs(of->W[slip * CONTACT_ROWS + j] * force[j] * step->whole);
     const real *const w = is_slow || directed[k] || slip < 0 ? AT_REST : of->rate + slip;
-    put_mode(CONTACTS + k, best[k], w, speed, step->watch->mode);
+    put_mode(CONTACTS + k, mode_by_rows(of, best[k], k, imposed, second), w, speed, step->watch->mode);
     if (is_slow)
       step->watch->fastest[k] = fmax(step->watch->fastest[k], speed);
     step->watch->part[k] = (is_slow ? CONTACT_BEGIN : 1.0) * fabs(step->whole);

@@ -261,6 +261,15 @@ static slip_pace pace_of(const event_step *step, const contact_terms *of, int k,
   return pace;
 }
 
+/* Gives a slip w the direction of its rate, or if that is 0 its own; `keeps`: in the next part of a step. */
+static void renew_direction(const event_step *step, int k, const real *w, real *direction, int keeps)
+{
+  const real speed = length_of(w, 2);
+  for (int i = 0; speed > 0.0 && i < 2; i++)
+    direction[i] = w[i] / speed;
+  direct_slip(step, k, direction, direction, keeps);
+}
+
 /* Slips in space at the beginning of a part of a step, of at most *longest. Where they stop and where they begin
  * solutions are not smooth: parts are in proportion to |w|/|w'|, and to the time |w|/(W tau) in which the direction
  * relaxes to that of other forces. Slow ones that stop or begin by a jump of friction keep their direction, and those
@@ -298,19 +307,15 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
   part = fmin(stopping ? uncut : part, *longest);
   if (changes)
     TRY(add_change(step, FIRST_TRANSITION, at));
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const real *const w = of.rate + CONTACTS[k].tangential;
-    if (!pace[k].renews || turns[k])
-      continue;
-    for (int i = 0; length_of(w, 2) > 0.0 && i < 2; i++)
-      mode[k].direction[i] = w[i] / length_of(w, 2);
-    direct_slip(step, k, mode[k].direction, mode[k].direction, pace[k].keeps);
-  }
-  if (turning)
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    if (pace[k].renews && !turns[k])
+      renew_direction(step, k, of.rate + CONTACTS[k].tangential, mode[k].direction, pace[k].keeps);
+  if (turning) {
     status = turn_slips(step, at, &of, turns, mode, &part);
+    *longest = part;
+  }
   if (status != OK)
     --*step->filled; /* the part is taken again */
-  *longest = turning ? part : *longest;
   put_modes(step->watch->mode, step->own);
   return status;
 }

@@ -129,35 +129,44 @@ static int remove_residuals(const event_step *step, event_sample *at, contact_te
   return any ? settle(step, at, of, now) : OK;
 }
 
+/* Notes which contacts were closed, and by their modes and transitions which touch and rest, and whether a contact that
+ * meets approaches, also one that just does not close yet. Fails where a coefficient is impossible. */
+static int begin_change(const event_step *step, const contact_terms *of, contact_change *now, int *closed,
+    int *approach)
+{
+  real impossible = 0.0;
+  *approach = 0;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const contact_mode mode = mode_of(step->watch->mode, k);
+    if (CONTACTS[k].slips > 0)
+      step->watch->fastest[k] = fmax(step->watch->fastest[k], of->speed[CONTACTS[k].tangential]);
+    closed[k] = CONTACTS[k].normal >= 0 && mode.closed && !now->leaves[k];
+    now->touches[k] |= closed[k];
+    now->rests[k] = mode.sticks || (mode.closed && mode.held) || (now->stops[k] && stops_at(step, of, k));
+    now->rests[k] &= !now->begins[k];
+    const int meets = is_met(of, now, closed, k), acts = meets || (mode.closed && !now->leaves[k]);
+    const int reason = acts ? impossible_reason(of, k, 0, meets, &impossible) : 0;
+    if (reason)
+      return refuse(step, reason, k, impossible);
+    *approach |= meets &&
+        of->rate[CONTACTS[k].normal] < (now->closes[k] ? 0.0 : -CONTACT_ROUNDING * of->speed[CONTACTS[k].normal]);
+  }
+  return OK;
+}
+
 /* Impacts and new modes at a state, which is projected onto their constraints. That may turn slow slips, and modes are
  * chosen again if it reverses these or makes forces impossible; none that remain so are kept. */
 static int change_modes(const event_step *step, event_sample *at, contact_change *now)
 {
   contact_terms of;
   contact_mode present[EVENT_CONTACTS];
-  real force[CONTACT_ROWS];
   const real none[CONTACT_ROWS] = {0.0};
-  real before[CONTACT_ROWS], impossible = 0.0;
-  int closed[EVENT_CONTACTS], outside[EVENT_CONTACTS], approach = 0, first = 0;
+  real force[CONTACT_ROWS], before[CONTACT_ROWS];
+  int closed[EVENT_CONTACTS], outside[EVENT_CONTACTS], approach, first = 0;
   step->report->t = at->t;
   TRY(terms_at(step, at, &of));
   memcpy(before, of.value, sizeof before);
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const contact_mode mode = mode_of(step->watch->mode, k);
-    if (CONTACTS[k].slips > 0)
-      step->watch->fastest[k] = fmax(step->watch->fastest[k], of.speed[CONTACTS[k].tangential]);
-    closed[k] = CONTACTS[k].normal >= 0 && mode.closed && !now->leaves[k];
-    now->touches[k] |= closed[k];
-    now->rests[k] = mode.sticks || (mode.closed && mode.held) || (now->stops[k] && stops_at(step, &of, k));
-    now->rests[k] &= !now->begins[k];
-    const int meets = is_met(&of, now, closed, k);
-    const int acts = meets || (mode.closed && !now->leaves[k]);
-    const int reason = acts ? impossible_reason(&of, k, 0, meets, &impossible) : 0;
-    if (reason)
-      return refuse(step, reason, k, impossible);
-    approach |= meets && /* also one that just does not close yet */
-        of.rate[CONTACTS[k].normal] < (now->closes[k] ? 0.0 : -CONTACT_ROUNDING * of.speed[CONTACTS[k].normal]);
-  }
+  TRY(begin_change(step, &of, now, closed, &approach));
   forces_at(at->t, at->q, at->p, step->own, present, force, step->workspace);
   if (approach)
     TRY(collide(step, at, &of, closed, none, now));

@@ -512,14 +512,87 @@ static long long last_state(const event_step *step, long long first)
   return first;
 }
 
+#ifdef EVENT_CONTACTS
+/* Whether an unsolved part of a fixed step is taken again: a half of it, or whole without a contact that others nearly
+ * hold. */
+static int takes_again(const event_step *step, event_sample *left, real part, real *longest, int *again)
+{
+  *longest = 0.5 * fabs(part);
+  *again = *longest > CONTACT_UNSOLVED * fabs(step->whole);
+  if (*again)
+    return OK;
+  *longest = INFINITY;
+  return open_nearly_held(step, left, again);
+}
+#endif
+
+/* Finds the crossings of a part of a step, those from `first` on, up to its end `right`. */
+static int settle_part(const event_step *step, long long first, const event_sample *right)
+{
+#ifdef EVENT_CONTACTS
+  TRY(end_modes_at_start(step, right));
+#endif
+  (void)right;
+  return settle_crossings(step, first);
+}
+
+/* Fails if errors of a part up to `at` are too large; notes those of parts of a fixed step. */
+static int judge_end(const event_step *step, event_run *run, const event_sample *left, const event_sample *at,
+    real part, const step_control *control, int changes)
+{
+#if defined(CONTACTS_VARY) && EVENTS_CONTROLLED
+  if (control)
+    TRY(judge_slips(step, left, at, part, control->tolerance));
+#endif
+#ifdef EVENT_KINKS
+  if (!control && changes)
+    TRY(observe_part(run, step, left, part));
+#endif
+  (void)step, (void)run, (void)left, (void)at, (void)part, (void)control, (void)changes;
+  return OK;
+}
+
+/* Changes the state at the start of a run, of which a step of some length ends at `right`; *starts: whether there are
+ * changes, *ends: whether the step ends with them. */
+static int change_start(const event_run *before, event_run *run, event_step *step, int adaptive, real length,
+    const stored_states *to, event_sample *left, event_sample *right, int *starts, int *ends)
+{
+  *starts = *ends = 0;
+  if (before->step == 0 && ANY_IMPACTS)
+    TRY(change_at_start(step, left, starts));
+  if (!*starts)
+    return OK;
+  TRY(store_state(to, left, 0.0, 0, adaptive ? before->step + 1 : -1, step->report));
+  *ends = adaptive || step->watch->ended;
+  if (*ends) {
+    end_at_change(run, before, left, 0, adaptive);
+    return OK;
+  }
+  TRY(evaluate_functions(step, left, values_at(step, 0)));
+  return step_from_left(step, left, length, right);
+}
+
+/* Stores the state after a part of a step of which a length is left; *ends: whether the step ends there. */
+static int end_part(const event_run *before, event_run *run, event_step *step, int adaptive, real length, real part,
+    int iterations, const stored_states *to, event_sample *at, int *ends)
+{
+  const int is_last = fabs(length) <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->whole);
+  const long long within = adaptive ? before->step + 1 : -1;
+  at->t = is_last && !step->watch->ended ? run->t : at->t; /* which output times may equal */
+  TRY(store_state(to, at, part, is_last ? iterations : 0, is_last ? run->step : within, step->report));
+  *ends = is_last || adaptive || step->watch->ended;
+  if (*ends)
+    end_at_change(run, before, at, is_last, adaptive);
+  return OK;
+}
+
 /* Searches a step of a run that was at `before`, changes the state at crossings and continues the step: one of an
  * adaptive run with `control`. */
 static int change_in_step(const event_run *before, event_run *run, event_step *step, const step_control *control,
     real length, int iterations, const stored_states *to)
 {
   const int adaptive = control != NULL;
-  const long long within = adaptive ? before->step + 1 : -1;
-  int starts = 0;
+  int starts, ends;
   real *const states = step->memory + 9 * M;
   event_sample left = {.t = before->t, .q = states, .p = states + M};
   event_sample right = {.fraction = 1.0, .t = run->t, .q = states + 2 * M, .p = states + 3 * M};
@@ -533,31 +606,20 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
   copy_state(left.q, left.p, before->q, before->p);
   copy_state(right.q, right.p, run->q, run->p);
   TRY(evaluate_functions(step, &left, values_at(step, 0)));
-  if (before->step == 0 && ANY_IMPACTS)
-    TRY(change_at_start(step, &left, &starts));
-  if (starts) {
-    TRY(store_state(to, &left, 0.0, 0, within, step->report));
-    if (adaptive || step->watch->ended) {
-      end_at_change(run, before, &left, 0, adaptive);
-      return OK;
-    }
-    TRY(evaluate_functions(step, &left, values_at(step, 0)));
-    TRY(step_from_left(step, &left, length, &right));
-  }
-  for (int changes = starts;; changes++) {
+  TRY(change_start(before, run, step, adaptive, length, to, &left, &right, &starts, &ends));
+  for (int changes = starts; !ends; changes++) {
     event_sample at = {.q = states + 4 * M, .p = states + 5 * M};
     real part = length;
-    int acts = 0, ends, cut = 0, status = OK;
+    int acts = 0, cut = 0, status = OK;
 #ifdef EVENT_CONTACTS
     if (!adaptive)
       status = shorten_part(step, &left, &right, run, changes, longest, &part);
     cut = part != length;
 #endif
-    const real span = part;
     const long long first = *step->filled;
     long long group = first;
     step->t = left.t;
-    step->h = span;
+    step->h = part;
     step->q = left.q;
     step->p = left.p;
     if (status == OK)
@@ -565,24 +627,16 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
 #ifdef EVENT_CONTACTS
     longest = INFINITY;
     if (!adaptive && may_be_halved(step, status, part, 0.0)) {
-      int opens = 0;
+      int again;
       *step->filled = first;
-      longest = 0.5 * fabs(part);
-      if (longest <= CONTACT_UNSOLVED * fabs(step->whole)) {
-        TRY(open_nearly_held(step, &left, &opens));
-        longest = INFINITY;
-      }
-      if (opens || longest < INFINITY)
+      TRY(takes_again(step, &left, part, &longest, &again));
+      if (again)
         continue;
     }
 #endif
     step->rounding_known |= !step->watch->started;
-#ifdef EVENT_CONTACTS
     if (status == OK)
-      status = end_modes_at_start(step, &right);
-#endif
-    if (status == OK)
-      status = settle_crossings(step, first);
+      status = settle_part(step, first, &right);
     if (status == NOT_CONVERGED && step->watch->accumulated) {
       step->watch->ended = 1; /* the start of this part is where crossings accumulate */
       end_at_change(run, before, &left, 0, 0);
@@ -591,25 +645,19 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     TRY(status);
     for (long long i = first; i < *step->filled; i++)
       acts |= step->watch->acts[step->found[i].function];
-    if (acts || step->watch->ended) {
+    const int stops = acts || step->watch->ended;
+    if (stops) {
       group = last_state(step, first);
       part *= step->found[group].fraction;
       TRY(refine_crossing(step, group, &right, &at, &part));
     }
-#if defined(CONTACTS_VARY) && EVENTS_CONTROLLED
-    if (adaptive)
-      TRY(judge_slips(step, &left, acts || step->watch->ended ? &at : &right, part, control->tolerance));
-#endif
-#ifdef EVENT_KINKS
-    if (!adaptive && (changes > 0 || acts))
-      TRY(observe_part(run, step, &left, part));
-#endif
+    TRY(judge_end(step, run, &left, stops ? &at : &right, part, control, changes > 0 || acts));
     step->watch->time += part;
-    cut &= !acts && !step->watch->ended;
+    cut &= !stops;
     if (cut) {
       at.t = right.t;
       copy_state(at.q, at.p, right.q, right.p);
-    } else if (!acts && !step->watch->ended) {
+    } else if (!stops) {
       step->watch->started = 1;
       if (changes > 0)
         set_run(run, run->t, &right);
@@ -623,17 +671,13 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     if (!cut)
       TRY(change_at(step, group, &at));
     length -= part;
-    ends = fabs(length) <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->whole);
-    at.t = ends && !step->watch->ended ? run->t : at.t; /* which output times may equal */
-    TRY(store_state(to, &at, part, ends ? iterations : 0, ends ? run->step : within, step->report));
-    if (!ends && changes == CHANGES_IN_STEP) {
+    step->watch->started = cut;
+    TRY(end_part(before, run, step, adaptive, length, part, iterations, to, &at, &ends));
+    if (ends)
+      return OK;
+    if (changes == CHANGES_IN_STEP) {
       step->watch->jammed = step->found[group].function + 1;
       return NOT_CONVERGED;
-    }
-    step->watch->started = cut;
-    if (ends || adaptive || step->watch->ended) {
-      end_at_change(run, before, &at, ends, adaptive);
-      return OK;
     }
     left.t = at.t;
     copy_state(left.q, left.p, at.q, at.p);
@@ -642,6 +686,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     TRY(step_from_left(step, &left, length, &right));
 #endif
   }
+  return OK;
 }
 
 #ifdef EVENT_CONTACTS
@@ -801,6 +846,8 @@ static int check_energy(const event_step *step, event_run *before, event_run *ru
   contact_terms of;
   contact_mode mode[EVENT_CONTACTS];
   real force[CONTACT_ROWS], after[CONTACT_ROWS], first, last, power = 0.0, allowed, *const v = step->memory + 3 * M;
+  if (!ENERGY_DECREASES)
+    return OK;
   TRY(NAME(energy)(left.t, left.q, left.p, step->own, &first, step->workspace));
   TRY(NAME(energy)(run->t, run->q, run->p, step->own, &last, step->workspace));
   TRY(NAME(velocity)(run->t, run->q, run->p, step->own, v, step->workspace));
@@ -951,6 +998,75 @@ static void undo_changes(const event_step *step, const event_watch *before, long
   *step->filled = first;
 }
 
+#if defined(EVENT_CONTACTS) && EVENTS_CONTROLLED
+/* Control of a step of at most some size, whose tolerance returns to that of the run after one that missed it. */
+static const step_control *limit_step(event_watch *watch, const step_control *control, real most, step_control *limited)
+{
+  *limited = *control;
+  limited->max_step = fmin(control->max_step, most);
+  watch->tolerance *= watch->tolerance > DBL_EPSILON ? 0.5 : 0.0;
+  limited->tolerance = fmax(control->tolerance, watch->tolerance);
+  return limited;
+}
+#endif
+
+/* Begins a step: first modes of a run, slips in space, which allow a *longest step, and sides of kinks. */
+static int begin_step(event_run *run, event_run *before, event_step *step, real t_end, const step_control *control,
+    real *longest, real *size)
+{
+  int status = OK;
+#ifdef CONTACTS_IN_SPACE
+  event_watch *const watch = step->watch;
+  event_sample now = {.t = run->t, .q = run->q, .p = run->p};
+  *longest = fabs(run->h);
+#if EVENTS_CONTROLLED
+  const real unknown_size = watch->pace > 0.0 ? watch->pace : fabs(t_end - run->t);
+  if (control) /* the size that the controller has found */
+    *longest = run->error_before > 0 ? exp2((real)run->grid_level / 4.0) : unknown_size;
+#endif
+  step->whole = fmax(*longest, watch->pace);
+#endif
+#ifdef EVENT_MODES
+  if (!step->watch->begun)
+    status = begin_run(run, step, control ? t_end - run->t : run->h);
+  put_modes(step->watch->mode, step->own);
+#endif
+#ifdef CONTACTS_IN_SPACE
+  if (status == OK)
+    status = renew_slips(step, &now, longest);
+#endif
+  keep_run(before, run, step->values + (long long)EVENT_VALUES * EVENTS);
+#ifdef EVENT_KINKS
+  *size = run->h;
+  if (status == OK)
+    status = begin_at_kinks(run, before, step, t_end, control, size);
+#endif
+  (void)t_end, (void)control, (void)longest, (void)size;
+  return status;
+}
+
+/* Returns to the start of a step that failed. Whether it is taken again, as an adaptive one of that size was not
+ * solved; if not, *status becomes OK where no crossing has room. */
+static int returns_to(const event_step *step, event_run *run, const event_run *before, const event_watch *watched,
+    long long crossed, real size, int *status)
+{
+  int again = 0;
+#ifdef EVENT_CONTACTS
+  again = may_be_halved(step, *status, size, step->watch->pace);
+  if (step->watch->gain > 0.0 && !again)
+    refuse(step, CONTACT_CREATES_ENERGY, -1, step->watch->gain);
+#endif
+  (void)size;
+  copy_run(run, before);
+  if (again || *status == EVENT_NO_ROOM) {
+    undo_changes(step, watched, crossed);
+    *status = OK;
+  } else {
+    *step->filled = crossed;
+  }
+  return again;
+}
+
 int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, const step_control *control,
     long long steps, const real *parameters, const solver_options *options, long long states, real *t, real *q, real *p,
     real *length, int *iterations, long long *number, long long room, event_crossing *found, long long *filled,
@@ -984,46 +1100,14 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
         memory, memory + 15 * M, 0, &horizon, own};
     real size = 0.0;
     int count = 0;
-#ifdef EVENT_CONTACTS
     real longest = INFINITY;
-#endif
-#ifdef CONTACTS_IN_SPACE
-    event_sample now = {.t = run->t, .q = run->q, .p = run->p};
-    longest = fabs(run->h);
-#if EVENTS_CONTROLLED
-    const real unknown_size = watch->pace > 0.0 ? watch->pace : fabs(t_end - run->t);
-    if (control) /* the size that the controller has found */
-      longest = run->error_before > 0 ? exp2((real)run->grid_level / 4.0) : unknown_size;
-#endif
-    step.whole = fmax(longest, watch->pace);
-#endif
-#ifdef EVENT_MODES
-    if (!watch->begun)
-      status = begin_run(run, &step, control ? t_end - run->t : run->h);
-    put_modes(watch->mode, own);
-#endif
-#ifdef CONTACTS_IN_SPACE
-    if (status == OK)
-      status = renew_slips(&step, &now, &longest);
-#endif
-    keep_run(&before, run, step.values + (long long)EVENT_VALUES * EVENTS);
-#ifdef EVENT_KINKS
-    size = run->h;
-    if (status == OK)
-      status = begin_at_kinks(run, &before, &step, t_end, control, &size);
-#endif
+    status = begin_step(run, &before, &step, t_end, control, &longest, &size);
     const step_control *limited = control;
 #ifdef EVENT_CONTACTS
 #if EVENTS_CONTROLLED
     step_control shorter;
-    if (control) {
-      shorter = *control;
-      shorter.max_step = fmin(shorter.max_step, fmin(longest, unsolved));
-      unsolved = INFINITY;
-      watch->tolerance *= watch->tolerance > DBL_EPSILON ? 0.5 : 0.0;
-      shorter.tolerance = fmax(control->tolerance, watch->tolerance);
-      limited = &shorter;
-    }
+    limited = control ? limit_step(watch, control, fmin(longest, unsolved), &shorter) : NULL;
+    unsolved = INFINITY;
 #endif
     status = take_contact_step(status, run, &before, t_end, limited, &step, longest, &size, &count);
 #else
@@ -1033,7 +1117,7 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
     if (status == OK)
       status = change_in_step(&before, run, &step, limited, size, count, &to);
 #if defined(EVENT_CONTACTS) && EVENTS_CONTROLLED
-    if (ENERGY_DECREASES && status == OK && control)
+    if (status == OK && control)
       status = check_energy(&step, &before, run, watched.begun ? watched.mode : watch->mode,
           fmax(control->tolerance, CHANGE_FAIR));
     int opens = 0;
@@ -1043,25 +1127,12 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
       continue;
 #endif
     if (status != OK) {
-      int again = 0;
-#ifdef EVENT_CONTACTS
-#if EVENTS_CONTROLLED
+      report->stored = kept;
+#if defined(EVENT_CONTACTS) && EVENTS_CONTROLLED
       unsolved = 0.5 * size;
 #endif
-      again = control && may_be_halved(&step, status, size, watch->pace);
-      if (watch->gain > 0.0 && !again)
-        refuse(&step, CONTACT_CREATES_ENERGY, -1, watch->gain);
-#endif
-      copy_run(run, &before);
-      report->stored = kept;
-      if (status == EVENT_NO_ROOM || again) {
-        undo_changes(&step, &watched, crossed);
-        status = OK;
-        if (again)
-          continue;
-        return OK;
-      }
-      *filled = crossed;
+      if (returns_to(&step, run, &before, &watched, crossed, control ? size : 0.0, &status))
+        continue;
       if (status > STATUS(SPURIOUS_SOLUTION))
         *watch = initial; /* the call is repeated */
       return status;
