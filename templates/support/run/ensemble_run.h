@@ -46,17 +46,13 @@ static void add_increments(lanes *x, lanes *carry, const lanes *increment, const
 /* x + carry += increment with its low word, in double-double arithmetic, in active lanes. */
 static void add_increments(lanes *x, lanes *carry, const lanes *increment, const real *active)
 {
+  lanes advanced;
+  memcpy(&advanced, active, sizeof advanced);
   for (int i = 0; i < M; i++) {
-    const lane_view old = {x[i]}, old_carry = {carry[i]};
     const lanes sum = x[i] + increment[i], part = sum - x[i];
     const lanes rest = ((x[i] - (sum - part)) + (increment[i] - part)) + (carry[i] + increment[M + i]);
-    lane_view new_x = {sum + rest}, new_carry = {rest - ((sum + rest) - sum)};
-    for (int j = 0; j < LANES; j++) {
-      new_x.lane[j] = active[j] > 0.0 ? new_x.lane[j] : old.lane[j];
-      new_carry.lane[j] = active[j] > 0.0 ? new_carry.lane[j] : old_carry.lane[j];
-    }
-    x[i] = new_x.all;
-    carry[i] = new_carry.all;
+    carry[i] = lanes_selected(advanced, rest - ((sum + rest) - sum), carry[i]);
+    x[i] = lanes_selected(advanced, sum + rest, x[i]);
   }
 }
 #endif
