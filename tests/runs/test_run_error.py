@@ -69,6 +69,89 @@ def test_errors_have_sign_and_size(method):
         assert off <= 4e-16 * (abs(c) + length) * 4.0
 
 
+POWERS = {
+    "inertia": (-2, 0),
+    "coupling": (0, 0),
+    "field": (0, -1),
+    "loss": (0, -1),
+    "push": (1, -2),
+    "rate": (0, -1),
+    "a": (0, -2),
+    "b": (0, -2),
+    "d": (-2, -2),
+    "f": (-2, -2),
+    "g": (-1, -2),
+}
+"""Powers of the units of length and time that the parameters of ``random_system`` have, for masses of 1."""
+
+
+@cache
+def random_system(method):
+    """Return the stepper of a mass matrix, a magnetic field, a potential, damping and a force, all by parameters."""
+    formula = (
+        "x_dot**2/2 + (1 + inertia*x**2)*y_dot**2/2 + coupling*x_dot*y_dot + field*(x*y_dot - y*x_dot)/2"
+        " - (a*x**2 + b*y**2)/2 - (d*x**4 + f*y**4)/4 - g*x**2*y + push*x*cos(rate*t)"
+    )
+    damped = {"dissipation": "loss*(x_dot**2 + y_dot**2)/2"}
+    return sc.compile_stepper(lagrange("random", "x y", formula, **damped, **dict.fromkeys(POWERS, 0.0)), method)
+
+
+def end_by_hand(q, v, end, of):
+    """Return positions and momenta at the end, by DOP853 of the equations of ``random_system``, to about 1e-12."""
+
+    def rates(t, z):
+        x, y, u, w = z
+        force = [
+            of["inertia"] * x * w**2 + of["field"] * w - of["loss"] * u + of["push"] * math.cos(of["rate"] * t),
+            -2.0 * of["inertia"] * x * u * w - of["field"] * u - of["loss"] * w,
+        ]
+        force[0] -= of["a"] * x + of["d"] * x**3 + 2.0 * of["g"] * x * y
+        force[1] -= of["b"] * y + of["f"] * y**3 + of["g"] * x**2
+        return [u, w, *np.linalg.solve([[1.0, of["coupling"]], [of["coupling"], 1.0 + of["inertia"] * x**2]], force)]
+
+    x, y, u, w = solve_ivp(rates, (0.0, end), [*q, *v], method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
+    p_x = u + of["coupling"] * w - of["field"] * y / 2.0
+    return np.array([x, y, p_x, (1.0 + of["inertia"] * x**2) * w + of["coupling"] * u + of["field"] * x / 2.0])
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("method", ["svi:4", "svi:8", "gauss:3"])
+def test_statements_on_errors_hold_for_random_systems(method):
+    """Random systems, states, tolerances, units and directions: sign and size, bounds, corrections, rows, ``error=``.
+
+    Errors to 1 %, their bounds at least half of the truth, corrected states a hundred times as accurate, the same
+    errors where states are saved seldom, and ``error=`` in at most two runs, whose error it bounds.
+    """
+    random, stepper = np.random.default_rng(91), random_system(method)
+    for _ in range(8):
+        of = {name: random.uniform(0.0, 0.9) for name in POWERS} | {"g": random.uniform(0.0, 0.3)}
+        q, v = random.uniform(-1.0, 1.0, (2, 2))
+        end, tolerance = random.choice([-12.0, 12.0]), 10.0 ** random.uniform(-8.0, -4.0)
+        of["loss"] *= 0.1 if end < 0.0 else 1.0  # else growth backward is that of the truth, too
+        exact, (length, time) = end_by_hand(q, v, end, of), 10.0 ** random.uniform(-6.0, 6.0, 2)
+        values = {name: of[name] * length**i * time**j for name, (i, j) in POWERS.items()}
+        motion = {"velocity": v * length / time, "parameters": values, "t_end": end * time}
+        runs = [
+            stepper.integrate(q * length, **motion, tolerance=tolerance, save_every=k, check_growth=False)
+            for k in (1, 7, 10**6)
+        ]
+        confirmed = stepper.integrate(q * length, **motion, error=1e-9)
+        units = np.array([length, length, length / time, length / time])
+        sizes = runs[0].error.sizes.ravel() / units
+
+        def at_end(states, units=units):
+            return np.r_[np.asarray(states.q)[-1], np.asarray(states.p)[-1]] / units
+
+        true, (error, *seldom) = at_end(runs[0]) - exact, (at_end(run.error) for run in runs)
+        size = np.abs(true / sizes).max()
+        assert np.abs((error - true) / sizes).max() <= 1e-2 * size + 1e-11, (of, tolerance)
+        assert 0.5 * size <= runs[0].error.relative[-1], (of, tolerance)
+        assert np.abs((at_end(runs[0].corrected) - exact) / sizes).max() <= 1e-2 * size + 1e-11, (of, tolerance)
+        assert np.abs((np.array(seldom) - error) / sizes).max() <= 1e-3 * size + 1e-13, (of, tolerance)
+        assert confirmed.confirmation.runs <= 2
+        assert np.abs((at_end(confirmed) - exact) / sizes).max() <= confirmed.global_error + 1e-11 <= 2e-9
+
+
 @pytest.mark.second
 def test_what_iterations_leave_does_not_grow_at_pericentres():
     """Nine orbits of eccentricity 0.99: with 1e-3 of transported errors left by iterations they are half too large."""
