@@ -23,7 +23,7 @@ from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted, without_a
 
 Array = NDArray[np.float64]
 
-PART_OF_STEP, GOAL = 0.01, 0.3
+PART_OF_STEP, GOAL = 0.01, 0.5
 """Parts of the bound: the error of a single step, which others add to, and the error that the next run aims at."""
 LARGE_REDUCTION = 1e-3
 """Ratio of successive tolerances where the error is ``LOST``, and not proportional to them."""
