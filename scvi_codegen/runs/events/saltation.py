@@ -102,7 +102,7 @@ def jumps_within(
 
     Raises:
         StateError: if states within steps were not saved, if several events change the state at once, if a crossing
-            grazes, or for a run backward in time.
+            grazes, or for a run backward in time through events other than kinks.
     """
     stepper, slides = states.stepper, _directions(states.stepper)
     changes, jumps = (_turns(states, numbers) if slides else {}) | _changes(states, numbers), {}
@@ -259,7 +259,7 @@ def _changes(states: SavedStates, numbers: NDArray[np.intp]) -> dict[int, tuple[
     """Return the event, of entries, and the state before it for each of ``numbers`` at which an event acted."""
     result: dict[int, tuple[Event, Array]] = {}
     for crossings, rows in changes_by_events(states):
-        if states.forward < 0.0:
+        if states.forward < 0.0 and not isinstance(crossings.event, Kink):
             raise StateError("derivatives through events that change the state require a run forward in time")
         here = (numbers[0] < rows) & (rows <= numbers[-1])
         entry_events = states.stepper._events_of_entries(crossings.event) if here.any() else ()
@@ -310,7 +310,7 @@ def _jump(
     start = np.concatenate([starts.q[k - 1], starts.p[k - 1]])
     arrival = products(start, float(starts.h[k - 1]), float(starts.t[k - 1]), np.eye(size)[-1:])[:, 0]
     at_end = row + 1 == len(states)
-    h = SMALL_STEP * abs(states.h) if at_end else float(steps_after(states, row, row + 1)[0])
+    h = SMALL_STEP * states.forward * abs(states.h) if at_end else float(steps_after(states, row, row + 1)[0])
     # the change divides a step of fixed size if the part after or before it is shorter than h
     short = abs(h) < (1.0 - WHOLE) * abs(states.h) or abs(starts.h[k - 1]) < WHOLE * abs(states.h)
     divided = float(not at_end and isinstance(states.plan, FixedSteps) and short)
