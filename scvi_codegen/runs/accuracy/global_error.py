@@ -201,6 +201,13 @@ def _alternative(trajectory: Any, result: GlobalError) -> str:
     )
 
 
+def _is_better(one: GlobalError, other: GlobalError, start: float) -> bool:
+    """Return whether one result is better: of two without digits at the end, that which is confirmed for longer."""
+    if min(one.estimate, other.estimate) < LOST:
+        return one.estimate <= other.estimate
+    return abs(one.confirmed_until - start) >= abs(other.confirmed_until - start)
+
+
 class Runs:
     """Runs of one motion by tolerance, one of which is returned with its global error.
 
@@ -236,7 +243,7 @@ class Runs:
                     run.confirmation = replace(result, estimate=math.inf, confirmed_until=float(run.t[0]))
                     best = run if best is None else best
                     continue
-                if best is None or result.estimate <= best.confirmation.estimate:
+                if best is None or _is_better(result, best.confirmation, float(run.t[0])):
                     best = run
             if tolerance is None or (result is not None and (result.confirmed or result.reason)):
                 break
