@@ -176,18 +176,20 @@ def oscillation(x, v, rate, t):
 
 
 def wall(random):
-    """An oscillator that bounces off a wall at x = -d, in closed form."""
+    """An oscillator that bounces off a wall at x = -d, in closed form; forward, or backward with 1/e."""
     k, d, e, v = *random.uniform([0.5, 0.1, 0.5], [2.0, 0.6, 0.95]), random.uniform(-1.0, 1.0)
-    rate, left, start, (x, speed) = math.sqrt(k), 8.0, np.array([1.0, v]), (1.0, v)
+    sign = random.choice([-1.0, 1.0])
+    rate, left, start, (x, speed) = math.sqrt(k), 8.0, np.array([1.0, v]), (1.0, sign * v)
     while (size := math.hypot(x, speed / rate)) > d:
         phase = math.atan2(-speed / rate, x)
         wait = (math.acos(-d / size) - phase) % (2.0 * math.pi) / rate
         if wait >= left:
             break
-        left, x, speed = left - wait, -d, -e * oscillation(x, speed, rate, wait)[1]
+        left, x, speed = left - wait, -d, -(e**sign) * oscillation(x, speed, rate, wait)[1]
     system = lagrange("wall", "x", "x_dot**2/2 - k*x**2/2 + 0*d*e", k=1.0, d=0.5, e=0.9)
     events = {"events": sc.impact("x + d", restitution="e")}
-    return system, events, {"k": k, "d": d, "e": e}, start, 8.0, np.array(oscillation(x, speed, rate, left))
+    x, speed = oscillation(x, speed, rate, left)
+    return system, events, {"k": k, "d": d, "e": e}, start, 8.0 * sign, np.array([x, sign * speed])
 
 
 def kink(random):
