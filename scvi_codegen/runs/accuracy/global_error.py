@@ -265,7 +265,7 @@ class Runs:
         """Return the ratio of the next tolerance to that of a run, or of one that failed."""
         if result is None or not result.estimate < LOST:
             return LARGE_REDUCTION
-        return GOAL * self.requested / result.estimate
+        return float(GOAL * self.requested / result.estimate)
 
     def _steps(self, tolerance: float | None) -> dict[str, float | None]:
         if self.has_tau:
