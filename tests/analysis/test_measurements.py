@@ -172,7 +172,7 @@ def test_the_worst_of_several_is_reported(monkeypatch: pytest.MonkeyPatch) -> No
     steps = [(SimpleNamespace(h=0.1, unit=unit), error) for unit, error in ((1e-9, 2e-7), (4e-9, 9e-7), (2e-9, 3e-7))]
     monkeypatch.setattr(variable_steps, "_steps_of", lambda _: iter(steps))
     runs = SimpleNamespace(motion=None, tolerance=1e-6, rounding=lambda s: s.unit, distance=lambda *known: known[-1])
-    expected = (3e-7, pytest.approx(1e-6 + 16 * 4e-9), "relative, 7 steps, largest 9.0e-07")
+    expected = (3e-7, pytest.approx(1e-6 + 16 * 4e-9), "relative, 12 steps, largest 9.0e-07")
     assert variable_steps._within_tolerance(runs)[:3] == expected
 
 

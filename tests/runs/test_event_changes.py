@@ -720,6 +720,36 @@ def test_backward_runs_invert_impacts_and_apply_changes_as_written():
 
 
 @pytest.mark.second
+@pytest.mark.parametrize(
+    "event",
+    [
+        sc.impact("x + 1/2 - sin(t)/9", restitution="4/5 + x*y/10"),
+        sc.Event("y - t/50", then={"p_x": "p_x + y*x/9 + x"}),
+    ],
+    ids=["impact", "change"],
+)
+def test_derivatives_of_runs_backward_are_differences_and_those_of_impacts_the_inverse(event: sc.Event) -> None:
+    """A moving wall whose restitution depends on the state, and a change of momentum, with a mass matrix."""
+    system = lagrange("w", "x y", "x_dot**2*(1 + y**2)/2 + y_dot**2/2 - x**2 - y**2/2 - x*y/3")
+    stepper, start = sc.compile_stepper(system, "svi:6", events=event), np.array([1.0, 0.4, 0.3, -0.2])
+
+    def run(state: np.ndarray, t: float, t_end: float) -> sc.Trajectory:
+        return stepper.integrate(state[:2], state[2:], t=t, t_end=t_end, check_growth=False)
+
+    def end(state: np.ndarray, t: float, t_end: float) -> np.ndarray:
+        return np.concatenate(run(state, t, t_end)[-1][1:])
+
+    there, late = run(start, 0.0, 5.0), end(start, 0.0, 5.0)
+    back = run(late, 5.0, 0.0)
+    assert min(len(each.events[0]) for each in (there, back)) >= 1
+    matrix, moves = back.tangent(np.eye(4))[-1], 1e-6 * np.eye(4)
+    columns = [(end(late + move, 5.0, 0.0) - end(late - move, 5.0, 0.0)) / 2e-6 for move in moves]
+    assert matrix == pytest.approx(np.array(columns).T, rel=1e-6, abs=1e-7)
+    if event.is_wall:
+        assert matrix @ there.tangent(np.eye(4))[-1] == pytest.approx(np.eye(4), abs=1e-8)
+
+
+@pytest.mark.second
 @pytest.mark.parametrize("steps", [{"h": 0.1}, {"tolerance": 1e-8}], ids=["fixed", "adaptive"])
 def test_walls_that_a_start_touches_have_derivatives(steps: dict[str, float]) -> None:
     """A free body from a wall that it approaches: x = e (x0 + v t) behind it, as from beside it."""

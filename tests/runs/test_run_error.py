@@ -69,6 +69,162 @@ def test_errors_have_sign_and_size(method):
         assert off <= 4e-16 * (abs(c) + length) * 4.0
 
 
+POWERS = {
+    "inertia": (-2, 0),
+    "coupling": (0, 0),
+    "field": (0, -1),
+    "loss": (0, -1),
+    "push": (1, -2),
+    "rate": (0, -1),
+    "a": (0, -2),
+    "b": (0, -2),
+    "d": (-2, -2),
+    "f": (-2, -2),
+    "g": (-1, -2),
+}
+"""Powers of the units of length and time that the parameters of ``random_system`` have, for masses of 1."""
+
+
+@cache
+def random_system(method):
+    """Return the stepper of a mass matrix, a magnetic field, a potential, damping and a force, all by parameters."""
+    formula = (
+        "x_dot**2/2 + (1 + inertia*x**2)*y_dot**2/2 + coupling*x_dot*y_dot + field*(x*y_dot - y*x_dot)/2"
+        " - (a*x**2 + b*y**2)/2 - (d*x**4 + f*y**4)/4 - g*x**2*y + push*x*cos(rate*t)"
+    )
+    damped = {"dissipation": "loss*(x_dot**2 + y_dot**2)/2"}
+    return sc.compile_stepper(lagrange("random", "x y", formula, **damped, **dict.fromkeys(POWERS, 0.0)), method)
+
+
+def end_by_hand(q, v, end, of):
+    """Return positions and momenta at the end, by DOP853 of the equations of ``random_system``, to about 1e-12."""
+
+    def rates(t, z):
+        x, y, u, w = z
+        force = [
+            of["inertia"] * x * w**2 + of["field"] * w - of["loss"] * u + of["push"] * math.cos(of["rate"] * t),
+            -2.0 * of["inertia"] * x * u * w - of["field"] * u - of["loss"] * w,
+        ]
+        force[0] -= of["a"] * x + of["d"] * x**3 + 2.0 * of["g"] * x * y
+        force[1] -= of["b"] * y + of["f"] * y**3 + of["g"] * x**2
+        return [u, w, *np.linalg.solve([[1.0, of["coupling"]], [of["coupling"], 1.0 + of["inertia"] * x**2]], force)]
+
+    x, y, u, w = solve_ivp(rates, (0.0, end), [*q, *v], method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
+    p_x = u + of["coupling"] * w - of["field"] * y / 2.0
+    return np.array([x, y, p_x, (1.0 + of["inertia"] * x**2) * w + of["coupling"] * u + of["field"] * x / 2.0])
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("method", ["svi:4", "svi:8", "gauss:3"])
+def test_statements_on_errors_hold_for_random_systems(method):
+    """Random systems, states, tolerances, units and directions: sign and size, bounds, corrections, rows, ``error=``.
+
+    Errors to 1 %, their bounds at least half of the truth, corrected states a hundred times as accurate, the same
+    errors where states are saved seldom, and ``error=`` in at most two runs, whose error it bounds.
+    """
+    random, stepper = np.random.default_rng(91), random_system(method)
+    for _ in range(8):
+        of = {name: random.uniform(0.0, 0.9) for name in POWERS} | {"g": random.uniform(0.0, 0.3)}
+        q, v = random.uniform(-1.0, 1.0, (2, 2))
+        end, tolerance = random.choice([-12.0, 12.0]), 10.0 ** random.uniform(-8.0, -4.0)
+        of["loss"] *= 0.1 if end < 0.0 else 1.0  # else growth backward is that of the truth, too
+        exact, (length, time) = end_by_hand(q, v, end, of), 10.0 ** random.uniform(-6.0, 6.0, 2)
+        values = {name: of[name] * length**i * time**j for name, (i, j) in POWERS.items()}
+        motion = {"velocity": v * length / time, "parameters": values, "t_end": end * time}
+        runs = [
+            stepper.integrate(q * length, **motion, tolerance=tolerance, save_every=k, check_growth=False)
+            for k in (1, 7, 10**6)
+        ]
+        confirmed = stepper.integrate(q * length, **motion, error=1e-9)
+        units = np.array([length, length, length / time, length / time])
+        sizes = runs[0].error.sizes.ravel() / units
+
+        def at_end(states, units=units):
+            return np.r_[np.asarray(states.q)[-1], np.asarray(states.p)[-1]] / units
+
+        true, (error, *seldom) = at_end(runs[0]) - exact, (at_end(run.error) for run in runs)
+        size = np.abs(true / sizes).max()
+        assert np.abs((error - true) / sizes).max() <= 1e-2 * size + 1e-11, (of, tolerance)
+        assert 0.5 * size <= runs[0].error.relative[-1], (of, tolerance)
+        assert np.abs((at_end(runs[0].corrected) - exact) / sizes).max() <= 1e-2 * size + 1e-11, (of, tolerance)
+        assert np.abs((np.array(seldom) - error) / sizes).max() <= 1e-3 * size + 1e-13, (of, tolerance)
+        assert confirmed.confirmation.runs <= 2
+        assert np.abs((at_end(confirmed) - exact) / sizes).max() <= confirmed.global_error + 1e-11 <= 2e-9
+
+
+def rod(random):
+    """A pendulum on a rod, beside DOP853 of the equation of its angle; forward or backward."""
+    (g, length), (angle, rate), end = random.uniform(0.5, 2.0, 2), random.uniform(-1.0, 1.0, 2), random.choice([-6, 6])
+    formula, constraints = "(x_dot**2 + y_dot**2)/2 - g*y", ["x**2 + y**2 - l**2"]
+    system = lagrange("rod", "x y", formula, constraints=constraints, g=1.0, l=1.0)
+
+    def state(angle, rate):
+        along, across = np.array([math.sin(angle), -math.cos(angle)]), np.array([math.cos(angle), math.sin(angle)])
+        return length * np.concatenate([along, rate * across])
+
+    def rates(_, z):
+        return [z[1], -g / length * math.sin(z[0])]
+
+    late = solve_ivp(rates, (0.0, end), [angle, rate], method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
+    return system, {}, {"g": g, "l": length}, state(angle, rate), end, state(*late)
+
+
+def oscillation(x, v, rate, t):
+    """Return position and velocity of x'' = -rate^2 x after the time t."""
+    size, phase = math.hypot(x, v / rate), math.atan2(-v / rate, x) + rate * t
+    return size * math.cos(phase), -size * rate * math.sin(phase)
+
+
+def wall(random):
+    """An oscillator that bounces off a wall at x = -d, in closed form; forward, or backward with 1/e."""
+    k, d, e, v = *random.uniform([0.5, 0.1, 0.5], [2.0, 0.6, 0.95]), random.uniform(-1.0, 1.0)
+    sign = random.choice([-1.0, 1.0])
+    rate, left, start, (x, speed) = math.sqrt(k), 8.0, np.array([1.0, v]), (1.0, sign * v)
+    while (size := math.hypot(x, speed / rate)) > d:
+        phase = math.atan2(-speed / rate, x)
+        wait = (math.acos(-d / size) - phase) % (2.0 * math.pi) / rate
+        if wait >= left:
+            break
+        left, x, speed = left - wait, -d, -(e**sign) * oscillation(x, speed, rate, wait)[1]
+    system = lagrange("wall", "x", "x_dot**2/2 - k*x**2/2 + 0*d*e", k=1.0, d=0.5, e=0.9)
+    events = {"events": sc.impact("x + d", restitution="e")}
+    x, speed = oscillation(x, speed, rate, left)
+    return system, events, {"k": k, "d": d, "e": e}, start, 8.0 * sign, np.array([x, sign * speed])
+
+
+def kink(random):
+    """An oscillator of two stiffnesses, in closed form; forward or backward."""
+    (k, s), v, end = random.uniform(0.5, 4.0, 2), random.uniform(-1.0, 1.0), random.choice([-8.0, 8.0])
+    sign, left, x, speed, side = math.copysign(1.0, end), 8.0, 1.0, math.copysign(1.0, end) * v, 1.0
+    while True:
+        rate = math.sqrt(k if side > 0.0 else s)
+        wait = (0.5 * math.pi - math.atan2(-speed / rate, x)) % math.pi / rate if x else math.pi / rate
+        if wait >= left:
+            break
+        left, speed, x, side = left - wait, oscillation(x, speed, rate, wait)[1], 0.0, -side
+    x, speed = oscillation(x, speed, rate, left)
+    system = lagrange("kink", "x", "x_dot**2/2 - k*max(x, 0)**2/2 - s*min(x, 0)**2/2", k=1.0, s=2.0)
+    return system, {}, {"k": k, "s": s}, np.array([1.0, v]), end, np.array([x, sign * speed])
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("motion", [rod, wall, kink])
+def test_errors_through_constraints_impacts_and_kinks_have_sign_and_size(motion):
+    """Twelve random motions of each kind: errors to 1 %, and states minus them a hundred times as accurate."""
+    random, stepper = np.random.default_rng(7), None
+    for _ in range(12):
+        system, events, parameters, start, end, exact = motion(random)
+        stepper = stepper or sc.compile_stepper(system, "svi:4", **events)
+        (q, v), tolerance = np.split(start, 2), 10.0 ** random.uniform(-8.0, -4.0)
+        run = stepper.integrate(q, velocity=v, parameters=parameters, t_end=end, tolerance=tolerance)
+        true, sizes = np.r_[run.q[-1], run.p[-1]] - exact, run.error.sizes.ravel()
+        error, corrected = np.r_[run.error.q[-1], run.error.p[-1]], np.r_[run.corrected.q[-1], run.corrected.p[-1]]
+        size = np.abs(true / sizes).max()
+        assert np.abs((error - true) / sizes).max() <= 1e-2 * size + 1e-12, (parameters, end, tolerance)
+        assert 0.5 * size <= run.error.relative[-1]
+        assert np.abs((corrected - exact) / sizes).max() <= 1e-2 * size + 1e-12, (parameters, end, tolerance)
+
+
 @pytest.mark.second
 def test_what_iterations_leave_does_not_grow_at_pericentres():
     """Nine orbits of eccentricity 0.99: with 1e-3 of transported errors left by iterations they are half too large."""

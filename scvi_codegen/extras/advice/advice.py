@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -252,40 +252,29 @@ class _Trial(NamedTuple):
     """Pilot run with n steps for the span, or with the first of them.
 
     Attributes:
-        h: step size.
-        error, rounding: relative errors at the end of the span, and the part that rounding causes; of runs that are
-            lost by the end those at the last time at which rounding alone meets the tolerance.
-        power: power of time by which the error grows.
-        duration, until: times until which digits are left, and until which the tolerance is met.
-        judged: time at which the error is judged.
-        covered: duration of the run.
-        lost: whether no digits are left at its end.
+        evidence: what users see of it.
+        rounding: part of the error that rounding causes.
+        lost: whether rounding errors alone, which grow exponentially, exceed the tolerance.
+        power: power of time by which errors grow.
+        judged, until: times until which errors have digits, and until which they are below the tolerance.
+        breaks: time at which the run fails, or loses all digits at once.
+        failure: why it fails.
     """
 
     n: int
-    h: float
-    error: float = math.inf
+    evidence: Evidence
     rounding: float = 0.0
+    lost: bool = False
     power: float = 0.0
-    duration: float = 0.0
-    until: float = 0.0
     judged: float = 0.0
-    covered: float = 0.0
-    lost: bool = True
-    iterations: float = 0.0
-    seconds: float = 0.0
+    until: float = 0.0
+    breaks: float = math.inf
     failure: str = ""
 
-    def aim(self, tolerance: float) -> float:
-        """Return half of the tolerance, or what rounding leaves of it, at least twice the error of rounding."""
-        return max(
-            tolerance / SAFETY, min(SAFETY * self.rounding, tolerance if self.rounding < tolerance else math.inf)
-        )
-
-    @property
-    def tenfold(self) -> float:
-        """Time in which errors grow tenfold, infinite unless they grow exponentially."""
-        return math.inf if self.power <= EXPONENTIAL else self.judged / 2.0 / (self.power * math.log10(2.0))
+    def missed(self, tolerance: float) -> float:
+        """Return the error relative to that aimed at: half of the tolerance, or twice what rounding leaves."""
+        most = tolerance if self.rounding < tolerance else math.inf
+        return self.evidence.error / max(tolerance / SAFETY, min(SAFETY * self.rounding, most))
 
 
 class _Pilot(NamedTuple):
@@ -300,6 +289,15 @@ class _Pilot(NamedTuple):
     tolerance: float
     order: int
 
+    def first(self) -> int:
+        """Return the number of steps of the size of the first adaptive one that loses its digits."""
+        end = self.settings["t"] + self.span
+        try:
+            run = self.stepper.products.finer.start(self.q, self.p, t_end=end, tolerance=Products.LOST, **self.settings)
+            return max(1, math.ceil(abs(self.span / float(run.record(1).step_sizes[0]))))
+        except (MethodError, StepFailedError):
+            return 1
+
     def tried(self, n: int) -> _Trial:
         """Return the run with n steps for the span, or with the first of them; StateError for a motion at rest."""
         h, steps, began = self.span / n, min(n, self.most), time.perf_counter()
@@ -310,76 +308,92 @@ class _Pilot(NamedTuple):
             run = self.stepper.integrate(self.q, self.p, h=h, steps=steps, **self.settings)
         except StepFailedError as failure:
             lasted = abs(failure.t - self.settings["t"])
-            return _Trial(n, h, covered=abs(h) * steps, duration=lasted, failure=failure.status)
-        price = {"seconds": (time.perf_counter() - began) / abs(h * steps), "iterations": run.iterations.sum() / steps}
+            return _Trial(n, Evidence(h, math.inf, 0.0, 0.0), breaks=lasted, failure=failure.status)
         if largest_range(np.asarray(run.q)) <= Products.RESOLVED * ROUNDOFF * np.abs(np.asarray(run.q)).max():
             raise StateError(
                 f"the motion is at rest over t = {abs(h) * steps:.3g}: errors relative to its size are undefined; give "
                 "an initial state that moves, or choose h below the shortest period"
             )
+        seconds = (time.perf_counter() - began) / abs(h * steps)
+        row = Evidence(h, math.inf, float(run.iterations.sum() / steps), seconds)
+        if run.step_error >= 1.0:  # the error of a step is the motion
+            return _Trial(n, row, breaks=abs(run.worst_step_time - run.t[0]))
         with np.errstate(over="ignore"):  # of chaotic motions
-            return self.judged(run, _Trial(n, h, covered=abs(h) * steps, **price))
+            return self.judged(run, n, row)
 
-    def judged(self, run: Any, trial: _Trial) -> _Trial:
-        """Return a pilot run with its errors."""
+    def judged(self, run: Any, n: int, evidence: Evidence) -> _Trial:
+        """Return a pilot run with its errors, which grow by powers of time, or exponentially, to the end of the span.
+
+        Where rounding errors alone exceed the tolerance and grow exponentially, errors are those before they do.
+        """
         error, t = run.error, np.abs(np.asarray(run.t) - run.t[0])
-        lost = not error.relative[-1] < Products.LOST
-        rows = int(np.flatnonzero(error.relative < Products.LOST)[-1]) + 1
-        sizes, errors = error.relative_until(rows)
-        roundings = np.maximum.accumulate(error.roundings(sizes)[:rows])
-        row = int(np.flatnonzero(SAFETY * roundings <= self.tolerance)[-1]) if lost else rows - 1
-        half = int(np.searchsorted(t, t[row] / 2.0))
-        powers = [math.log2(max(1.0, x[row] / x[half])) if x[half] else 0.0 for x in (errors, roundings)]
-        ratio = 1.0 if lost else max(1.0, abs(self.span) / t[row])
-        power = powers[1] if lost else powers[0]  # neighbours leave each other as rounding errors grow
-        grown = [k * (2.0 * (ratio - 1.0) if power > EXPONENTIAL else math.log2(ratio)) for k in powers]
-        ends = [float(x[row]) * 2.0 ** min(k, 1000.0) for x, k in zip((errors, roundings), grown, strict=True)]
-        if not lost and ends[1] >= Products.LOST:  # rounding alone exceeds it later: judged as far as it goes
-            lost, power, ends = True, powers[1], [float(errors[row]), float(roundings[row])]
-        if lost and (row == 0 or row == rows - 1 < len(t) - 1):  # errors are those of the steps, not of rounding
-            ends[0] = math.inf
-        met = np.flatnonzero(errors <= self.tolerance)[-1]
-        times: Any = {name: float(t[k]) for name, k in (("duration", rows - 1), ("judged", row), ("until", met))}
-        return trial._replace(error=ends[0], rounding=ends[1], power=power, lost=lost, **times)
+        last = int(np.flatnonzero(error.relative < Products.LOST)[-1])
+        sizes, errors = error.relative_until(last + 1)
+        both = np.array([errors, np.maximum.accumulate(error.roundings(sizes)[: last + 1])])
+        half, ratio = both[:, np.searchsorted(t, t[last] / 2.0)], max(1.0, abs(self.span) / (t[last] or math.inf))
+        powers = np.log2(np.maximum(1.0, both[:, last] / np.where(half > 0.0, half, math.inf)))
+        grown = powers * np.where(powers > EXPONENTIAL, 2.0 * (ratio - 1.0), math.log2(ratio))
+        at_end, row = both[:, last] * 2.0 ** np.minimum(grown, 1000.0), last
+        lost = bool(powers[1] > EXPONENTIAL and SAFETY * at_end[1] > self.tolerance)
+        if lost:
+            row = int(np.flatnonzero(SAFETY * both[1] <= self.tolerance)[-1])
+            at_end = both[:, row]
+        until = float(t[np.flatnonzero(errors <= self.tolerance)[-1]])
+        by_steps = row == last < len(t) - 1  # digits are lost by errors of steps
+        at_once = by_steps and until >= (1.0 - 1.0 / FACTOR**2) * t[last]
+        unknown = at_once or (lost and (by_steps or row == 0))
+        return _Trial(
+            n,
+            evidence._replace(error=math.inf if unknown else float(at_end[0])),
+            rounding=float(at_end[1]),
+            lost=lost,
+            power=float(powers[int(lost)]),  # neighbours leave each other as rounding errors grow
+            judged=float(t[last]),
+            until=until,
+            breaks=float(t[last]) if at_once else math.inf,
+        )
 
     def trials(self, n: int) -> list[_Trial]:
-        """Return runs with numbers of steps, from n on, until the error is half of the tolerance."""
-        trials: list[_Trial] = []
-        while n not in [k.n for k in trials]:
-            trials.append(trial := self.tried(n))
-            worst = max((k.n for k in trials if k.error > k.aim(self.tolerance)), default=0)
-            best = min((k.n for k in trials if k.n > worst), default=0)
-            aim = trial.aim(self.tolerance) / math.sqrt(SAFETY)
-            if best and (best <= SAFETY ** (1.0 / self.order) * worst or (n == best and trial.error * SAFETY >= aim)):
+        """Return runs with numbers of steps from n on, each by the error of the last one, until it is that aimed at."""
+        trials: dict[int, _Trial] = {}
+        while n not in trials:
+            trials[n] = trial = self.tried(n)
+            missed = math.sqrt(SAFETY) * trial.missed(self.tolerance)
+            worst, best = _bracket(trials.values(), self.tolerance)
+            if best and (best <= SAFETY ** (1.0 / self.order) * worst or (n == best and missed * SAFETY >= 1.0)):
                 break
-            n = math.ceil(n * min(max((trial.error / aim) ** (1.0 / self.order), 1.0 / FACTOR), FACTOR))
+            n = math.ceil(n * min(max(missed ** (1.0 / self.order), 1.0 / FACTOR), FACTOR))
             if not worst < n < (best or math.inf):
                 n = max(1, math.ceil(math.sqrt(worst * best))) if best else FACTOR * worst
-            if n > self.most and not best:
-                if any(k.error < Products.LOST and not k.lost for k in trials):
-                    break
-                # Digits are lost at once at an encounter or a singularity, by and by where neighbours diverge.
-                at_once = trial.until > (1.0 - 1.0 / FACTOR**2) * trial.duration
-                before = trials[-2].duration if len(trials) > 1 and trials[-2].failure else math.inf
-                fails = trial.failure and 0.0 < before < math.inf and FACTOR * trial.duration <= (FACTOR + 1) * before
-                if (at_once and trial.lost and not trial.failure) or fails or n > self.most**2:
-                    raise UnresolvedError(
-                        f"no pilot run over t = {trial.covered:.3g} is accurate, with step sizes down to "
-                        f"{abs(trial.h):.3g}: the solution may end in a singularity or have a close encounter; use "
-                        "adaptive step size (t_end, --tolerance), or a shorter span"
-                    )
-        return trials
+            if best or n <= self.most:
+                continue
+            if any(k.evidence.error < Products.LOST and not k.lost for k in trials.values()):
+                break
+            if math.inf > trial.breaks > abs(self.span) * self.most / n:  # the next run would not reach it
+                raise UnresolvedError(
+                    f"no pilot run of {self.most} steps is accurate, with step sizes down to "
+                    f"{abs(trial.evidence.h):.3g}: the solution may end in a singularity or have a close encounter; "
+                    "use adaptive step size (t_end, --tolerance), or a shorter span"
+                )
+        return list(trials.values())
 
 
-def _warnings(trial: _Trial, tolerance: float, span: float) -> Iterator[str]:
+def _bracket(trials: Iterable[_Trial], tolerance: float) -> tuple[int, int]:
+    """Return the largest number of steps that misses the tolerance, and the smallest one above that meets it; or 0."""
+    worst = max((k.n for k in trials if k.missed(tolerance) > 1.0), default=0)
+    return worst, min((k.n for k in trials if k.n > worst), default=0)
+
+
+def _warnings(trial: _Trial, error: float, tolerance: float, span: float) -> Iterator[str]:
     """Yield warnings about conditions that prevent, or may prevent, the tolerance from being met."""
-    chaos = f"neighbouring trajectories diverge tenfold every {trial.tenfold:.3g} units of time (chaos)"
+    tenfold = trial.judged / 2.0 / (max(trial.power, 1.0) * math.log10(2.0))
+    chaos = f"neighbouring trajectories diverge tenfold every {tenfold:.3g} units of time (chaos)"
     if trial.lost:
         yield f"the tolerance cannot be met: {chaos}, so round-off alone exceeds it"
         yield f"the recommended step meets it until t = {trial.until:.4g}"
-    elif trial.error > tolerance and SAFETY * trial.rounding > trial.error:
+    elif error > tolerance and SAFETY * trial.rounding > error:
         yield f"round-off alone causes an error of about {trial.rounding:.1g}, which smaller steps do not reduce"
-    elif trial.tenfold < math.inf and trial.covered < 0.9 * abs(span):
+    elif trial.power > EXPONENTIAL and SAFETY * trial.judged < abs(span):
         yield f"{chaos}, at an uncertain rate later"
 
 
@@ -391,7 +405,7 @@ def _advised(
     Of an ensemble the step is found for one trajectory, and the errors of all with that step are computed; if another
     one misses the tolerance, a smaller step is found for that.
     """
-    settings, n, done = {"t": state["t"], "options": state["options"]}, FACTOR**2, set[int]()
+    settings, n, done = {"t": state["t"], "options": state["options"]}, 0, set[int]()
     most = NUMBERS // stepper.dimension
     starts, together = _starts(stepper, q, state)
     members, at_rest = list(range(len(starts))), StateError(f"all {len(starts)} trajectories are at rest")
@@ -400,7 +414,7 @@ def _advised(
         q, p, own = starts[member]
         pilot = _Pilot(most, stepper, q, p, {**settings, "parameters": own}, span, tolerance, method.order or 1)
         try:
-            trials = pilot.trials(n)
+            trials = pilot.trials(n or pilot.first())
         except StateError as failure:
             at_rest = at_rest if together else failure
             continue
@@ -433,24 +447,26 @@ def _starts(stepper: Stepper, q: States, state: dict[str, Any]) -> tuple[list[tu
 def _described(pilot: _Pilot, trials: list[_Trial], method: Method, symplectic: bool, member: int | None) -> Advice:
     """Return the step with the least work of those that meet the tolerance, in numbers and words."""
     tolerance, specification = pilot.tolerance, method.specification()
-    overhead, trials = OVERHEAD[pilot.stepper.interface.words], sorted(trials)
-    worst = max((k.n for k in trials if k.error > k.aim(tolerance)), default=0)
-    good = [k for k in trials if k.n > worst]
-    trial = min(good or trials[-1:], key=lambda k: k.n * (k.iterations + overhead))
-    n, h, error = trial.n, trial.h, min(1.0, trial.error) if not trial.lost else 1.0
-    sentences = [f"The pilot runs covered {trial.covered:.4g} of {abs(pilot.span):.4g}, where errors grew "]
-    sentences[0] += f"like t^{trial.power:.1f}." if trial.tenfold == math.inf else "exponentially."
-    if trial.covered >= (1.0 - 0.5**10) * abs(pilot.span):
+    overhead, trials = OVERHEAD[pilot.stepper.interface.words], sorted(trials, key=lambda k: k.n)
+    good = [k for k in trials if k.n > _bracket(trials, tolerance)[0]]
+    trial = min(good or trials[-1:], key=lambda k: k.n * (k.evidence.iterations + overhead))
+    n, h, error = trial.n, trial.evidence.h, 1.0 if trial.lost else min(1.0, trial.evidence.error)
+    covered = min(n, pilot.most)
+    growth = "exponentially" if trial.power > EXPONENTIAL else f"like t^{trial.power:.1f}"
+    sentences = [f"The pilot runs covered {abs(h) * covered:.4g} of {abs(pilot.span):.4g}, where errors grew {growth}."]
+    if covered == n:
         sentences = ["The pilot runs covered the whole span."]
     if member is not None:
         sentences.append(f"Trajectory {member} (from 0) of the ensemble has the largest error.")
     if not good:
-        error = trial.aim(tolerance)
-        n = math.ceil(n * (trial.error / error) ** (1.0 / pilot.order))
+        missed = trial.missed(tolerance)
+        n, error = math.ceil(n * missed ** (1.0 / pilot.order)), trial.evidence.error / missed
         h = pilot.span / n
         sentences.append(f"So small a step was not tried: the error is extrapolated by order {pilot.order}.")
     if failing := [k for k in trials if k.failure]:
-        sentences.append(f"The solver fails at a step size of {abs(failing[-1].h):.3g}: {failing[-1].failure}.")
+        sentences.append(
+            f"The solver fails at a step size of {abs(failing[-1].evidence.h):.3g}: {failing[-1].failure}."
+        )
     if symplectic:
         sentences.append("The method is symplectic only at this fixed step size.")
     steps = n if pilot.stepper.interface.words == 1 else math.ceil(pilot.span / h)
@@ -462,8 +478,8 @@ def _described(pilot: _Pilot, trials: list[_Trial], method: Method, symplectic: 
         degree=degree if isinstance(degree, int) else None,
         method=method,
         expected_error=error,
-        evidence=tuple(Evidence(k.h, k.error, float(k.iterations), k.seconds) for k in trials),
+        evidence=tuple(k.evidence for k in trials),
         message=message,
-        warnings=tuple(_warnings(trial, tolerance, pilot.span)),
+        warnings=tuple(_warnings(trial, error, tolerance, pilot.span)),
         member=member,
     )

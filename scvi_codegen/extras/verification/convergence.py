@@ -21,7 +21,14 @@ from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.extras.exact.solution import exact_motion, numbers
 from scvi_codegen.extras.exact.step import derived_step
 from scvi_codegen.extras.verification.certificate import Check, Finding, checked
-from scvi_codegen.extras.verification.system_under_test import EPSILON, LARGEST_RATIO, TRIALS, State, SystemUnderTest
+from scvi_codegen.extras.verification.system_under_test import (
+    EPSILON,
+    EQUAL,
+    LARGEST_RATIO,
+    TRIALS,
+    State,
+    SystemUnderTest,
+)
 from scvi_codegen.methods import (
     SCVI,
     SVI,
@@ -155,8 +162,8 @@ def _of_size(specification: Mapping[str, Any], key: str, size: int) -> Method | 
         return None
 
 
-EQUAL, ROUNDED = 1e-30, 1e-13
-"""Bounds: for equations in 60 digits; for equations whose tables are rounded to 53 bits."""
+ROUNDED = 1e-13
+"""Bound for equations whose tables are rounded to 53 bits."""
 OTHER_FORM = "position form is phase-space form for constant mass"
 MAX_LEGENDRE_COORDINATES = 6
 """Largest number of coordinates for which the Legendre transform is done symbolically."""

@@ -26,6 +26,7 @@ from scvi_codegen.extras.verification.system_under_test import (
     LONG_RUN,
     ROUND_OFF,
     ROUNDINGS,
+    SAMPLED,
     SHORT_RUN,
     STEP_DIVISOR,
     WIDTH,
@@ -205,7 +206,7 @@ def _saltation(scales: Array, run: Trajectory, changes: list[Change]) -> Finding
 def _reversal(run: Trajectory, changes: list[Change]) -> Finding | None:
     """Return the defect of steps with elastic impacts and back, in units of one rounding of state, time and step."""
     worst = list[float]()
-    for change in _elastic(changes)[:SAMPLED_CHANGES]:
+    for change in _elastic(changes)[:SAMPLED]:
         start, step = _across(run, change, run.h)
         there, stepper = step(start), cast(Stepper, run.stepper)
         end, t = np.hstack([there.q[-1], there.p[-1]]), there.t[-1]
@@ -230,8 +231,8 @@ def _symplecticity(run: Trajectory, changes: list[Change]) -> Finding | None:
     return Finding(defects[1], max(defects[0] * LARGEST_RATIO, BOUND), "step / 8")
 
 
-SAMPLED_CHANGES, ROUNDED, DIFFERENCE = 12, ROUNDINGS * EPSILON, mp.mpf(10) ** -30
-"""Number of changes that are checked, bound on zeros relative to their terms, and width of differences."""
+ROUNDED, DIFFERENCE = ROUNDINGS * EPSILON, mp.mpf(10) ** -30
+"""Bound on zeros relative to their terms, and width of differences."""
 OUTSIDE = 1e-9
 """Part of their size by which impulses may leave their cone, ten times that by which runs choose them
 (CONTACT_ROUNDING)."""
@@ -289,7 +290,7 @@ class RunInModes:
                 changes.append((t, run.stepper.searched.index(crossings.event), *ends, sides))
         times = [change[0] for change in changes]
         alone = sorted((change for change in changes if times.count(change[0]) == 1), key=lambda change: change[0])
-        return alone[:: -(-len(alone) // SAMPLED_CHANGES) or 1]
+        return alone[:: -(-len(alone) // SAMPLED) or 1]
 
     @cached_property
     def impacts(self) -> list[tuple[float, float]]:

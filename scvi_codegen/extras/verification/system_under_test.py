@@ -81,9 +81,11 @@ ROUND_OFF, BOUND, NOISE_OF_DIFFERENCES = 1e-12, 1e-10, 1e-6
 products, and of finite differences."""
 STEP_DIVISOR, LARGEST_RATIO = 8, 0.25
 """Ratio of two step sizes whose errors are compared, and largest ratio of the errors of a better and a worse one."""
-CONSECUTIVE_STEPS, SHORT_RUN, LONG_RUN, TRIALS = 3, 40, 1000, 12
+CONSECUTIVE_STEPS, SHORT_RUN, LONG_RUN, TRIALS, SAMPLED = 3, 40, 1000, 12, 12
 """Number of steps in a row that are checked, of steps of short runs and of states sampled in others, of steps of long
-runs, and of step sizes that a search tries."""
+runs, of step sizes that a search tries, and of steps and changes of a run that are checked."""
+EQUAL = 1e-30
+"""Relative difference of equal numbers in 60 digits."""
 WIDTH = 1e-5
 """Width of differences of constraints, relative to the state."""
 PERTURBATION = 0.05

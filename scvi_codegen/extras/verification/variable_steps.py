@@ -17,6 +17,7 @@ from scvi_codegen.extras.verification.structure import momentum_error
 from scvi_codegen.extras.verification.system_under_test import (
     EPSILON,
     ROUNDINGS,
+    SAMPLED,
     SHORT_RUN,
     STEP_DIVISOR,
     State,
@@ -29,8 +30,6 @@ ERROR_RATIO = 100.0
 """Largest ratio of the error in t to that in tau: the quadrature of dt = g dtau has an error of the same order."""
 CUT = (2, 0.6)
 """Target time in steps: two whole steps and part of a third."""
-SAMPLED_STEPS = 7
-"""Number of steps of a run that are checked."""
 STEP_FACTOR = 4
 """Ratio of the step size of a run with a time-rescaling function to the fixed step size."""
 LEAST_REDUCTION = 2.5
@@ -200,7 +199,7 @@ def _adaptive_run(runs: VariableSteps, part: float = 1.0) -> Trajectory:
 def _steps_of(runs: VariableSteps) -> Iterator[tuple[State, Array]]:
     """Yield some steps of a run, including the first and the last: start with step size, and end."""
     run = _adaptive_run(runs)
-    for k in np.unique(np.linspace(0, len(run) - 2, SAMPLED_STEPS).astype(int)):
+    for k in np.unique(np.linspace(0, len(run) - 2, SAMPLED).astype(int)):
         start = State(run.q[k], run.p[k], float(run.t[k]), float(run.t[k + 1] - run.t[k]))
         yield start, np.concatenate([run.q[k + 1], run.p[k + 1]])
 
@@ -210,7 +209,7 @@ def _equal_single_steps(runs: VariableSteps) -> Finding:
     for start, end in _steps_of(runs):
         unit = runs.tested.rounding(start) + runs.residual * runs.tested.scales(start)
         worst = max(worst, float(np.max(np.abs(runs.tested.ends(start) - end) / unit)))
-    return Finding(worst, ROUNDINGS, f"in units of residual and rounding, {SAMPLED_STEPS} steps")
+    return Finding(worst, ROUNDINGS, f"in units of residual and rounding, {SAMPLED} steps")
 
 
 def _follow_step_density(runs: VariableSteps) -> Finding:
@@ -248,7 +247,7 @@ def _within_tolerance(runs: VariableSteps) -> Finding:
     for start, end in _steps_of(runs):
         errors.append(runs.distance(runs.motion, start, mp.mpf(start.h), end))
         rounding = max(rounding, ROUNDINGS * runs.rounding(start))
-    remark = f"relative, {SAMPLED_STEPS} steps, largest {max(errors):.1e}"
+    remark = f"relative, {SAMPLED} steps, largest {max(errors):.1e}"
     return Finding(float(np.median(errors)), (runs.tolerance or EPSILON) + rounding, remark)
 
 

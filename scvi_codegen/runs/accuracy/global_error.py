@@ -23,16 +23,14 @@ from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted, without_a
 
 Array = NDArray[np.float64]
 
-FIRST, GOAL = 0.01, 0.5
-"""First local tolerance relative to the bound; part of it that the next tolerance aims at."""
-LEAST_REDUCTION, LARGE_REDUCTION = 0.3, 1e-3
-"""Largest ratio of successive tolerances; that where the error is ``LOST``, and not proportional to them."""
+PART_OF_STEP, GOAL = 0.01, 0.5
+"""Parts of the bound: the error of a single step, which others add to, and the error that the next run aims at."""
+LARGE_REDUCTION = 1e-3
+"""Ratio of successive tolerances where the error is ``LOST``, and not proportional to them."""
 MOST_RUNS, LEAST = 5, (1e-16, 1e-30)
 """Largest number of runs; tolerances of one and two words below which runs are at round-off."""
 MOST_EXAMINATIONS, FINER_PIECES = 2, 0.0625
 """Searches for narrow forces; ratio of their pieces, the second one where the first one finds some."""
-PART_OF_ERROR = 0.01
-"""Differences in pieces that count: parts of the bound, which later steps may enlarge, and ``ROUNDINGS``."""
 ROUNDINGS_OF_RESULT = 10.0
 """Smallest estimate in roundings."""
 UNEVEN = 30.0
@@ -203,6 +201,13 @@ def _alternative(trajectory: Any, result: GlobalError) -> str:
     )
 
 
+def _is_better(one: GlobalError, other: GlobalError, start: float) -> bool:
+    """Return whether one result is better: of two without digits at the end, that which is confirmed for longer."""
+    if min(one.estimate, other.estimate) < LOST:
+        return one.estimate <= other.estimate
+    return abs(one.confirmed_until - start) >= abs(other.confirmed_until - start)
+
+
 class Runs:
     """Runs of one motion by tolerance, one of which is returned with its global error.
 
@@ -223,7 +228,7 @@ class Runs:
         Raises:
             StepFailedError: if all runs fail.
         """
-        tolerance: float | None = FIRST * self.requested
+        tolerance: float | None = PART_OF_STEP * self.requested
         best, failure, run = None, None, None
         while self.count < MOST_RUNS:
             is_last = self.count == MOST_RUNS - 1
@@ -238,7 +243,7 @@ class Runs:
                     run.confirmation = replace(result, estimate=math.inf, confirmed_until=float(run.t[0]))
                     best = run if best is None else best
                     continue
-                if best is None or result.estimate <= best.confirmation.estimate:
+                if best is None or _is_better(result, best.confirmation, float(run.t[0])):
                     best = run
             if tolerance is None or (result is not None and (result.confirmed or result.reason)):
                 break
@@ -260,7 +265,7 @@ class Runs:
         """Return the ratio of the next tolerance to that of a run, or of one that failed."""
         if result is None or not result.estimate < LOST:
             return LARGE_REDUCTION
-        return float(min(LEAST_REDUCTION, GOAL * self.requested / result.estimate))
+        return float(GOAL * self.requested / result.estimate)
 
     def _steps(self, tolerance: float | None) -> dict[str, float | None]:
         if self.has_tau:
@@ -319,7 +324,7 @@ class Runs:
         size = longest_piece(run, self.motion.end - start) * FINER_PIECES**self.examinations
         self.examinations += 1
         rounding = roundoff(1) * max(1.0, max(abs(start), abs(end)) / abs(end - start))  # also of times
-        bound = max(PART_OF_ERROR * self.requested, ROUNDINGS * rounding)
+        bound = max(PART_OF_STEP * self.requested, ROUNDINGS * rounding)
         apart = differences_in_pieces(run, size, bound)
         if not apart.any():
             return False

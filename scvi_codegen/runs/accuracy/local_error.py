@@ -23,9 +23,6 @@ SUMMED: Final = 10.0
 
 ADAPTIVE_REMEDY: Final = ", or use adaptive steps (t_end= without h)"
 
-GROSS_ERROR: Final = 0.5
-"""Relative energy change that triggers a warning in fixed-step runs without an error estimate."""
-
 MOST_CHECKED: Final = 1000
 """Largest number of trajectories of an ensemble whose energy is checked."""
 
@@ -91,7 +88,7 @@ def warn_of_energy_error(trajectory: SavedStates, run: Memory) -> None:
         if is_adaptive:
             warn_of_energies(*energies, tolerable=tolerable)
         else:
-            warn_of_energies(*energies, tolerable=GROSS_ERROR, why=FIXED_STEP_REMEDY)
+            warn_of_energies(*energies, tolerable=LOST, why=FIXED_STEP_REMEDY)
 
 
 def warn_of_energy_errors(ensemble: Any, ends: Array | None = None) -> None:

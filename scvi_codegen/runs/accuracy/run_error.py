@@ -63,10 +63,8 @@ CONVERGED = 1e-4
 """Changes of errors relative to the change of momenta in a step, d, below which the finer method resolves it.
 
 Errors of orders r and R of one motion are d and about d^(R/r): a tenth of the first where d is 10^(-r / (R - r)), and
-R - r is a quarter of r or more (``finer_method``).
+R - r is a quarter of r or more (``finer_method``). Iterations of the finer method leave a tenth of it, ``LOST``.
 """
-PART_OF_CHANGE = 1e-5
-"""Of changes of errors, which iterations of the finer method leave."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -383,7 +381,7 @@ class _Replay:
         t, h = np.ascontiguousarray(piece.t[begin:end]), np.ascontiguousarray(steps_after(piece, begin, end))
         q, p = (np.ascontiguousarray(np.asarray(column)[begin : end + 1]) for column in (piece.q, piece.p))
         starts, parameters = Starts(t, h, q, p), piece.parameters_on_sides(float(piece.t[begin]))
-        k, limits = 0, np.array([CONVERGED, LOST, RESOLVED * self.u, PART_OF_CHANGE])
+        k, limits = 0, np.array([CONVERGED, LOST, RESOLVED * self.u, LOST * CONVERGED])
         while k < len(h):
             part, row = starts.part(k, k + MOST_STEPS), first + begin + k + 1
             results = self.results[:, :, row : row + len(part.h)]

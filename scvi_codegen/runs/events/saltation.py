@@ -101,8 +101,8 @@ def jumps_within(
         all_inputs: whether derivatives with respect to parameters are required.
 
     Raises:
-        StateError: if states within steps were not saved, if several events change the state at once, if a crossing
-            grazes, or for a run backward in time.
+        StateError: if states within steps were not saved, if several events change the state at once, or if a crossing
+            grazes.
     """
     stepper, slides = states.stepper, _directions(states.stepper)
     changes, jumps = (_turns(states, numbers) if slides else {}) | _changes(states, numbers), {}
@@ -259,8 +259,6 @@ def _changes(states: SavedStates, numbers: NDArray[np.intp]) -> dict[int, tuple[
     """Return the event, of entries, and the state before it for each of ``numbers`` at which an event acted."""
     result: dict[int, tuple[Event, Array]] = {}
     for crossings, rows in changes_by_events(states):
-        if states.forward < 0.0:
-            raise StateError("derivatives through events that change the state require a run forward in time")
         here = (numbers[0] < rows) & (rows <= numbers[-1])
         entry_events = states.stepper._events_of_entries(crossings.event) if here.any() else ()
         entries = (crossings.element[here], crossings.q[here], crossings.p[here])
@@ -310,7 +308,7 @@ def _jump(
     start = np.concatenate([starts.q[k - 1], starts.p[k - 1]])
     arrival = products(start, float(starts.h[k - 1]), float(starts.t[k - 1]), np.eye(size)[-1:])[:, 0]
     at_end = row + 1 == len(states)
-    h = SMALL_STEP * abs(states.h) if at_end else float(steps_after(states, row, row + 1)[0])
+    h = SMALL_STEP * states.forward * abs(states.h) if at_end else float(steps_after(states, row, row + 1)[0])
     # the change divides a step of fixed size if the part after or before it is shorter than h
     short = abs(h) < (1.0 - WHOLE) * abs(states.h) or abs(starts.h[k - 1]) < WHOLE * abs(states.h)
     divided = float(not at_end and isinstance(states.plan, FixedSteps) and short)
@@ -522,7 +520,9 @@ def _impact(here: Place, later: Place, values: Values, before: Array, after: Arr
     """
     stepper, t = here.states.stepper, here.t
     m, count = stepper.dimension, values.gradient.size
-    n, e, (q, p) = values.value[:m], values.value[m + 1], np.split(before, 2)
+    n, e, e_by, (q, p) = values.value[:m], values.value[m + 1], values.map[m + 1], np.split(before, 2)
+    if here.states.forward < 0.0:  # a run backward in time undoes the impact
+        e, e_by = 1.0 / e, -e_by / e**2
     # P_u maps G^T mu to 0, and the change of p, lambda n + G^T mu, to lambda P_u n
     onto = _projection(later._replace(all_inputs=False), after)[1][m:, m : 2 * m]
     impulse = float((onto @ (after - before)[m:]) @ (onto @ n) / ((onto @ n) @ (onto @ n)))
@@ -548,7 +548,7 @@ def _impact(here: Place, later: Place, values: Values, before: Array, after: Arr
         residual -= work + by_momentum @ p1_by
         residual_by_impulse -= by_momentum @ p1_by_impulse
     # lambda_x = (lambda_1 e_x + (1 + e) lambda_1x) / 2
-    impulse_by = 0.5 * (full * values.map[m + 1] - (1.0 + e) * residual / residual_by_impulse)
+    impulse_by = 0.5 * (full * e_by - (1.0 + e) * residual / residual_by_impulse)
     _, by, by_impulse = changed(impulse)
     return np.vstack([np.eye(m, count), by + np.outer(by_impulse, impulse_by)])
 
