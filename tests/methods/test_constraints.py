@@ -424,11 +424,6 @@ def test_constraints_of_a_hamiltonian_equal_those_of_its_lagrangian():
 
 @pytest.mark.rotated
 def test_unsupported_combinations_with_constraints_are_rejected():
-    rolling = lagrange("blade", "x y", "(x_dot**2 + y_dot**2)/2", constraints=["x_dot = y*y_dot"])
-    with pytest.raises(sc.SystemDefinitionError, match="nonholonomic constraints"):
-        sc.reparametrise(rolling, "1 + x**2")
-    with pytest.raises(sc.SystemDefinitionError, match="constraints"):
-        sc.hamiltonian_of(rod())
     free = sc.HamiltonianSystem.from_text(name="free", coordinates=["x"], hamiltonian="p_x**2/2")
     with pytest.raises(sc.SystemDefinitionError, match="constraints"):
         replace(free, constraints=free.coordinates)
