@@ -197,7 +197,7 @@ def test_the_matrix_of_multipliers_of_a_chain_is_a_band(terms, reach):
 def test_adaptive_steps_are_rejected_where_the_iteration_of_multipliers_fails():
     """Newton's method takes the long steps that the error admits; the iteration of multipliers rejects them."""
     rods = two_rods(m=1.0)
-    ours, newton = (sc.compile_stepper(rods, lobatto(8), solver=solver) for solver in ("auto", "newton"))
+    ours, newton = (sc.compile_stepper(rods, lobatto(10), solver=solver) for solver in ("auto", "newton"))
     start, span = ([0.6, -0.8, 1.4, -1.4], newton.momentum([0.6, -0.8, 1.4, -1.4], [0.0] * 4, 0.0)), {"t_end": 5.0}
     run, long = (stepper.integrate(*start, **span, tolerance=1e-3) for stepper in (ours, newton))
     exact = newton.integrate(*start, h=0.05, steps=100)
