@@ -4,18 +4,12 @@ import re
 
 import numpy as np
 import pytest
+from samples import earth_and_moon
 from scipy.special import ellipk
 
 import scvi_codegen as sc
 
 PENDULUM = sc.LagrangianSystem.from_text("pendulum", ["q"], "q_dot**2/2 + g*cos(q)", parameters={"g": 1.0})
-RESTRICTED = sc.LagrangianSystem.from_text(
-    name="restricted three-body problem",
-    coordinates=["x", "y", "z"],
-    lagrangian="((x_dot - y)**2 + (y_dot + x)**2 + z_dot**2)/2"
-    " + (1 - mu)/sqrt((x + mu)**2 + y**2 + z**2) + mu/sqrt((x - 1 + mu)**2 + y**2 + z**2)",
-    parameters={"mu": 1.215058560962404e-2},
-)
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +19,7 @@ def pendulum():
 
 @pytest.fixture(scope="module")
 def moon():
-    return sc.compile_stepper(RESTRICTED, "svi:8")
+    return sc.compile_stepper(earth_and_moon(), "svi:8")
 
 
 @pytest.mark.rotated

@@ -3,18 +3,12 @@
 import numpy as np
 import pytest
 from notation import lagrange
+from samples import earth_and_moon
 from scipy.special import ellipk
 
 import scvi_codegen as sc
 
 PENDULUM = lagrange("pendulum", "q", "q_dot**2/2 + g*cos(q) + a*q**3", g=1, a=0)
-RESTRICTED = lagrange(
-    "restricted three-body problem",
-    "x y z",
-    "((x_dot - y)**2 + (y_dot + x)**2 + z_dot**2)/2"
-    " + (1 - mu)/sqrt((x + mu)**2 + y**2 + z**2) + mu/sqrt((x - 1 + mu)**2 + y**2 + z**2)",
-    mu=1.215058560962404e-2,
-)
 MIRROR = ["x", "-y", "z"]
 
 
@@ -25,7 +19,7 @@ def pendulum():
 
 @pytest.fixture(scope="module")
 def moon():
-    return sc.compile_stepper(RESTRICTED, "svi:8")
+    return sc.compile_stepper(earth_and_moon(), "svi:8")
 
 
 def closing(orbit, gain=0.0):
