@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from notation import lagrange
 from numpy.testing import assert_allclose
+from samples import earth_and_moon
 from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 
@@ -20,14 +21,7 @@ Jet Propulsion Laboratory (ssd.jpl.nasa.gov/tools/periodic_orbits.html)."""
 @pytest.fixture(scope="module")
 def restricted():
     """Three bodies in the rotating frame, by its Lagrangian."""
-    system = sc.LagrangianSystem.from_text(
-        name="restricted three-body problem",
-        coordinates=["x", "y", "z"],
-        lagrangian="((x_dot - y)**2 + (y_dot + x)**2 + z_dot**2)/2"
-        " + (1 - mu)/sqrt((x + mu)**2 + y**2 + z**2) + mu/sqrt((x - 1 + mu)**2 + y**2 + z**2)",
-        parameters={"mu": EARTH_MOON},
-    )
-    return sc.compile_stepper(system, sc.SVI(6))
+    return sc.compile_stepper(earth_and_moon(), sc.SVI(6))
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Properties of the C code: strict C99, C++ headers, no allocation, no globals, reproducible, no user text."""
+"""Properties of the C code: C++ headers, no allocation, no globals, reproducible, no user text."""
 
 import os
 import re
@@ -15,8 +15,7 @@ import pytest
 from notation import hamilton, lagrange
 from programs import needs
 from samples import QUICK_FLAGS, sample_named
-from strict_c import STRICT, check_strict, run, write
-from style import check_style
+from strict_c import STRICT, run, write
 
 import scvi_codegen as sc
 from scvi_codegen.codegen.native.building import TUNED_FLAGS, _mathematics
@@ -53,7 +52,6 @@ METHODS = {
 }
 
 
-SHARES = 6
 TUNED = (sc.SVI(3), sc.Gauss(5), sc.SpectralCollocation(4), sc.SCVI(5, variational=False))
 
 
@@ -88,64 +86,6 @@ def generated(method: str) -> Mapping[str, tuple[Source, Interface]]:
     return found
 
 
-def share_of(method: str, share: int) -> list[Source]:
-    """Every sixth of the texts of a method: over the shares all of them."""
-    return [source for source, _ in generated(method).values()][share::SHARES]
-
-
-@pytest.mark.sampled(6)
-@pytest.mark.covering
-@pytest.mark.parametrize("share", range(SHARES))
-@pytest.mark.parametrize("method", METHODS)
-def test_code_compiles_without_warnings(method, share, tmp_path):
-    """The objects export nothing but names with the prefix, and hold no data that could be written."""
-    files = write(share_of(method, share), tmp_path)
-    run([needs("gcc"), *STRICT, "-O1", "-c", *files], tmp_path)
-    if sys.platform == "linux":
-        for file in files:
-            check_symbols(Path(file).stem, tmp_path)
-
-
-@pytest.mark.sampled(6)
-@pytest.mark.covering
-@pytest.mark.parametrize("share", range(SHARES))
-@pytest.mark.parametrize("method", METHODS)
-def test_clang_reports_no_warnings(method, share, tmp_path):
-    compiler = needs("clang")
-    run([compiler, *STRICT, "-c", *write(share_of(method, share), tmp_path)], tmp_path)
-
-
-@pytest.mark.covering
-@pytest.mark.parametrize("compiler", ["gcc", "clang"])
-@pytest.mark.parametrize("solver", ["auto", "newton"])
-@pytest.mark.parametrize("name", ["kepler", "double-pendulum", "driven Hamiltonian"])
-def test_sources_for_this_machine_compile_without_warnings(name, solver, compiler, tmp_path):
-    """Sources with a fallback library and with a step density."""
-    system = systems()[name]
-    q = system.coordinates[0].name
-    time_transformation = f"1/(1 + {q}**2)"
-    stepper = sc.compile_stepper(
-        system, sc.SVI(3), solver=solver, time_transformation=time_transformation, prefix="own", flags=QUICK_FLAGS
-    )
-    texts = [stepper.source, *([stepper.fallback] if stepper.fallback else [])]
-    assert len(texts) == (2 if solver == "auto" else 1)
-    for number, text in enumerate(texts):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        check_strict(text, folder, compiler=compiler)
-        check_style(text.header)
-        variables = re.findall(r"^(\w+) [BbCc]", run([needs("nm"), "-P", f"{text.prefix}.o"], folder), re.MULTILINE)
-        assert variables == []
-
-
-def check_symbols(prefix: str, folder: Path) -> None:
-    symbols = [line.split() for line in run([needs("nm"), "-P", f"{prefix}.o"], folder).splitlines()]
-    assert [name for name, kind, *_ in symbols if kind.isupper() and kind != "U" and not name.startswith(prefix)] == []
-    assert [name for name, kind, *_ in symbols if kind in "DdBbCSsGg"] == []
-    _, line = run([needs("size"), f"{prefix}.o"], folder).splitlines()
-    assert line.split()[1:3] == ["0", "0"]  # data, bss
-
-
 @pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("method", METHODS)
 def test_code_allocates_nothing_writes_nothing_and_has_no_static_state(method):
@@ -169,19 +109,6 @@ def test_headers_compile_as_c_plus_plus(tmp_path):
     objects = [f"{Path(file).stem}.o" for file in files]
     run([needs("g++"), *CXX, "main.cpp", *objects, "-lm", "-o", "main"], tmp_path)
     run([str(tmp_path / "main")], tmp_path)
-
-
-@pytest.mark.sampled(1)
-@pytest.mark.covering
-@pytest.mark.parametrize("solver", ["newton", "fixed-point"])
-@pytest.mark.parametrize("compiler", ["gcc", "clang"])
-def test_either_solver_alone_compiles_without_warnings(compiler, solver, tmp_path):
-    methods = (sc.SVI(2), sc.Gauss(3), sc.StoermerVerlet(), sc.SpectralCollocation(2), sc.SCVI(3, variational=False))
-    names = ("kepler", "driven-duffing", "pumped-cart-pole")
-    sources = [sc.generate_source(systems()[name], method, solver=solver)[0] for method in methods for name in names]
-    sources += [sc.generate_source(driven_hamiltonian(), method, solver=solver)[0] for method in methods[:3]]
-    files = write(sources, tmp_path)
-    run([needs(compiler), *STRICT, "-c", *files], tmp_path)
 
 
 @pytest.mark.sampled(1)

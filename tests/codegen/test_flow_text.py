@@ -1,4 +1,4 @@
-"""C code of flows compiles without warnings, in the project style, for every kind of solver."""
+"""C code of flows, and of derivatives of each kind of solver, compiles without warnings, in the project style."""
 
 import pytest
 from samples import linkage, pumped_cart_pole, two_rods

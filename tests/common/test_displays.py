@@ -97,48 +97,11 @@ def test_every_display_is_well_formed_and_short(name):
 
 
 class TestMethod:
-    def test_method_display_lists_its_properties(self):
-        shown = sc.SVI(3)._repr_html_()
-        assert re.search(r">order</th><td[^>]*>6</td>", shown)
-        assert re.search(r">symplectic</th><td[^>]*>yes</td>", shown)
-        assert re.search(r">symplectic</th><td[^>]*>no</td>", sc.SpectralCollocation(3)._repr_html_())
-
     def test_coefficients_are_exact_where_they_are_short(self):
         shown = sc.SVI(3)._repr_html_()
         assert "<msqrt><mn>15</mn></msqrt>" in shown
         assert "0.77459666924148338" in shown
         assert "msqrt" not in sc.SVI(9, "gauss-legendre:9", nodes="legendre-lobatto")._repr_html_()
-
-
-class TestSystem:
-    def test_lagrangian_is_typeset(self):
-        shown = sc.problem("planar-pendulum").system.with_parameters(g=9.81)._repr_html_()
-        assert "<math" in shown
-        assert "<mi>L</mi>" in shown
-        assert "g = 9.81" in shown
-        assert "<mi>H</mi>" in sc.hamiltonian_of(sc.problem("planar-pendulum").system)._repr_html_()
-
-    def test_long_lagrangian_is_abbreviated_with_a_count(self):
-        text = " + ".join(f"q{k}_dot**2/2 - (q{k} - q{(k + 1) % 40})**4/4" for k in range(40))
-        large = lagrange("chain", [f"q{k}" for k in range(40)], text)._repr_html_()
-        assert re.search(r"L: \d{3} operations", large)
-        assert ".. (40)" in large
-
-
-class TestEquations:
-    def test_equations_are_typeset_with_numbers(self):
-        shown = DISPLAYED["equations"]()._repr_html_()
-        assert shown.count("(27a)") == shown.count("(27b)") == 1
-        assert "<math" in shown
-
-    def test_large_equations_are_abbreviated_in_every_form(self):
-        derived = sc.derive(sc.problem("double-pendulum").system, sc.SVI(6))
-        assert repr(derived) == "<12 equations of double pendulum by svi-6-gauss-legendre-6>"
-        assert derived._repr_latex_() is None
-        shown = derived._repr_html_()
-        assert re.search(r"\(27a\) \d+ operations", shown)
-        small = DISPLAYED["equations"]()
-        assert small._repr_latex_() == small.to_latex()
 
 
 def test_rows_of_numbers_are_numbered_as_in_the_formulas():

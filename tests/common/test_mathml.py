@@ -64,47 +64,12 @@ def test_mathml_evaluates_to_the_expression(expression):
     check_read_back(expression)
 
 
-GREEK = '<mi mathvariant="normal" style="font-style:italic">'
-TAU_1 = f"<msub>{GREEK}τ</mi><mn>1</mn></msub>"
-DOT = '<mo style="font-weight:bold;padding-bottom:0.12em">˙</mo></mover>'
-NAMED = {
-    "theta_1": f"<msub>{GREEK}θ</mi><mn>1</mn></msub>",
-    "theta1": f"<msub>{GREEK}θ</mi><mn>1</mn></msub>",
-    "Q__2_x": "<msubsup><mi>Q</mi><mi>x</mi><mn>2</mn></msubsup>",
-    "Q_2_x": "<msubsup><mi>Q</mi><mi>x</mi><mn>2</mn></msubsup>",
-    "Q_1": "<msup><mi>Q</mi><mn>1</mn></msup>",
-    "\\dot{q}": f'<mover accent="true"><mi>q</mi>{DOT}',
-    "\\hat{D}_1": '<msub><mover accent="true"><mi>D</mi><mo>^</mo></mover><mn>1</mn></msub>',
-    "w__'_1": "<msubsup><mi>w</mi><mn>1</mn><mo>′</mo></msubsup>",
-    "q_dot": f'<mover accent="true"><mi>q</mi>{DOT}',
-    "q1_dot_k": f'<msub><mover accent="true"><mi>q</mi>{DOT}<mrow><mn>1</mn><mo>,</mo><mi>k</mi></mrow></msub>',
-    "p_k": "<msub><mi>p</mi><mi>k</mi></msub>",
-    "q_{k+1}": "<msub><mi>q</mi><mrow><mi>k</mi><mo>+</mo><mn>1</mn></mrow></msub>",
-    "lambda_1_q1": f"<msub>{GREEK}λ</mi><mrow><mn>1</mn><mo>,</mo><msub><mi>q</mi><mn>1</mn></msub></mrow></msub>",
-    "l_1_0": f"<mrow><msub><mi>l</mi><mn>0</mn></msub><mo>(</mo>{TAU_1}<mo>)</mo></mrow>",
-    "_h": "<mi>h</mi>",
-    "a<b&c": "<mi>a&lt;b&amp;c</mi>",
-}
-
-
-@pytest.mark.parametrize("name", NAMED)
-def test_names_are_typeset(name):
-    assert inner(Symbol(name)) == NAMED[name]
-
-
 @pytest.mark.parametrize(
     ("number", "text"),
     [("0.1", "0.1"), ("3.0", "3.0"), ("0.33333333333333333", "0.333333"), ("1e-12", "1.0·10\N{MINUS SIGN}12")],
 )
 def test_numbers_have_sensible_digits(number, text):
     assert "".join(ElementTree.fromstring(Typeset.whole(Float(number, 50))).itertext()) == text
-
-
-def test_a_power_of_a_symbol_with_an_upper_index_is_in_brackets():
-    assert (
-        inner(Symbol("Q_1") ** 2)
-        == "<msup><mrow><mo>(</mo><msup><mi>Q</mi><mn>1</mn></msup><mo>)</mo></mrow><mn>2</mn></msup>"
-    )
 
 
 @pytest.mark.parametrize(
@@ -126,10 +91,6 @@ def test_all_kinds_are_well_formed_and_without_html_entities(expression):
     for text in (Typeset.whole(expression), *Typeset.terms(expression)):
         ElementTree.fromstring(text)
         assert set(re.findall(r"&\w+;", text)) <= {"&lt;", "&gt;", "&amp;"}
-
-
-def test_functions_have_their_standard_names():
-    assert inner(Function("L_d")(x)).startswith("<mrow><msub><mi>L</mi><mi>d</mi></msub>")
 
 
 class TestTerms:

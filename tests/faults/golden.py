@@ -21,13 +21,14 @@ def changed_program(header: str, faulty: str) -> str:
         header: path of the header in the checkout.
         faulty: its text with the fault.
     """
-    support = header.removeprefix("templates/")
+    support, correct = header.removeprefix("templates/"), (ROOT / header).read_text()
     for name in CELLS:
         source, main = _generated(name)
         assert source is not None
         if support not in (headers := dict(source.support)):
             continue
-        found = of_source(replace(source, support=tuple((headers | {support: faulty}).items())), main)
+        changed = headers[support].replace(correct, faulty)  # the guard around it stays
+        found = of_source(replace(source, support=tuple((headers | {support: changed}).items())), main)
         if found.code != _program(name).code:
             printed = _output(found)
             if printed is None:

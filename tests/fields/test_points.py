@@ -102,21 +102,6 @@ def test_equal_elements_are_divided_at_places():
     assert given.cell_points[:, 0].tolist() == [0, 0.3, 0.5, 0.55]
 
 
-@pytest.mark.parametrize(
-    ("points", "options", "message"),
-    [
-        ([{"x": 1.5, "lagrangian": "u"}], {}, "at x = 1.5 is outside of the axis, 0 to 1"),
-        ([{"y": 0.5, "lagrangian": "u"}], {}, "a point Lagrangian needs a place and a formula, .*\"x\": .., .*'y'"),
-        ([{"x": 0.5, "lagrangian": "u_x**2"}], {}, "unknown name 'u_x'"),
-        ([{"x": 0, "lagrangian": "u_t**2"}], {"degree": 4, "elements": 2}, "at x = 0 is not at an unknown"),
-        ([{"x": 0.3, "lagrangian": "u"}], {"degree": 9}, 'at x = 0.3 is not .*: use "spectral-elements"'),
-    ],
-)
-def test_errors_of_points_have_names(points, options, message):
-    with pytest.raises(sc.SystemDefinitionError, match=message):
-        string(points).discretise("legendre" if {*options} == {"degree"} else "spectral-elements", **options)
-
-
 def test_masses_need_a_point_and_hamiltonian_densities_have_none():
     ring = {"space": {"x": (0, 1)}, "boundary": {"x": "periodic"}}
     mass = [{"x": 0.3, "lagrangian": "m*u_t**2/2"}]

@@ -27,7 +27,7 @@ from scvi_codegen.extras.derivation.equations import derive
 from scvi_codegen.extras.derivation.notation import table_entries
 from scvi_codegen.extras.derivation.page.document import ITERATIONS, derivation_html, kernels_of
 from scvi_codegen.extras.derivation.page.drawings import curve_section, jacobian_pattern
-from scvi_codegen.extras.derivation.writing import MOST_LINES, Formula
+from scvi_codegen.extras.derivation.writing import Formula
 from scvi_codegen.methods.discretise import paper_equations
 from scvi_codegen.methods.tables.number_tables import positions
 
@@ -154,20 +154,6 @@ class TestPage:
             assert temporaries == body.count("const")
             assert results == len(re.findall(r"^  (?:value|derivative)\[", body, re.MULTILINE))
             assert before == sum(sympy.count_ops(formula) for formula in kernel.formulas)
-
-    @pytest.mark.rotated
-    def test_large_system_is_abbreviated_with_a_note(self):
-        system = sc.problem("outer-solar-system").system
-        page = derivation_html(system, sc.SVI(8))
-        assert len(page.encode()) < 1_000_000
-        Page(page)
-        assert re.search(r"The first \d of 18 equations\.", page)
-        assert "144 rows and columns" in page
-        assert "they are omitted here" in page
-        functions = sc.generate_source(system, sc.SVI(8))[0].functions
-        count = sum(len(functions[f"quadrature_derivatives{end}"].text.splitlines()) for end in ("_1", "_2", ""))
-        assert count > 1000
-        assert f"/* .. {count - MOST_LINES} more lines */" in page
 
 
 @pytest.mark.rotated

@@ -197,7 +197,7 @@ def test_the_matrix_of_multipliers_of_a_chain_is_a_band(terms, reach):
 def test_adaptive_steps_are_rejected_where_the_iteration_of_multipliers_fails():
     """Newton's method takes the long steps that the error admits; the iteration of multipliers rejects them."""
     rods = two_rods(m=1.0)
-    ours, newton = (sc.compile_stepper(rods, lobatto(8), solver=solver) for solver in ("auto", "newton"))
+    ours, newton = (sc.compile_stepper(rods, lobatto(10), solver=solver) for solver in ("auto", "newton"))
     start, span = ([0.6, -0.8, 1.4, -1.4], newton.momentum([0.6, -0.8, 1.4, -1.4], [0.0] * 4, 0.0)), {"t_end": 5.0}
     run, long = (stepper.integrate(*start, **span, tolerance=1e-3) for stepper in (ours, newton))
     exact = newton.integrate(*start, h=0.05, steps=100)
@@ -424,11 +424,6 @@ def test_constraints_of_a_hamiltonian_equal_those_of_its_lagrangian():
 
 @pytest.mark.rotated
 def test_unsupported_combinations_with_constraints_are_rejected():
-    rolling = lagrange("blade", "x y", "(x_dot**2 + y_dot**2)/2", constraints=["x_dot = y*y_dot"])
-    with pytest.raises(sc.SystemDefinitionError, match="nonholonomic constraints"):
-        sc.reparametrise(rolling, "1 + x**2")
-    with pytest.raises(sc.SystemDefinitionError, match="constraints"):
-        sc.hamiltonian_of(rod())
     free = sc.HamiltonianSystem.from_text(name="free", coordinates=["x"], hamiltonian="p_x**2/2")
     with pytest.raises(sc.SystemDefinitionError, match="constraints"):
         replace(free, constraints=free.coordinates)

@@ -89,11 +89,3 @@ def test_order_of_a_user_defined_rule_is_computed() -> None:
     assert (exact.points, exact.weights, exact.order) == (sc.gauss_legendre(2).points, sc.gauss_legendre(2).weights, 4)
     assert sc.Quadrature(name="modest", points=(-1, 0, 1), weights=(third, 4 * third, third), order=2).order == 2
     assert not sc.Quadrature(name="lopsided", points=(-1, 1), weights=(0.5, 1.5)).symmetric
-
-
-def test_counts_and_sides_are_checked_even_after_a_cached_call() -> None:
-    sc.gauss_radau(2)
-    with pytest.raises(sc.MethodError, match=r"not 2\.0"):
-        sc.gauss_radau(2.0)  # type: ignore[arg-type]  # the wrong type is the point
-    with pytest.raises(sc.MethodError, match="'left' or 'right', got 'middle'"):
-        sc.gauss_radau(2, "middle")  # type: ignore[arg-type]  # the wrong value is the point

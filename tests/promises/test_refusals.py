@@ -5,7 +5,8 @@ A table ``["stepper.integrate".StateError.kepler]`` states what is called, the c
 function of the package, with the subject as first argument unless that is ``none``. Of several calls each is made,
 those of ensembles with one trajectory. A row, ``"words" = { arguments }``, has the words of the error in their order,
 with `` .. `` for what is between them; several arguments with the same error are a list. Methods of the result follow
-as ``then = { name = { arguments } }``. ``with`` has what the rows of a table share; ``second`` is the second tier.
+as ``then = { name = { arguments } }``; a ``start`` is made by a function of the package from its table. ``with`` has
+what the rows of a table share; ``second`` is the second tier.
 
 ``[subjects]`` are systems, as arguments of ``from_text``, and steppers, as a ``system`` with arguments of
 ``compile_stepper``. Other names are those of the catalogue.
@@ -49,6 +50,13 @@ def subject(description: str) -> Any:
     )
 
 
+@cache
+def start_of(description: str, made: str) -> Any:
+    """Return the orbit or the equilibrium of a stepper from which a family starts."""
+    ((function, arguments),) = json.loads(made).items()
+    return getattr(sc, function)(subject(description), **arguments)
+
+
 def value(name: str, x: Any) -> Any:
     """Return an argument as the package takes it: methods and events are made, tables of inputs are tuples."""
     if name == "method" and isinstance(x, dict) and "statements" in x:
@@ -73,6 +81,8 @@ def call(name: str, of: Any, arguments: dict[str, Any]) -> None:
     if name == "system":
         result = system_of(of | first)
     elif kind == "sc":
+        if isinstance(first.get("start"), dict):
+            first["start"] = start_of(json.dumps(of), json.dumps(first["start"]))
         result = getattr(sc, function)(*[] if of == "none" else [subject(json.dumps(of))], **first)
     else:
         result = getattr(subject(json.dumps(of)), function)(**first)

@@ -5,7 +5,6 @@ import pytest
 from notation import lagrange
 
 import scvi_codegen as sc
-from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.runs.results.joining import compensated_sums
 
 pytestmark = pytest.mark.rotated
@@ -173,20 +172,3 @@ def test_shadow_energy_is_constant_and_shows_a_drift(method, h):
     lost = 1e-11 * np.cumsum(np.einsum("ij,ij->i", run.p, run.p))[6:-6]
     assert abs(drifting[-1] - drifting[0] + lost[-1] - lost[0]) < 0.1 * lost[-1]
     assert np.ptp(run.energy()) > 10 * lost[-1]  # hidden there
-
-
-def test_shadow_energy_and_actions_are_refused_with_the_reason(stepper):
-    run = stepper.integrate(START[:2], START[2:], h=0.2, steps=40)
-    with pytest.raises(MethodError, match="with the long steps of this method"):
-        run.shadow_energy()
-    low = sc.compile_stepper(HENON_HEILES, "svi:1")
-    with pytest.raises(StateError, match="all states of a run of fixed step size"):
-        low.integrate(START[:2], START[2:], h=0.2, steps=40, save_every=2).shadow_energy()
-    with pytest.raises(StateError, match="more than 12 states"):
-        low.integrate(START[:2], START[2:], h=0.2, steps=8).shadow_energy()
-    with pytest.raises(StateError, match="even number from 2 to 24"):
-        low.integrate(START[:2], START[2:], h=0.2, steps=40).shadow_energy(7)
-    radau = sc.compile_stepper(HENON_HEILES, "radau-iia:2")
-    with pytest.raises(MethodError, match="without a sum of L along steps"):
-        radau.integrate(START[:2], START[2:], h=0.2, steps=4).action()
-    assert not radau.supports("action")

@@ -71,16 +71,6 @@ def test_failures_of_array_runs() -> None:
         sc.compile_stepper(FIELD, "svi:2").integrate(random(3, 2), h=0.4, steps=5)
 
 
-def test_index_out_of_range_of_a_table_is_rejected() -> None:
-    """A loop over another size than the table's rows, found before a row is read."""
-    system = lagrange("x", "q[N]", "sum(i in N, q_dot[i]**2/2 - q[bonds[i, 0]]**2)", tables=["bonds[B, 2]"])
-    message = r"bonds\[i, 0\] runs from 0 to 4, but bonds\[B, 2\] has B = 1 entries"
-    with pytest.raises(sc.StateError, match=message):
-        sc.compile_stepper(system, "svi:2").start(np.ones(5), h=0.1, tables={"bonds": [[0, 1]]})
-    with pytest.raises(sc.SystemDefinitionError, match="out of bounds"):
-        sc.unroll_sums(system, {"N": 5, "B": 1}, tables={"bonds": [[0, 1]]})
-
-
 @pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize(("method", "most"), [("svi:1", 1.3), ("svi:2", 1.6), ("svi:4", 2.2), ("svi:8", 3.4)])

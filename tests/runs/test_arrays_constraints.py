@@ -163,21 +163,6 @@ def test_model_files_and_generated_programs_have_constraints(tmp_path):
     assert "lambda*(2*r[i+1, 0] - 2*r[i, 0])" in sc.derive(model.system, model.method).to_text()
 
 
-@pytest.mark.parametrize(
-    ("bonds", "lengths", "message"),
-    [
-        ([[0, 1], [1, 2], [0, 1]], [1, 1, 1.001], r"'constraint 3\[0\]' and 'constraint 3\[2\]' contradict each other"),
-        ([[0, 1], [1, 2], [0, 1]], [1, 1, 1.0], r"'constraint 3\[0\]' and 'constraint 3\[2\]' are linearly dependent"),
-        ([[0, 1], [1, 2], [1, 1]], [1, 1, 1], r"'constraint 3\[2\]' contradict each other or cannot be reached"),
-    ],
-    ids=["contradiction", "a rod twice", "a rod to itself"],
-)
-def test_unsatisfiable_constraints_are_rejected(stepper, bonds, lengths, message):
-    q = [[0.0, 0], [1, 0], [1, 1]]
-    with pytest.raises(sc.StateError, match=message):
-        stepper.start(q, h=0.01, tables={"bonds": bonds, "pins": [0]}, parameters={"l": lengths}).advance(10)
-
-
 def test_discontinuous_constraint_parameters_are_rejected(stepper):
     q, data = chain(3)
     run = stepper.start(q, h=0.01, **data)
@@ -185,9 +170,3 @@ def test_discontinuous_constraint_parameters_are_rejected(stepper):
         run.update(parameters={"l": 0.5})
     run.advance(1)
     assert residuals(run)[0] < 1e-15
-
-
-@pytest.mark.parametrize("method", ["svi:2", "gauss:2", sc.StoermerVerlet("drift-kick-drift")])
-def test_methods_without_constraint_support_are_rejected(method):
-    with pytest.raises(sc.MethodError, match="RATTLE"):
-        sc.compile_stepper(net(), method)

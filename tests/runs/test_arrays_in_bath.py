@@ -1,4 +1,4 @@
-"""Arrays of run-time sizes in a heat bath: equal to named coordinates, temperatures, bits, refusals."""
+"""Arrays of run-time sizes in a heat bath: equal to named coordinates, temperatures, bits."""
 
 import numpy as np
 import pytest
@@ -63,15 +63,3 @@ def test_other_baths_are_compiled_for_the_sizes_of_a_call():
     run = sc.compile_stepper(chain, "svi:1").integrate(START, np.ones(4), h=0.1, steps=200)
     assert_allclose(run.p["q"].sum(axis=1), 4.0, atol=1e-10)
     assert np.ptp(run.p["q"][-1]) > 0.1
-
-
-def test_refusals_name_the_reason():
-    stepper = sc.compile_stepper(sc.LagrangianSystem.from_text(**CHAIN), "stoermer-verlet")
-    with pytest.raises(sc.SystemDefinitionError, match="noise= of arrays is not supported"):
-        sc.LagrangianSystem.from_text(**CHAIN, noise={"q": "1"})
-    with pytest.raises(sc.MethodError, match="metropolis"):
-        stepper.integrate(START, np.zeros(4), h=0.1, steps=1, metropolis=True, parameters=VALUES)
-    with pytest.raises(sc.ScviCodegenError):
-        stepper.integrate(START, np.zeros(4), t_end=1.0, parameters=VALUES)
-    with pytest.raises(sc.StateError, match="is -1 at t = 0"):
-        stepper.integrate(START, np.zeros(4), h=0.1, steps=1, parameters={**VALUES, "kT": -1.0})

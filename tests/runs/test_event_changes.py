@@ -607,21 +607,6 @@ def test_values_of_unknown_symbols_are_refused(ball):
     ball.integrate([1.0], [0.0], h=0.1, steps=30, events=sc.Event("y", then={"p_y": "p_y"}, where="y > 1 - 1"))
 
 
-@pytest.mark.quick
-def test_unsupported_combinations_are_refused():
-    pendulum = sc.problem("planar-pendulum").system
-    with pytest.raises(sc.EventError, match="in transformed time, where the energy is the constant"):
-        sc.compile_stepper(sc.reparametrise(pendulum, "1 + q**2"), "svi:4", events=sc.Event("q", then={"p_q": "-p_q"}))
-
-
-def test_restitution_of_parameters_is_not_negative():
-    bouncing = lagrange("ball", "y", "y_dot**2/2 - y + 0*e", e=-0.5)
-    with pytest.raises(sc.EventError, match=r"after the event 'y' .* its restitution is negative"):
-        sc.compile_stepper(bouncing, "svi:2", flags=FLAGS, events=sc.impact("y", "e")).integrate(
-            [1.0], [0.0], t_end=4.0
-        )
-
-
 def test_no_accuracy_warnings_of_energies_that_impacts_change(ball):
     with warnings.catch_warnings(action="error", category=sc.AccuracyWarning):
         sc.compile_stepper(BALL, "svi:4", flags=FLAGS).integrate(

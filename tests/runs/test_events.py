@@ -2,7 +2,6 @@
 
 import math
 import pickle
-import subprocess
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ import sympy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from notation import hamilton, lagrange
-from programs import needs
 from sympy.physics.mechanics import dynamicsymbols
 
 import scvi_codegen as sc
@@ -22,7 +20,6 @@ from scvi_codegen.systems.system import MechanicalSystem
 pytestmark = pytest.mark.rotated
 
 FLAGS = ("-O0",)
-CHANGES = [sc.impact("q - sin(t)", where="q > 0"), sc.Event("q", then={"q_dot": "-q_dot"})]
 FREE = sc.LagrangianSystem.from_text(name="free particle", coordinates=["q"], lagrangian="q_dot**2/2")
 
 
@@ -256,34 +253,6 @@ def test_stepper_with_events_is_pickled(pendulum):
     assert [len(found) for found in watched.integrate([0.5], [0.0], h=0.1, steps=200).events] == [3, 6]
     assert pendulum.events == ()
     assert watched.with_events(()).source == pendulum.source
-
-
-@pytest.mark.covering
-@pytest.mark.parametrize("compiler", ["gcc", "clang"])
-@pytest.mark.parametrize(
-    ("name", "method", "events"),
-    [
-        ("kepler", sc.SVI(4), ["q1*q2_dot - 1/sqrt((q1**2 + q2**2)**3)", "q2"]),
-        ("planar-pendulum", sc.StoermerVerlet(), ["sin(t)"]),
-        ("double-pendulum", sc.SCVI(2), ["t*theta1_dot", "sqrt(1 + theta2**2)**-5 - p_theta1"]),
-        ("harmonic-oscillator", sc.SVI(4), CHANGES),
-        ("planar-pendulum", sc.SVI(4), CHANGES),
-    ],
-)
-def test_source_with_events_extends_the_plain_one_without_warnings(compiler, name, method, events, tmp_path):
-    needs(compiler)
-    system, controlled = sc.problem(name).system, name == "planar-pendulum" and events is CHANGES
-    plain, _ = sc.generate_source(system, method, prefix="watched", controlled=controlled)
-    source, _ = sc.generate_source(system, method, prefix="watched", events=events, controlled=controlled)
-    assert (source.header, source.code) == (plain.header, plain.code)
-    assert source == sc.generate_source(system, method, prefix="watched", events=events, controlled=controlled)[0]
-    for each in source.amalgamated().sources:
-        (tmp_path / f"{each.prefix}.h").write_text(each.header)
-        (tmp_path / f"{each.prefix}.c").write_text(each.code)
-    strict = "-std=c99 -O1 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Wno-psabi -Werror -c".split()  # noqa: SIM905  (as typed)
-    command = [compiler, *strict, "watched.c", "watched_events.c"]
-    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert (result.returncode, result.stderr) == (0, "")
 
 
 def test_a_stepper_may_be_compiled_with_events():

@@ -192,17 +192,6 @@ def test_members_of_ensembles_have_dense_output_across_kinks():
     assert member.at(times)[1] == pytest.approx(stepper.integrate([1.0], [0.0], **settings).at(times)[1], abs=1e-12)
 
 
-@pytest.mark.rotated
-def test_sliding_is_an_error_that_names_it():
-    """By points that are not those of constraints, and where the force is not along the slip."""
-    rough = lagrange("rough", "x", "x_dot**2/2 - x**2/2", forces={"x": "-0.15*sign(x_dot)"})
-    with pytest.raises(sc.EventError, match=r"slides on 'x_dot' = 0 .* sc\.friction"):
-        sc.compile_stepper(rough, sc.SVI(4)).integrate([1.0], [0.0], t_end=10.0)
-    text, forces = "(x_dot**2 + y_dot**2 - x**2 - y**2)/2", {"x": "-0.15*sign(x_dot - y_dot)"}
-    with pytest.raises(sc.EventError, match=r"slides on 'x_dot - y_dot' = 0 .* sc\.friction"):
-        sc.compile_stepper(lagrange("belt", "x y", text, forces=forces), "svi:4").integrate([1, 0], [0, 0], t_end=10)
-
-
 @pytest.mark.full
 def test_steps_across_kinks_are_verified():
     """Sizes of tangent vectors are those of the parameters, without modes."""

@@ -1,4 +1,4 @@
-"""Ensembles in single precision: beside double precision, kept digits, what they refuse."""
+"""Ensembles in single precision: beside double precision, kept digits."""
 
 from functools import cache
 from typing import Any
@@ -67,27 +67,3 @@ def test_sums_are_compensated_and_continue_in_double_precision_beyond_the_range(
         span = {"h": (r / GM) ** 0.5 * r / 64, "steps": 100, "parameters": {"mu": GM}}
         runs = [stepper_of("kepler").integrate_ensemble(*start, **span, precision=x) for x in ("single", "double")]
         assert np.abs(runs[0].q - runs[1].q).max() < 10 * EPS * r
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"h": None, "steps": None, "t_end": 1.0}, r"adaptive .* not available with precision='single': give h"),
-        ({"observe": "energy"}, r"observe=.* not available with precision='single'"),
-        ({"action": True}, "action is not available with precision='single'"),
-        ({"h": 1e-40}, "size 1e-40 is outside the range of single precision"),
-        ({"parameters": {"mu": 1e39}}, "size 1e.39 is outside the range of single precision"),
-        ({"precision": "half"}, "precision is 'half': ensembles have 'double' and 'single'"),
-    ],
-)
-def test_refusals_name_the_precision_and_the_remedy(arguments: dict[str, Any], message: str) -> None:
-    kepler = stepper_of("kepler") if "h" not in arguments else stepper_of("henon-heiles")
-    with pytest.raises(sc.ScviCodegenError, match=message):
-        kepler.integrate_ensemble(
-            [[1.0, 0.0]], [[0.0, 1.0]], **{"h": 0.1, "steps": 1, "precision": "single", **arguments}
-        )
-
-
-def test_compiled_steppers_have_no_single_precision() -> None:
-    with pytest.raises(sc.MethodError, match=r"that of ensembles, integrate_ensemble\(.., precision='single'\)"):
-        sc.compile_stepper(sc.problem("kepler").system, "svi:4", precision="single")

@@ -30,13 +30,6 @@ def test_work_balance_with_impacts(thrown, plan):
 
 
 @pytest.mark.second
-def test_unsupported_systems_have_no_work_balance(thrown):
-    stepper = sc.compile_stepper(thrown, sc.RadauIIA(2))
-    with pytest.raises(sc.MethodError, match="SVI, SCVI"):
-        stepper.integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=2).impulses()
-
-
-@pytest.mark.second
 def test_missing_newton_iteration_is_an_error_message(thrown):
     stepper = sc.compile_stepper(thrown, sc.SVI(3), solver="fixed-point")
     run = stepper.integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=2)

@@ -236,23 +236,6 @@ def test_model_files(tmp_path) -> None:
     assert np.array_equal(package.integrate(model.q, model.p, h=0.1, steps=10).variables, model.integrate().variables)
 
 
-@pytest.mark.rotated
-def test_unsupported_uses_are_named() -> None:
-    particle = system("massless particle")
-    changes = {"system without impacts": sc.impact("x"), "'y_dot' is not a": sc.Event("x", then={"y_dot": "1"})}
-    for message, event in changes.items():
-        with pytest.raises(sc.EventError, match=message):
-            sc.compile_stepper(particle, "svi:1", events=event)
-    for method in ("scvi:3", "composition"):
-        with pytest.raises(sc.MethodError):
-            sc.compile_stepper(particle, method).integrate([1.0, 0.2], h=0.1, steps=1)
-    slow = sc.compile_stepper(sc.reparametrise(particle, "1 + x**2"), "svi:2")
-    with pytest.raises(sc.MethodError, match="jacobian is not available in transformed time of a first-order system"):
-        slow.jacobian(*particle.halves([1.0, 0.2]), 0.1)
-    with pytest.raises(sc.SystemDefinitionError, match="use reparametrise"):
-        sc.compile_stepper(particle, "svi:2", time_transformation="1 + x**2").integrate([1.0, 0.2], h=0.1, t_end=1.0)
-
-
 @pytest.mark.second
 def test_inputs(tmp_path) -> None:
     driven = lagrange("driven", "x y", "(x + x**3)*y_dot - x**2/2 - y**2/2 - f*x - f**2*y", inputs="f")

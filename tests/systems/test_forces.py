@@ -1,12 +1,10 @@
 """Nonconservative forces: their definition and their derived expressions."""
 
-import pytest
 import sympy
 from notation import hamilton, lagrange
 from sympy.physics.mechanics import LagrangesMethod, Point, ReferenceFrame, dynamicsymbols
 
 import scvi_codegen as sc
-from scvi_codegen.methods.discretise import discretise
 
 PARAMETERS = {"m": 1.2, "c": 0.1, "F": 0.5, "w": 2.0}
 
@@ -77,15 +75,3 @@ def test_forces_of_sympys_mechanics_act_through_velocities():
         "pulled", "theta", "l**2*theta_dot**2/2", l=2, forces={"theta": "-3*l*sin(theta) - l**2*theta_dot + 5"}
     )
     assert sympy.simplify(system.forces[0] - expected.forces[0]) == 0
-
-
-def test_functions_that_need_an_action_reject_forces():
-    system = driven(forces={"x": "-c*x_dot"})
-    with pytest.raises(sc.SystemDefinitionError, match="forces act on 'driven'"):
-        sc.reparametrise(system, "1 + x**2")
-    with pytest.raises(sc.StateError, match="not derivatives of an action"):
-        sc.exact_discrete_lagrangian(system, [0, 0], [1, 1], 0.1)
-    with pytest.raises(sc.MethodError, match="without derivatives"):
-        discretise(system, sc.SVI(2, "hermite:2"))
-    with pytest.raises(sc.MethodError, match="lagrangian_of"):
-        discretise(sc.hamiltonian_of(system), sc.SCVI(2))

@@ -89,6 +89,13 @@ def sleigh() -> LagrangianSystem:
     return lagrange("sleigh", "x y a", text, constraints=["x_dot*sin(a) - y_dot*cos(a)"], m=1.3, J=0.7, d=0.2, k=0.5)
 
 
+def earth_and_moon() -> LagrangianSystem:
+    """Return the restricted three-body problem in the rotating frame."""
+    distances = "(1 - mu)/sqrt((x + mu)**2 + y**2 + z**2) + mu/sqrt((x - 1 + mu)**2 + y**2 + z**2)"
+    text = f"((x_dot - y)**2 + (y_dot + x)**2 + z_dot**2)/2 + {distances}"
+    return lagrange("restricted three-body problem", "x y z", text, mu=1.215058560962404e-2)
+
+
 def pushed_pendulum() -> LagrangianSystem:
     """Return a pendulum with a force u and a moving pivot w."""
     text = "q_dot**2/2 + (1 + w)*cos(q)"

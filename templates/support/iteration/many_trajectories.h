@@ -140,7 +140,7 @@ static SELDOM int decide_lanes(progress *now, const solver_options *options, int
   for (int j = 0; j < LANES; j++)
     if (status.lane[j] == 0.0 || status.lane[j] == -1.0) {
       trajectory_progress seen = {0.0, last.lane[j], before.lane[j], earlier.lane[j], amplified.lane[j],
-          (int)status.lane[j], (int)since.lane[j], by_largest.lane[j] > 0.0};
+          (int)status.lane[j], (int)since.lane[j], by_largest.lane[j] > 0.0, 0};
       holds.lane[j] = amplifies ? is_to_amplify(&seen, options, k) : is_one_stagnant(&seen, options, k);
       any |= holds.lane[j] > 0.0;
       last.lane[j] = seen.last, before.lane[j] = seen.before, earlier.lane[j] = seen.earlier;

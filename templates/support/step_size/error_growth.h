@@ -266,14 +266,14 @@ static inline double with_sign(double x, unsigned long long bits)
   return x;
 }
 
-/* Adds the rounding d of the positions at the start of the step, for a number of steps whose root is `weight`. */
-static inline void add_rounding(run_memory *run, const step_data *step, double weight, double *rounding)
+/* Adds the rounding d of the positions at the start of the step, for a number of steps whose root is `walk`. */
+static inline void add_rounding(run_memory *run, const step_data *step, double walk, double *rounding)
 {
   unsigned long long bits = (unsigned long long)run->signs;
   bits ^= bits << 13, bits ^= bits >> 7, bits ^= bits << 17; /* xorshift (Marsaglia 2003) */
   run->signs = (long long)bits;
   for (int i = 0; i < M; i++) {
-    rounding[i] = with_sign(ROUNDING * weight * step->q0[i], bits >> i % 24);
+    rounding[i] = with_sign(ROUNDING * walk * step->q0[i], bits >> i % 24);
     run->tangent[i][0] += rounding[i];
   }
 }
@@ -314,7 +314,7 @@ static __attribute__((noinline)) void measure_growth(run_memory *run, const step
   const long long since = run->tangent_steps - run->added;
   const int most = tolerance > LARGE_TOLERANCE ? LARGE_STEPS_OF_ERRORS : STEPS_OF_ERRORS;
   const int adds = since >= most || run->tangent_steps < STEPS_OF_ERRORS || last;
-  const double weight = adds ? sqrt((double)(since > 0 ? since : 1)) : 0.0;
+  const double walk = adds ? sqrt((double)(since > 0 ? since : 1)) : 0.0;
   double rounding[M];
   if (run->tangent_steps == 0) {
     run->tangent_h = step->h;
@@ -324,7 +324,7 @@ static __attribute__((noinline)) void measure_growth(run_memory *run, const step
       run->lowest[i] = run->highest[i] = step->q0[i];
   }
   if (adds)
-    add_rounding(run, step, weight, rounding);
+    add_rounding(run, step, walk, rounding);
   if (tolerance > LARGE_TOLERANCE && KNOTS <= 4) {
     advance_tangent(run, step, data, X, 1, 0.5 * step->h);
     advance_tangent(run, step, data, X, 2, 0.5 * step->h);
@@ -333,7 +333,7 @@ static __attribute__((noinline)) void measure_growth(run_memory *run, const step
   if (!run->measures_growth)
     return;
   if (adds) {
-    add_error(run, step, dq, larger(REAL_EPSILON / 2, PART_OF_TOLERANCE * tolerance) * weight, rounding, tolerance);
+    add_error(run, step, dq, larger(REAL_EPSILON / 2, PART_OF_TOLERANCE * tolerance) * walk, rounding, tolerance);
     run->added = run->tangent_steps;
   }
   run->tangent_steps++;
