@@ -37,7 +37,6 @@ from scvi_codegen.runs.accuracy.size import (
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runs.results.dense_output import parameters_set_until
 from scvi_codegen.runs.results.joining import concatenated
-from scvi_codegen.runs.results.output import ALL_STATES
 from scvi_codegen.runs.results.recomputation import motion_by_reactions, steps_after
 from scvi_codegen.runs.results.saved_states import Array, SavedStates, times_of_changes
 from scvi_codegen.runs.states.rotations import members_of
@@ -443,7 +442,7 @@ class _Replay:
         changes = self.finer.changes_states or interface.kinks or interface.modes or interface.contacts
         start = np.split(state if changes else state - self.now, 2)
         plan, parameters = ending_at(Adaptive(stop), stop), parameters_set_until(piece, t)
-        fine = self.finer._run(*start, plan=plan, t=t, parameters=parameters)._recorded(None, ALL_STATES)
+        fine = self.finer._run(*start, plan=plan, t=t, parameters=parameters)._recorded(None)
         after = self._state(piece, end)
         if changes:
             is_on_constraints = self.finer.constraints or interface.contacts  # rounded states are not
@@ -524,7 +523,7 @@ def _states_of(run: Any, finer: Any, seed: int) -> tuple[Any, Any]:
                 start = [_rounded(x, rounding * random.standard_normal(x.shape[-1]), words) for x in start]
             stop = float(piece.t[last])
             plan = ending_at(piece.plan if run.stepper.in_tau else Adaptive(stop, tolerance), stop)
-            fine = finer._run(*start, plan=plan, t=t, parameters=parameters)._recorded(None, ALL_STATES)
+            fine = finer._run(*start, plan=plan, t=t, parameters=parameters)._recorded(None)
             parts.append(fine._states_at(piece.t[first : last + 1]))
             t, start = piece.t[last], [x[-1] for x in parts[-1]]
     q, p = (concatenated(list(of)) for of in zip(*parts, strict=True))

@@ -179,7 +179,7 @@ class IndividualRuns:
             of_inputs = columns_of_inputs(stepper.interface) if ensemble.inputs else ()
             values = zip(stepper.interface.parameters, parameters.tolist(), strict=True)
             parameters = {name: value for k, (name, value) in enumerate(values) if k not in of_inputs}
-        steps: dict[str, Any] = {"t_end": float(self.ends[j]), **ensemble.settings.control.named}
+        steps: dict[str, Any] = {"t_end": float(self.ends[j]), **ensemble.settings.size.named}
         if ensemble.fixed is not None:
             steps = ensemble.fixed.arguments
         return steps | {
