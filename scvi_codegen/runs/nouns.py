@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
+from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise
+
 
 class Save(NamedTuple):
     """States that a run saves, and what it calls.
@@ -36,7 +38,7 @@ class Execution(NamedTuple):
         tables, threads: of arrays of run-time sizes.
         action: whether the action is summed.
         transitions, strict_energy: of contacts.
-        seed, metropolis: of the noise.
+        noise: its stream, not checked.
     """
 
     check_growth: bool | None = None
@@ -47,8 +49,7 @@ class Execution(NamedTuple):
     action: bool = False
     transitions: str | None = None
     strict_energy: bool = False
-    seed: int = 0
-    metropolis: bool = False
+    noise: Noise = DEFAULT_NOISE
 
 
 ALL_STATES, PLAIN = Save(), Execution()

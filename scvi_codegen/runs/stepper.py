@@ -227,7 +227,8 @@ class Stepper(OfSteppers, Integrator):
             EventError: if an event function has an unknown symbol or is not finite.
             StepFailedError: if a step fails; its ``trajectory`` contains the states before.
         """
-        others = check_growth, inputs, events, tables, threads, action, transitions, strict_energy, seed, metropolis
+        noise = Noise(seed, 0, metropolis) if seed != 0 or metropolis else DEFAULT_NOISE
+        others = check_growth, inputs, events, tables, threads, action, transitions, strict_energy, noise
         new = tuple.__new__  # nouns without calls of Python
         return self._integrate(
             new(Initial, (q, p, velocity, t, parameters, options)),
@@ -245,9 +246,9 @@ class Stepper(OfSteppers, Integrator):
         if way[1:] != PLAIN[1:]:
             self._check_not_of_run(way.tables, way.threads)
             stepper = self._for_run(way)
-            noise = Noise(way.seed, 0, way.metropolis).checked(stepper, inputs)
+            noise = way.noise.checked(stepper, inputs)
         if not (inputs is None and save.t_eval is None and save.observe is None):
-            inputs = stepper._checked_together(initial, size, span, save, inputs, way.seed)
+            inputs = stepper._checked_together(initial, size, span, save, inputs, noise.seed)
         if self.interface.rotations or self.interface.variables:
             q, p, velocity = self._states.start(*initial[:3])
             initial = initial._replace(q=q, p=p, velocity=velocity)

@@ -69,17 +69,6 @@ class Rows(NamedTuple):
         rows = before.repeat(self.numbers)
         return rows + np.arange(len(rows)), self.trajectories.repeat(self.numbers)
 
-    def put(self, *pairs: tuple[Array | None, Array]) -> None:
-        """Store values of the states in (n, k, ..) arrays of all trajectories; ``None`` is not stored."""
-        k, row, count = (int(numbers[0]) for numbers in self[:3])
-        equal = bool((self.first == row).all() and (self.numbers == count).all())
-        rectangle = slice(row, row + count), slice(k, k + len(self.first))
-        places: Any = rectangle if equal else self.indices()
-        for array, values in pairs:
-            if array is not None:
-                shape = (-1, count, *values.shape[1:])
-                array[places] = values.reshape(shape).swapaxes(0, 1) if equal else values
-
 
 class Batch:
     """Trajectories of an ensemble as C integrates them.
