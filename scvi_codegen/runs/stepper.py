@@ -91,7 +91,7 @@ class Stepper(OfSteppers, Integrator):
 
     def _compile(self) -> None:
         super()._compile()
-        if self.interface.words > 1 and self.events and self._doubles is not None:
+        if self.events and self._doubles is not None:
             self._in_double._compile()
             _ = self._event_functions
 
@@ -448,8 +448,7 @@ class Stepper(OfSteppers, Integrator):
         from scvi_codegen.runs.results.dense_output import times_of_run
 
         require(self, "t_eval")
-        if self.interface.words > 1:
-            check_doubles(t_eval=t_eval)
+        check_doubles(self.interface.words, t_eval=t_eval)
         if steps is None:
             return times_of_run(t_eval, t, cast(Until, plan).t_end)
         if self.in_tau:

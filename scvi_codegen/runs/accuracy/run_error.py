@@ -40,7 +40,7 @@ from scvi_codegen.runs.results.joining import concatenated
 from scvi_codegen.runs.results.recomputation import motion_by_reactions, steps_after
 from scvi_codegen.runs.results.saved_states import Array, SavedStates, times_of_changes
 from scvi_codegen.runs.states.rotations import members_of
-from scvi_codegen.runs.states.words import low_words, with_low
+from scvi_codegen.runs.states.words import sum_of
 from scvi_codegen.runs.stepping.features import refusal, require
 from scvi_codegen.runs.stepping.projection import determined_coordinates, projected
 from scvi_codegen.runs.stepping.step_derivatives import Curves, Starts
@@ -520,7 +520,7 @@ def _states_of(run: Any, finer: Any, seed: int) -> tuple[Any, Any]:
         for first, last in pairwise(breaks):
             if seed:
                 rounding = math.sqrt(max(1, run.steps) / (len(breaks) - 1)) * roundoff(words)
-                start = [_rounded(x, rounding * random.standard_normal(x.shape[-1]), words) for x in start]
+                start = [sum_of(x, rounding * random.standard_normal(x.shape[-1]) * np.asarray(x)) for x in start]
             stop = float(piece.t[last])
             plan = ending_at(piece.plan if run.stepper.in_tau else Adaptive(stop, tolerance), stop)
             fine = finer._run(*start, plan=plan, t=t, parameters=parameters)._recorded(None)
@@ -528,12 +528,6 @@ def _states_of(run: Any, finer: Any, seed: int) -> tuple[Any, Any]:
             t, start = piece.t[last], [x[-1] for x in parts[-1]]
     q, p = (concatenated(list(of)) for of in zip(*parts, strict=True))
     return q, p
-
-
-def _rounded(x: Any, relative_change: Array, words: int) -> Any:
-    """Return a state of one or two words with relative changes."""
-    change = relative_change * np.asarray(x)
-    return with_low(np.asarray(x), low_words(x) + change) if words > 1 else np.asarray(x) + change
 
 
 def corrected_states(run: Any, error: RunError) -> CorrectedStates:

@@ -189,8 +189,7 @@ class EnsembleSettings:
     def steps_or_ends(self, stepper: Any, t: float) -> tuple[int | None, Array | None]:
         """Return the number of common steps or the final times; StateError for missing or contradictory arguments."""
         h, t_end = self.h, self.t_end
-        if stepper.interface.words > 1:
-            check_doubles(t_end=t_end, t_eval=self.t_eval)
+        check_doubles(stepper.interface.words, t_end=t_end, t_eval=self.t_eval)
         if self.t_eval is not None:
             check_together(inputs=self.inputs, t_eval=self.t_eval)
             check_has_end(self.t_eval, t, h, t_end)

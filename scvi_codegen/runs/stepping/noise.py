@@ -136,8 +136,9 @@ class Noise(NamedTuple):
         return self._replace(seed=OPTION["seed"].checked(seed))
 
     def store(self, memory: Any) -> None:
-        """Set the stream of a run that starts, in C."""
-        memory.seed, memory.trajectory, memory.metropolis = self
+        """Set the stream of a run that starts, in C, which has none without a bath."""
+        if hasattr(memory, "seed"):
+            memory.seed, memory.trajectory, memory.metropolis = self
 
 
 def negative_strength(stepper: Any, t: float, parameters: Array, q: Array | None = None) -> str:

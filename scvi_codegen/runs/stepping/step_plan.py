@@ -355,8 +355,7 @@ def planned_steps(
     in_time, (steps, t_end) = interface.time_transformation is None, span
     check_agreement(span._asdict() | (size._asdict() if in_time else {}), partly=not in_time)
     plan = checked_plan(interface, size, None if in_time and size.h is not None else t_end)
-    if interface.words > 1:
-        check_doubles(t_end=t_end)
+    check_doubles(interface.words, t_end=t_end)
     if not isinstance(plan, FixedSteps):
         check_max_step(plan, cast(float, t), interface.words)
         return plan, None
