@@ -352,6 +352,14 @@ class Stepper(OfSteppers, Integrator):
         warn_of_unconfirmed_run(trajectory)
         return trajectory
 
+    def _step_of_tau(self, initial: Initial, end: float, tolerance: float) -> float:
+        """Return the largest step of tau for a tolerance."""
+        from scvi_codegen.runs.driver.largest_step import largest_step
+
+        q, p, velocity, t, parameters, options = initial
+        momenta = self._initial_momenta(q, p, velocity, t, parameters)
+        return largest_step(self, q, momenta, end - t, tolerance, t=t, parameters=parameters, options=options)
+
     @property
     def _in_double_double(self) -> Stepper | None:
         """The stepper in double-double of one with precision="auto"; ``None`` if there is none with its events."""

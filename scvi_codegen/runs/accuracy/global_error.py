@@ -272,13 +272,8 @@ class Runs:
 
     def _steps(self, tolerance: float | None) -> dict[str, float | None]:
         if self.has_tau:
-            from scvi_codegen.runs.driver.largest_step import largest_step  # here, because it imports runs
-
-            q, p, velocity, t, parameters, options = self.initial
-            momenta = self.stepper._initial_momenta(q, p, velocity, t, parameters)
             least = roundoff(self.words) if tolerance is None else tolerance
-            motion = self.stepper, q, momenta, self.end - t, least
-            return {"h": largest_step(*motion, t=t, parameters=parameters, options=options)}
+            return {"h": self.stepper._step_of_tau(self.initial, self.end, least)}
         limit = {} if self.largest == math.inf else {"max_step": self.largest}
         return {"tolerance": tolerance, **limit}
 
