@@ -417,7 +417,7 @@ class Stepper(OfSteppers, Integrator):
             from scvi_codegen.runs.events.contacts import in_first_modes
 
             return in_first_modes(self, q, p, t, parameters, duration_of(plan, t))
-        if len(self.interface.constraints) == self.interface.masked:
+        if not self.interface.imposed:
             return q, p
         return consistent(self, q, p, t, parameters)
 

@@ -102,7 +102,7 @@ def start_of_ensemble(
             for k, lasts in enumerate(np.broadcast_to(durations, len(values)).tolist()):
                 with of_trajectory(k):
                     positions[k], momenta[k] = in_first_modes(stepper, positions[k], momenta[k], t, values[k], lasts)
-        elif len(stepper.interface.constraints) > stepper.interface.masked:
+        elif stepper.interface.imposed:
             make_consistent(stepper, positions, momenta, t, values)
     return positions, momenta, values
 
