@@ -149,6 +149,8 @@ class IndividualRuns:
         finally:
             self.status, self.steps = self.successive.names, self.successive.done
             self.fallback_steps = self.successive.fallback_steps
+            if self.ensemble.fixed is not None and not self.ensemble.stepper.in_tau:
+                self.messages = self.ensemble.fixed.failures(self.status, self.steps)
 
     def _integrate(self, j: int, check_stop: StopCheck) -> None:
         """Integrate trajectory j as :meth:`Stepper.integrate` does; with ``error`` keep its confirmed local tolerance.
@@ -273,8 +275,6 @@ class IndividualRuns:
         if t is None:
             t = self._times(ordered(states.t))
         spans = self._spans(t) if fixed is None or self.t_eval is None else fixed.spans(ensemble.values_at)
-        if fixed is not None and self.successive is not None and not stepper.in_tau:
-            self.messages |= fixed.failures(self.status, self.steps)
         return EnsembleTrajectory(
             t=t,
             tau=tau,
