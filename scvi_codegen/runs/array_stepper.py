@@ -69,24 +69,8 @@ class StepperOfRunTimeSizes(Stepper):
     _last: tuple[Hashable, Stepper | None] = None, None
     _latest: tuple[Hashable, Stepper] | None = None
 
-    integrate = _bound(Stepper.integrate, at_rest=True)
-    start = _bound(Stepper.start, at_rest=True)
-    project = _bound(Stepper.project, at_rest=True)
-    integrate_ensemble = _bound(Stepper.integrate_ensemble, at_rest=True)
-    _ensemble = _bound(Stepper._ensemble, at_rest=True)
     chaos_indicators_ensemble: Any = Forwarded("steppers", "chaos_indicators_ensemble", partial(_bound, at_rest=True))
     path: Any = Forwarded("steppers", "path", _bound_path)
-    multipliers, constraint_values = _bound(Stepper.multipliers), _bound(Stepper.constraint_values)
-    step, step_positions = _bound(Stepper.step), _bound(Stepper.step_positions)
-    discrete_lagrangian = _bound(Stepper.discrete_lagrangian)
-    discrete_legendre_minus = _bound(Stepper.discrete_legendre_minus)
-    discrete_legendre_plus = _bound(Stepper.discrete_legendre_plus)
-    work_and_impulses, rates = _bound(Stepper.work_and_impulses), _bound(Stepper.rates)
-    energy, momentum_maps = _bound(Stepper.energy), _bound(Stepper.momentum_maps)
-    momentum, velocity = _bound(Stepper.momentum), _bound(Stepper.velocity)
-    initial_momentum = _bound(Stepper.initial_momentum)
-    jacobian, sensitivity = _bound(Stepper.jacobian), _bound(Stepper.sensitivity)
-    jvp, vjp = _bound(Stepper.jvp), _bound(Stepper.vjp)
 
     def _call_bound(
         self,
@@ -193,5 +177,15 @@ class StepperOfRunTimeSizes(Stepper):
         return self._reason is not None or "advance_to" in self.source.contents.functions
 
 
+AT_REST = "integrate start project integrate_ensemble _ensemble"
+"""Methods that bind the stepper, and begin with the velocity 0 where none is given."""
+BOUND = (
+    "multipliers constraint_values step step_positions discrete_lagrangian discrete_legendre_minus "
+    "discrete_legendre_plus work_and_impulses rates energy momentum_maps momentum velocity initial_momentum jacobian "
+    "sensitivity jvp vjp"
+)
+"""Further methods that bind the stepper."""
+for _name in f"{AT_REST} {BOUND}".split():
+    setattr(StepperOfRunTimeSizes, _name, _bound(getattr(Stepper, _name), at_rest=_name in AT_REST.split()))
 PER_STEP = (Stepper.integrate, Stepper.start)
 """Methods whose ``threads`` are those of each step."""

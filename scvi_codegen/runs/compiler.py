@@ -128,70 +128,81 @@ def compile_stepper(
         MethodError: if the method, the solver or another argument is not available for the system.
     """
     check_precision(precision, flags)
-    solver = _solver_of(solver, transitions)
-    summed: Sums = OPTION["sums"].checked(sums, MethodError)
-    of_finer = {"sizes": sizes, "tables": tables, "flags": flags, "precision": precision}
-    finer = Once(partial(_finer_stepper, system, method, tuple(contacts), of_finer))
-    others = {"precision": precision, "sizes": sizes, "tables": tables, "controller": controller}
-    named, stated = DEFAULT_NAME if method is None else method, system
-    system, rows = _with_contacts(system, named, contacts, solver, **others, time_transformation=time_transformation)
-    precision = "double" if rows else precision  # contacts have no second precision for "auto"
-    common: dict[str, Any] = {
+    _check_symmetries(symmetries)
+    if OPTION["transitions"].checked(transitions) == BY_STEPS and solver == "auto":
+        solver = BY_STEPS  # that of contacts by steps alone
+    choices: dict[str, Any] = {
         "solver": solver,
         "flags": flags,
         "prefix": prefix,
+        "symmetries": symmetries,
         "time_transformation": time_transformation,
         "controller": controller,
+        "sizes": sizes,
+        "tables": tables,
+        "precision": precision,
+        "sums": OPTION["sums"].checked(sums, MethodError),
     }
-    _check_symmetries(symmetries)
-    further: Any = {"symmetries": symmetries, "sizes": sizes, "tables": tables, "sums": sums, **common}
-    looser = None
-    if method is None and not rows:
-        looser = _looser(stated, {**further, "precision": precision})
-    if isinstance(system, OfRunTimeSizes) and sizes is None and tables is None:
-        of_arrays = _compile_arrays(system, method, symmetries, as_events(events), precision, common, summed, looser)
-        of_arrays._finer = finer
-        return of_arrays.by_transitions(transitions)
-    if sums == "plain":
+    stepper = _compiled(system, method, tuple(contacts), as_events(events), choices)
+    stepper._finer = Once(partial(_finer_stepper, system, method, tuple(contacts), choices))
+    return stepper.by_transitions(transitions)
+
+
+def _compiled(
+    stated: MechanicalSystem,
+    method: Method | str | None,
+    contacts: tuple[ContactLike, ...],
+    events: tuple[Event, ...],
+    choices: Mapping[str, Any],
+) -> Stepper:
+    """Return the stepper of :func:`compile_stepper`, by its further arguments: of each sizes, precision or system."""
+    named = DEFAULT_NAME if method is None else method
+    system, rows = _with_contacts(stated, named, contacts, choices)
+    if rows:  # contacts have no second precision for "auto"
+        choices = {**choices, "precision": "double"}
+    looser = _looser(stated, choices) if method is None and not rows else None
+    has_sizes = not choices["sizes"] is choices["tables"] is None
+    if isinstance(system, OfRunTimeSizes) and not has_sizes:
+        return _compile_arrays(system, method, events, choices, looser)
+    if choices["sums"] == "plain":
         raise MethodError(
             f"sums='plain' is not available for '{system.name}' with named coordinates or known sizes: leave out "
             "sums=, or declare arrays, q[N], whose sizes each run gives"
         )
-    if precision == AUTO:
-        return _in_both_precisions(partial(compile_stepper, system, method, **further), events).by_transitions(
-            transitions
-        )
+    if choices["precision"] == AUTO:
+        return _in_both_precisions(partial(compile_stepper, system, method), events, choices)
     shape: dict[str, Any] = {"mesh": system.mesh, "links": system.drawn_links}
-    if sizes is not None or tables is not None:
-        system, time_transformation = _at_sizes(system, time_transformation, sizes or {}, tables)
-        others = {"precision": precision, "controller": controller, "time_transformation": time_transformation}
-        system, rows = _with_contacts(system, named, (), solver, **others)
-    settings = system, as_method(named, system), solver, prefix, symmetries, time_transformation, controller
+    if has_sizes:
+        system, g = _at_sizes(system, choices["time_transformation"], choices["sizes"] or {}, choices["tables"])
+        choices = {**choices, "time_transformation": g, "sizes": None, "tables": None}
+        system, rows = _with_contacts(system, named, (), choices)
+    discretisation, flags = as_method(named, system), choices["flags"]
+    of_sources: list[Any] = [choices[name] for name in OF_SOURCES]
 
     def made(precision: str, events: tuple[Event, ...] = (), *, locates: bool = False) -> Stepper:
-        sources = CachedSources(*settings, precision, locates=locates)
+        sources = CachedSources(system, discretisation, *of_sources, precision, locates=locates)
         source, interface = sources.integrator()
         interface = replace(interface, layout=replace(interface.layout, **shape), contacts=rows)
-        stepper = Stepper(source, interface, variants=sources.variants, flags=flags, events=events, looser=looser)
-        return stepper.by_transitions(transitions)
+        return Stepper(source, interface, variants=sources.variants, flags=flags, events=events, looser=looser)
 
-    stepper = made(precision, as_events(events), locates=precision != DOUBLE_DOUBLE)
+    precision = choices["precision"]
+    stepper = made(precision, events, locates=precision != DOUBLE_DOUBLE)
     if precision == DOUBLE_DOUBLE:
         stepper._doubles = cache(partial(made, "double"))
     if not stepper.interface.modes:
         warn_of_formulas(stepper.interface, f"the stepper of '{stepper.interface.system}'")
     system.store_key()
-    stepper._finer = finer
     return stepper
 
 
 def _finer_stepper(
-    system: MechanicalSystem, method: Method | str | None, contacts: tuple[ContactLike, ...], options: Mapping[str, Any]
+    system: MechanicalSystem, method: Method | str | None, contacts: tuple[ContactLike, ...], choices: Mapping[str, Any]
 ) -> Stepper:
     """Return the stepper of :func:`~scvi_codegen.methods.finer_method`, in physical time."""
     constrained = bool(contacts or system.constraints or system.has_contacts or system.rotations)
     named = default_method(system) if method is None else as_method(method, system)
     name = finer_method(named, constrained=constrained)
+    options = {option: choices[option] for option in ("sizes", "tables", "flags", "precision")}
     precision = DOUBLE_DOUBLE if options["precision"] == DOUBLE_DOUBLE else "double"
     return _compiled_silently(system, name, {**options, "precision": precision, "contacts": contacts})
 
@@ -217,27 +228,27 @@ def _check_symmetries(symmetries: Any) -> None:
         check_kind(SYMMETRIES, symmetries, "symmetries")
 
 
-def _solver_of(solver: str, transitions: str) -> str:
-    """Return the solver of a stepper, that of contacts by steps alone if no other is named."""
-    alone = OPTION["transitions"].checked(transitions) == BY_STEPS and solver == "auto"
-    return BY_STEPS if alone else solver
+OF_SOURCES = "solver", "prefix", "symmetries", "time_transformation", "controller"
+"""Arguments of :class:`~scvi_codegen.codegen.pipeline.Sources` in order."""
+WITHOUT_CONTACTS = "precision", "sizes", "tables", "controller", "time_transformation"
+"""Arguments of which other values than the default exclude contacts."""
 
 
 def _with_contacts(
-    system: MechanicalSystem, method: Method | str, contacts: Sequence[ContactLike], solver: str, **others: Any
+    system: MechanicalSystem, method: Method | str, contacts: Sequence[ContactLike], choices: Mapping[str, Any]
 ) -> tuple[MechanicalSystem, tuple[ContactRows, ...]]:
-    """Return the system with the modes of its contacts as parameters, and their places; ``others`` exclude contacts."""
-    passed = [name for name, value in others.items() if value not in (None, "auto", "double")]
+    """Return the system with the modes of its contacts as parameters, and their places."""
+    passed = [name for name in WITHOUT_CONTACTS if choices[name] not in (None, "auto", "double")]
     if not passed:
         system = sliding(system, method)
     if not any((*contacts, system.has_contacts)):
         return system, ()
     if passed:
-        raise MethodError(f"{passed[0]}={others[passed[0]]!r} is not available with contacts: omit it")
+        raise MethodError(f"{passed[0]}={choices[passed[0]]!r} is not available with contacts: omit it")
     from scvi_codegen.systems.contacts.modes import bound_contacts
 
     system, rows = bound_contacts(system, (*system.contacts, *contacts))
-    if solver == BY_STEPS:
+    if choices["solver"] == BY_STEPS:
         return system, tuple(row.stepped for row in rows)
     if (count := len(system.reactions)) > MOST_ROWS:
         raise MethodError(
@@ -250,48 +261,47 @@ def _with_contacts(
 def _compile_arrays(
     system: MechanicalSystem,
     method: Method | str | None,
-    symmetries: Sequence[Symmetry],
     events: tuple[Event, ...],
-    precision: str,
-    common: Mapping[str, Any],
-    sums: Sums,
+    choices: Mapping[str, Any],
     looser: Once[Stepper] | None,
 ) -> Stepper:
-    """Return the stepper of arrays whose sizes each run determines; ``common``: further arguments."""
+    """Return the stepper of arrays whose sizes each run determines, by the arguments of :func:`_compiled`."""
     from scvi_codegen.runs.array_stepper import StepperOfRunTimeSizes
 
+    precision = choices["precision"]
     if precision == AUTO:
         raise MethodError(f"precision='auto' is not available with arrays of run-time sizes: {SIZES_REQUIRED}")
-    if symmetries:
+    if choices["symmetries"]:
         raise MethodError(f"symmetries= is unavailable for '{system.name}': {SIZES_REQUIRED}")
     if precision == DOUBLE_DOUBLE:
         raise MethodError("precision='double-double' is not available with arrays of run-time sizes: pass sizes={..}")
     discretisation = as_method(DEFAULT_NAME if method is None else method, system)
-    solver, prefix, g, controller = (common[name] for name in ("solver", "prefix", "time_transformation", "controller"))
-    sources = CachedArraySources(system, discretisation, solver, prefix, (), g, controller)
-    sources.use_sums(sums)
+    sources = CachedArraySources(system, discretisation, *(choices[name] for name in OF_SOURCES))
+    sources.use_sums(choices["sums"])
     source, interface, reason = sources.of_run_time_sizes()
-    if source is None and sums == "plain":
+    if source is None and choices["sums"] == "plain":
         raise MethodError(f"sums='plain' is not available for '{system.name}': {reason}")
     if system.constraints and isinstance(discretisation, StoermerVerlet):
         method = SVI(1, "gauss-lobatto:2")  # the name of RATTLE for known sizes
     warn_of_formulas(interface, f"the stepper of '{interface.system}' with sizes of each run")
+    common = {name: choices[name] for name in (*OF_SOURCES, "flags")}
     of_sizes = partial(compile_stepper, system, method, **common)
-    arguments: dict[str, Any] = {"variants": sources.variants, "flags": common["flags"], "events": events}
-    arguments["looser"] = looser
-    return StepperOfRunTimeSizes(source, interface, **arguments, of_sizes=of_sizes, reason=reason)
+    arguments: dict[str, Any] = {"flags": choices["flags"], "events": events, "looser": looser, "reason": reason}
+    return StepperOfRunTimeSizes(source, interface, variants=sources.variants, of_sizes=of_sizes, **arguments)
 
 
-def _in_both_precisions(compiled: Callable[..., Stepper], events: EventLike | Sequence[EventLike] | None) -> Stepper:
+def _in_both_precisions(
+    compiled: Callable[..., Stepper], events: tuple[Event, ...], choices: Mapping[str, Any]
+) -> Stepper:
     """Return the stepper in double of precision="auto", with that in double-double if there is one."""
 
     @cache
     def in_double_double() -> Stepper | None:
         with suppress(MethodError):  # of this system or method
-            return compiled(precision=DOUBLE_DOUBLE)
+            return compiled(**{**choices, "precision": DOUBLE_DOUBLE})
         return None
 
-    stepper = compiled(events=events)
+    stepper = compiled(**{**choices, "precision": "double"}, events=events)
     stepper._precise = in_double_double
     return stepper
 
@@ -325,35 +335,23 @@ def _at_sizes(
 
 
 class CachedSources:
-    """C sources of one integrator and its variants, from the cache if they were derived before."""
+    """C sources of one integrator and its variants, from the cache if they were derived before.
 
-    def __init__(
-        self,
-        system: MechanicalSystem,
-        method: Method,
-        solver: str,
-        prefix: str | None,
-        symmetries: Sequence[Symmetry],
-        g: str | Expr | None,
-        controller: str | None = None,
-        precision: str = "double",
-        *,
-        locates: bool = False,
-    ) -> None:
-        self.precision, self.locates = precision, locates
-        self.system, self.method, self.solver, self.prefix = system, method, solver, prefix
-        self.symmetries, self.g, self.controller = symmetries, g, controller
-        choices = (solver, prefix, tuple(symmetries), g, controller, *([precision] if precision != "double" else []))
-        choices = (*choices, *(["located"] if locates else []))
-        self.key = (*system.key(), *method.key(), key_of(choices))
+    ``choices``: the solver and further arguments of :class:`~scvi_codegen.codegen.pipeline.Sources`, in order.
+    """
+
+    def __init__(self, system: MechanicalSystem, method: Method, *choices: Any, locates: bool = False) -> None:
+        self.system, self.method, self.choices, self.locates = system, method, choices, locates
+        solver, prefix, symmetries, g, controller, *precision = choices
+        others = [*(of for of in precision if of != "double"), *["located"] * locates]
+        self.key = (*system.key(), *method.key(), key_of((solver, prefix, tuple(symmetries), g, controller, *others)))
 
     @cached_property
     def derived(self) -> Sources:
         """The sources that are not in the cache."""
         from scvi_codegen.codegen.pipeline import Sources
 
-        choices = self.solver, self.prefix, self.symmetries, self.g, self.controller, self.precision
-        return Sources(self.system, self.method, *choices, locates=self.locates)
+        return Sources(self.system, self.method, *self.choices, locates=self.locates)
 
     @property
     def variants(self) -> Variants:
@@ -399,7 +397,7 @@ class CachedArraySources(CachedSources):
         """The source that is not in the cache, and its interface."""
         from scvi_codegen.codegen.pipeline import ArraySources
 
-        sources = ArraySources(self.system, self.method, self.solver, self.prefix, (), self.g, self.controller)
+        sources = ArraySources(self.system, self.method, *self.choices)
         sources.sums = self.sums
         return sources
 

@@ -31,7 +31,7 @@ from scvi_codegen.runs.ensembles.lanes import CommonRuns, LaneRuns
 from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
 from scvi_codegen.runs.ensembles.schedule import CommonSteps
 from scvi_codegen.runs.events.saltation import check_sides
-from scvi_codegen.runs.states.layout import InitialData
+from scvi_codegen.runs.states.layout import Initial
 from scvi_codegen.runs.states.reduction import Reduction
 from scvi_codegen.runs.states.rotation_quantities import observable_derivatives, observable_names, observables
 from scvi_codegen.runs.states.rotations import Member, members_of
@@ -47,7 +47,7 @@ from scvi_codegen.runs.stepping.array_interface import RunArrays, check_accesses
 from scvi_codegen.runs.stepping.features import require
 from scvi_codegen.runs.stepping.projection import linearised
 from scvi_codegen.runs.stepping.step_derivatives import Starts
-from scvi_codegen.runs.stepping.step_plan import ErrorControl, StepPlan
+from scvi_codegen.runs.stepping.step_plan import StepPlan, Steps
 from scvi_codegen.systems.event import Event
 
 if TYPE_CHECKING:
@@ -148,12 +148,12 @@ class Products:
         options: SolverOptions | None = None,
     ) -> Run:
         """Return a run from (q, p) at t by steps of a plan, such as ``Fixed(h)``; raises as :meth:`Stepper.start`."""
-        run: Run = self.stepper._started(InitialData(q, p, None, t, parameters, options), plan)
+        run: Run = self.stepper._started(Initial(q, p, None, t, parameters, options), plan)
         return run
 
     def largest_step(self, max_step: float | None) -> float:
         """Return the largest size of adaptive steps, infinity for ``None``; StateError unless it is positive."""
-        return float(ErrorControl(max_step=max_step).checked().get("max_step", math.inf))
+        return float(Steps(max_step=max_step).checked().get("max_step", math.inf))
 
     def library(self, source: Source, flags: Sequence[str] = ()) -> building.Library:
         """Return a source of its steps, compiled once with these flags, too: ``path``, ``ffi`` and ``lib``."""

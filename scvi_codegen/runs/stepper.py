@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
-from math import isfinite
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, cast
 
 import numpy as np
@@ -27,22 +26,23 @@ from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.common.once import constantly
 from scvi_codegen.common.validation import ArgumentType, checked_count, checks_arguments, of
 from scvi_codegen.runs.forwarding import OfSteppers
-from scvi_codegen.runs.states.layout import InitialData
+from scvi_codegen.runs.nouns import PLAIN, Execution, Save
+from scvi_codegen.runs.states.layout import Initial
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import Array, Parameters, States, check_step_given
 from scvi_codegen.runs.states.words import check_doubles, hashed
 from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.runs.stepping.features import check_strict_energy, check_together, require
 from scvi_codegen.runs.stepping.integrator import Integrator
+from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise, with_sequences
 from scvi_codegen.runs.stepping.projection import consistent, constraint_values, multipliers, projected
 from scvi_codegen.runs.stepping.step_plan import (
     Adaptive,
-    ErrorControl,
     Fixed,
-    KindOfSteps,
+    Span,
     StepPlan,
+    Steps,
     Until,
-    check_max_step,
     checked_plan,
     duration_of,
     planned_steps,
@@ -50,14 +50,12 @@ from scvi_codegen.runs.stepping.step_plan import (
 from scvi_codegen.systems.event import Event, EventLike
 
 if TYPE_CHECKING:
-    from scvi_codegen.runs.driver.bounded_motion import BoundedMotion
     from scvi_codegen.runs.driver.observation import Observe
     from scvi_codegen.runs.driver.run import Run
     from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings
     from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
     from scvi_codegen.runs.events.functions import EventFunctions
     from scvi_codegen.runs.products import Products
-    from scvi_codegen.runs.stepping.noise import Noise
     from scvi_codegen.runs.trajectory import Trajectory
 
 Called = TypeVar("Called", bound=Callable[..., Any])
@@ -93,7 +91,7 @@ class Stepper(OfSteppers, Integrator):
 
     def _compile(self) -> None:
         super()._compile()
-        if self.interface.words > 1 and self.events and self._doubles is not None:
+        if self.events and self._doubles is not None:
             self._in_double._compile()
             _ = self._event_functions
 
@@ -229,64 +227,67 @@ class Stepper(OfSteppers, Integrator):
             EventError: if an event function has an unknown symbol or is not finite.
             StepFailedError: if a step fails; its ``trajectory`` contains the states before.
         """
-        if type(save_every) is not int or save_every != 1:
-            save_every = checked_count(save_every, "save_every", least=1)
-        is_plain = events is None and not action and transitions is None and not strict_energy
-        way = {"transitions": transitions, "strict_energy": strict_energy}
-        stepper: Stepper = self if is_plain else self._for_run(events, action=action, **way)
-        interface, inputs = self.interface, inputs or None
-        noise = stepper._noise(seed, metropolis, inputs) if seed != 0 or metropolis else None
-        if not (inputs is None and t_eval is None and observe is None and tables is None and threads is None):
-            from scvi_codegen.runs.results.dense_output import check_has_end
+        noise = Noise(seed, 0, metropolis) if seed != 0 or metropolis else DEFAULT_NOISE
+        others = check_growth, inputs, events, tables, threads, action, transitions, strict_energy, noise
+        new = tuple.__new__  # nouns without calls of Python
+        return self._integrate(
+            new(Initial, (q, p, velocity, t, parameters, options)),
+            new(Steps, (tolerance, absolute_tolerance, max_step, first_step, h, error)),
+            new(Span, (steps, t_end)),
+            new(Save, (save_every, t_eval, observe, progress)),
+            new(Execution, others),
+        )
 
-            self._check_not_of_run(tables, threads)
-            stride = None if save_every == 1 else save_every
-            check_together(inputs=inputs, t_eval=t_eval, observe=observe, save_every=stride, error=error)
-            check_has_end(t_eval, t, h, t_end)
-            if inputs is not None:
-                from scvi_codegen.runs.driver.segments import InputSegments, checked_inputs, final_time
-                from scvi_codegen.runs.stepping.noise import with_sequences
-
-                end = partial(final_time, t, h, steps, t_end)
-                inputs = checked_inputs(interface, with_sequences(interface.inputs, inputs, seed, t=t, h=h, end=end))
-        if interface.rotations or interface.variables:
-            q, p, velocity = self._states.start(q, p, velocity)
-        if error is not None:
-            from scvi_codegen.runs.accuracy.global_error import checked_error
-            from scvi_codegen.runs.driver.bounded_motion import BoundedMotion
-
-            require(stepper, "error")
-            motion = BoundedMotion(
-                stepper=stepper,
-                error=checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance}, self),
-                initial=InitialData(q, p, velocity, t, parameters, options),
-                end=checked_number(t_end, "t_end"),
-                control=ErrorControl(None, absolute_tolerance, max_step, first_step),
-                inputs=inputs,
-                output={"save_every": save_every, "t_eval": t_eval},
-                progress=progress,
-            )
-            return stepper._bounded(motion)
-        t = t if type(t) is float and isfinite(t) else self._states.time(t)
-        begin = 0.0 if h is None or t_end is None else hashed(t)  # one plan for all times where they do not matter
-        schedule = h, steps, t_end, tolerance, absolute_tolerance, max_step, first_step, save_every, begin
+    def _integrate(self, initial: Initial, size: Steps, span: Span, save: Save, way: Execution = PLAIN) -> Trajectory:
+        """Return a run of :meth:`integrate`: the door of all runs that are asked for by nouns."""
+        stepper, inputs, noise, t = self, way.inputs or None, DEFAULT_NOISE, initial.t
+        if type(save.save_every) is not int or save.save_every != 1:
+            save = save._replace(save_every=checked_count(save.save_every, "save_every", least=1))
+        if way[1:] != PLAIN[1:]:
+            self._check_not_of_run(way.tables, way.threads)
+            stepper = self._for_run(way)
+            noise = way.noise.checked(stepper, inputs)
+        if not (inputs is None and save.t_eval is None and save.observe is None):
+            inputs = stepper._checked_together(initial, size, span, save, inputs, noise.seed)
+        if self.interface.rotations or self.interface.variables:
+            q, p, velocity = self._states.start(*initial[:3])
+            initial = initial._replace(q=q, p=p, velocity=velocity)
+        if size.error is not None:
+            return stepper._bounded(initial, size, span, save, inputs)
+        if type(t) is not float or t - t != 0.0:  # not finite
+            initial = initial._replace(t=(t := self._states.time(t)))
+        begin = 0.0 if span.t_end is None or (size.h is size.max_step is None) else hashed(t)  # one plan for all times
         try:
-            stepper, plan, count = stepper._planned(*schedule)
+            stepper, plan, count = stepper._planned(size, span, save.save_every, begin)
         except TypeError:  # of an argument that is not hashable, as an array
-            stepper, plan, count = stepper._planned.__wrapped__(*schedule)
-        if max_step is not None:
-            check_max_step(plan, t, interface.words)
-        segments, output = None, cast(Any, save_every)
+            stepper, plan, count = stepper._planned.__wrapped__(size, span, save.save_every, begin)
+        segments = None
         if inputs is not None:
-            segments = InputSegments(stepper, inputs, parameters, t, final_time(t, h, steps, t_end))
-            plan, parameters = segments.plan(plan), segments.first
-        if not (t_eval is None and observe is None and progress is None):
-            from scvi_codegen.runs.results.output import Output
+            from scvi_codegen.runs.driver.segments import InputSegments, final_time
 
-            times = None if t_eval is None else stepper._output_times(t_eval, t, plan, count)
-            output = Output(save_every, times, observe, progress)
-        initial = tuple.__new__(InitialData, (q, p, velocity, t, parameters, options))  # without a call of Python
-        return stepper._integrated(initial, plan, count, output, segments, check_growth, noise)
+            end = final_time(t, size.h, *span)
+            segments = InputSegments(stepper, inputs, initial.parameters, t, end)
+            plan, initial = segments.plan(plan), initial._replace(parameters=segments.first)
+        if save.t_eval is not None:
+            save = save._replace(t_eval=stepper._output_times(save.t_eval, t, plan, count))
+        trajectory: Trajectory = stepper._integrated(initial, plan, count, save, segments, way.check_growth, noise)
+        return trajectory
+
+    def _checked_together(
+        self, initial: Initial, size: Steps, span: Span, save: Save, inputs: Mapping[str, Any] | None, seed: int
+    ) -> Mapping[str, Any] | None:
+        """Return checked inputs; raise an error for what they, output times or an observer exclude."""
+        from scvi_codegen.runs.driver.segments import checked_inputs, final_time
+        from scvi_codegen.runs.results.dense_output import check_has_end
+
+        (save_every, t_eval, observe, _), (h, t) = save, (size.h, initial.t)
+        stride = None if save_every == 1 else save_every
+        check_together(inputs=inputs, t_eval=t_eval, observe=observe, save_every=stride, error=size.error)
+        check_has_end(t_eval, t, h, span.t_end)
+        if inputs is None:
+            return None
+        names, end = self.interface.inputs, partial(final_time, t, h, *span)
+        return checked_inputs(self.interface, with_sequences(names, inputs, seed, t=t, h=h, end=end))
 
     @cached_property
     def _integrated(self) -> Callable[..., Trajectory]:
@@ -295,10 +296,10 @@ class Stepper(OfSteppers, Integrator):
 
         return partial(integrated, self)
 
-    def _for_run(self, events: EventLike | Sequence[EventLike] | None, *, action: bool, **way: Any) -> Self:
+    def _for_run(self, way: Execution) -> Self:
         """Return the stepper of runs with these events, ``None`` for its own, that sum the action if requested."""
-        stepper = self.with_events(events).by_transitions(**way)
-        if not action:
+        stepper = self.with_events(way.events).by_transitions(way.transitions, strict_energy=way.strict_energy)
+        if not way.action:
             return stepper
         require(stepper, "action")
         return stepper.acting
@@ -338,16 +339,26 @@ class Stepper(OfSteppers, Integrator):
         stepper = self._looser().with_events(self.events)
         return stepper.acting if self.sums_action else stepper
 
-    def _bounded(self, motion: BoundedMotion) -> Trajectory:
+    def _bounded(self, initial: Initial, size: Steps, span: Span, save: Save, inputs: Any) -> Trajectory:
         """Return the run whose relative global error is confirmed to be bounded, in double-double if double fails."""
-        from scvi_codegen.runs.accuracy.global_error import Runs, warn_of_unconfirmed_run
+        from scvi_codegen.runs.accuracy.global_error import Runs, checked_error, warn_of_unconfirmed_run
 
-        trajectory: Trajectory = Runs(motion).confirmed_run()
+        require(self, "error")
+        size, end = checked_error(size, span, self), checked_number(span.t_end, "t_end")
+        trajectory: Trajectory = Runs(self, initial, size, end, save, inputs).confirmed_run()
         assert trajectory.confirmation is not None  # by confirmed_run
         if not (trajectory.confirmation.confirmed or self._has_tau) and (precise := self._in_double_double) is not None:
-            return precise._bounded(replace(motion, stepper=precise))
+            return precise._bounded(initial, size, span, save, inputs)
         warn_of_unconfirmed_run(trajectory)
         return trajectory
+
+    def _step_of_tau(self, initial: Initial, end: float, tolerance: float) -> float:
+        """Return the largest step of tau for a tolerance."""
+        from scvi_codegen.runs.driver.largest_step import largest_step
+
+        q, p, velocity, t, parameters, options = initial
+        momenta = self._initial_momenta(q, p, velocity, t, parameters)
+        return largest_step(self, q, momenta, end - t, tolerance, t=t, parameters=parameters, options=options)
 
     @property
     def _in_double_double(self) -> Stepper | None:
@@ -386,16 +397,11 @@ class Stepper(OfSteppers, Integrator):
         The other arguments are those of :meth:`integrate`.
         """
         self._check_not_of_run(tables, threads)
-        initial = InitialData(*self._states.start(q, p, velocity), t, parameters, options)
-        control = ErrorControl(tolerance, absolute_tolerance, max_step, first_step)
-        return self._started(initial, self._plan(h, t_end, control), self._noise(seed, metropolis))
+        initial = Initial(*self._states.start(q, p, velocity), t, parameters, options)
+        plan = checked_plan(self.interface, Steps(tolerance, absolute_tolerance, max_step, first_step, h), t_end)
+        return self._started(initial, plan, Noise(seed, 0, metropolis).checked(self))
 
-    def _noise(self, seed: int, metropolis: bool, inputs: Any = None) -> Noise:
-        from scvi_codegen.runs.stepping.noise import Noise
-
-        return Noise.checked(self, seed, metropolis, inputs=inputs)
-
-    def _started(self, initial: InitialData, plan: StepPlan, noise: Noise | None = None) -> Run:
+    def _started(self, initial: Initial, plan: StepPlan, noise: Noise = DEFAULT_NOISE) -> Run:
         """Return a run at its start, on the constraints."""
         from scvi_codegen.runs.driver.run import Run
 
@@ -403,7 +409,7 @@ class Stepper(OfSteppers, Integrator):
         (q, p), (*_, t, parameters, options) = stepper._consistent_state(initial, plan), initial
         return Run.started(stepper, q, p, plan=plan, t=t, parameters=parameters, options=options, noise=noise)
 
-    def _consistent_state(self, initial: InitialData, plan: StepPlan) -> tuple[States, States]:
+    def _consistent_state(self, initial: Initial, plan: StepPlan) -> tuple[States, States]:
         """Return (q, p), or q and the momenta of a velocity, on the constraints."""
         q, p, velocity, t, parameters, _ = initial
         p = self._initial_momenta(q, p, velocity, t, parameters)
@@ -411,7 +417,7 @@ class Stepper(OfSteppers, Integrator):
             from scvi_codegen.runs.events.contacts import in_first_modes
 
             return in_first_modes(self, q, p, t, parameters, duration_of(plan, t))
-        if len(self.interface.constraints) == self.interface.masked:
+        if not self.interface.imposed:
             return q, p
         return consistent(self, q, p, t, parameters)
 
@@ -436,14 +442,6 @@ class Stepper(OfSteppers, Integrator):
 
         return Run.started(self, q, p, **arguments)
 
-    def _plan(self, h: float | None, t_end: float | None, control: ErrorControl) -> StepPlan:
-        return checked_plan(self._kind_of_steps, h, t_end, control)
-
-    @property
-    def _kind_of_steps(self) -> KindOfSteps:
-        interface = self.interface
-        return KindOfSteps(interface.time_transformation, self.in_tau, interface.words, interface.has_unseen_growth)
-
     @cached_property
     def _planned(self) -> Any:
         """Function :meth:`_with_plan`, with what it returned before."""
@@ -451,15 +449,14 @@ class Stepper(OfSteppers, Integrator):
 
     def _with_plan(self, *schedule: Any) -> tuple[Self, StepPlan, int | None]:
         """Return the stepper, the plan and the number of steps of the arguments of :func:`planned_steps`."""
-        plan, count = planned_steps(self._kind_of_steps, *schedule)
+        plan, count = planned_steps(self.interface, *schedule)
         return (self._at_tolerance(plan.tolerance) if isinstance(plan, Adaptive) else self), plan, count
 
     def _output_times(self, t_eval: ArrayLike, t: float, plan: StepPlan, steps: int | None) -> Array:
         from scvi_codegen.runs.results.dense_output import times_of_run
 
         require(self, "t_eval")
-        if self.interface.words > 1:
-            check_doubles(t_eval=t_eval)
+        check_doubles(self.interface.words, t_eval=t_eval)
         if steps is None:
             return times_of_run(t_eval, t, cast(Until, plan).t_end)
         if self.in_tau:
@@ -495,8 +492,8 @@ class Stepper(OfSteppers, Integrator):
         transformed = self.interface.time_transformation is not None
         if h is not None and not transformed:
             raise StateError("omit h: the saved run contains its step size")
-        control = ErrorControl(tolerance, absolute_tolerance, max_step)
-        plan = self._plan(h, t_end, control) if t_end is not None or transformed else None
+        control = Steps(tolerance, absolute_tolerance, max_step, h=h)
+        plan = checked_plan(self.interface, control, t_end) if t_end is not None or transformed else None
         if self._reason is not None:
             raise StateError(f"restore this run by with_sizes(...).from_checkpoint(saved): {self._reason}")
         if not self.interface.layout.coordinates:
@@ -506,7 +503,7 @@ class Stepper(OfSteppers, Integrator):
             saved, self.origin or self, threads=threads, adaptive=t_end is not None
         )
         if isinstance(plan, Adaptive):
-            plan = ErrorControl(**own._asdict() | control.named).to(plan.t_end)
+            plan = Steps(**own._asdict() | control.named).to(plan.t_end)
         if parameters is None or isinstance(parameters, Mapping):
             parameters = by_name | dict(parameters or {})
         return Run.restored(stepper, state, parameters=parameters, options=options, plan=plan)
@@ -605,11 +602,11 @@ class Stepper(OfSteppers, Integrator):
             from scvi_codegen.runs.accuracy.global_error import checked_error
 
             require(self, "error")
-            steps = {"h": settings.h, "steps": settings.steps, "tolerance": settings.tolerance}
-            settings = replace(settings, error=checked_error(settings.error, steps, self))
-        stepper = self._for_run(None, action=action)
+            size = checked_error(settings.size, Span(settings.steps), self)
+            settings = replace(settings, error=size.error)
+        stepper = self._for_run(Execution(action=action))
         if settings.h is None:
-            stepper = stepper._at_tolerance(settings.control.checked().get("tolerance"))
+            stepper = stepper._at_tolerance(settings.size.checked().get("tolerance"))
         return Ensemble.of(stepper, q, p, settings, velocity=velocity)
 
     def project(

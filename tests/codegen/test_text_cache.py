@@ -71,10 +71,9 @@ def test_ensemble_source_is_generated_on_demand_and_cached(made, tmp_path, monke
 def keys(**options) -> tuple[str, ...]:
     """Return the parts of a cache key."""
     system = sc.LagrangianSystem.from_text(**TEXT)
-    found = compiler.CachedSources(
-        system, **{"method": sc.SVI(2), "solver": "auto", "prefix": None, "symmetries": (), "g": None, **options}
-    )
-    return found.key
+    choices = {"solver": "auto", "prefix": None, "symmetries": (), "g": None, "controller": None, "precision": "double"}
+    method, *others = ({"method": sc.SVI(2)} | choices | options).values()
+    return compiler.CachedSources(system, method, *others).key
 
 
 ARGUMENTS = {

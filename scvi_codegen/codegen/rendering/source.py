@@ -478,6 +478,11 @@ class Interface:
         )
 
     @property
+    def imposed(self) -> tuple[str, ...]:
+        """Constraints of all modes, without the masked ones."""
+        return self.constraints[: len(self.constraints) - self.masked]
+
+    @property
     def own_parameters(self) -> tuple[str, ...]:
         """Names of the parameters of the system, without those of modes."""
         return self.parameters[: len(self.parameters) - len(self.mode_names)]

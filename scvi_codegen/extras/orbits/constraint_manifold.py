@@ -20,7 +20,7 @@ MOMENT = 2.0**-30
 
 def reduction_of(stepper: Stepper, t: float, parameters: Array) -> Reduction:
     """Return the maps to the tangent spaces of a system without gauge directions and on its constraints."""
-    if len(stepper.interface.constraints) == stepper.interface.masked:
+    if not stepper.interface.imposed:
         return stepper.products.reduction
     return ConstraintManifold(stepper, t, parameters)
 
@@ -31,7 +31,7 @@ class ConstraintManifold(Reduction):
     def __init__(self, stepper: Stepper, t: float, parameters: Array) -> None:
         super().__init__(stepper.interface)
         self.stepper, self.t, self.parameters, self.free = stepper, t, parameters, stepper.products.reduction
-        self.count = len(stepper.interface.constraints) - stepper.interface.masked
+        self.count = len(stepper.interface.imposed)
         self.size -= 2 * self.count
 
     def at(self, t: float, parameters: Array) -> ConstraintManifold:

@@ -445,7 +445,7 @@ def gains_of(stepper: Stepper, gain: ArrayLike | Sequence[float | None] | None) 
     entries: Any = np.zeros(stepper.dimension) if gain is None else gain
     drifts = np.array([entry is None for entry in np.atleast_1d(np.asarray(entries, dtype=object))])
     if drifts.any():
-        if len(stepper.interface.constraints) > stepper.interface.masked:
+        if stepper.interface.imposed:
             raise StateError("a gain of None requires a system without constraints: give its number")
         entries = [0.0 if entry is None else entry for entry in entries]
     return {"gain": stepper.products.states.vector(entries, "gain"), "drifts": drifts}

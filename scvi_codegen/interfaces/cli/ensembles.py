@@ -79,10 +79,7 @@ def _runs(model: Model, stepper: Stepper, states: EnsembleStates) -> CommonRuns 
     settings = EnsembleSettings(
         options=model.solver_options, observe=model.observe, parameters=states.parameters, **model._run_arguments()
     )
-    runs = runs_of(Ensemble.of(stepper, states.q, states.momenta(stepper), settings))
-    if isinstance(runs, CommonRuns):
-        runs.batch()
-    return runs
+    return runs_of(Ensemble.of(stepper, states.q, states.momenta(stepper), settings))
 
 
 def ensemble_summary(model: Model, outcome: EnsembleOutcome, balance: float | None) -> str:

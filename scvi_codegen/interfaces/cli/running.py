@@ -22,8 +22,8 @@ from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runs.driver.largest_step import accuracy_message
 from scvi_codegen.runs.driver.run import Run
 from scvi_codegen.runs.driver.segments import record_segments
+from scvi_codegen.runs.nouns import Save
 from scvi_codegen.runs.results.energy import EnergyAccount
-from scvi_codegen.runs.results.output import Output
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.states.words import Words, as_text
 from scvi_codegen.runs.stepping.step_plan import Adaptive, FixedSteps, InTau
@@ -92,8 +92,8 @@ def integrate_model(model: Model) -> RunOutcome:
         segments, in_segments = model.segments(run), bool(model.system.inputs)
         try:
             steps = None if in_segments else next(segments)
-            output = Output(model.save_every, model.output_times(run, steps), progress=look)
-            record = partial(run._recorded, output=output, stop=stop)
+            save = Save(model.save_every, model.output_times(run, steps), progress=look)
+            record = partial(run._recorded, save=save, stop=stop)
             trajectory = record_segments(run, segments, record, lambda: stopped) if in_segments else record(steps)
         except StepFailedError as error:
             failure, trajectory = error, Trajectory.before(error)

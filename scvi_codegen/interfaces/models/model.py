@@ -238,9 +238,9 @@ class Model(TimeSpan):
         """Return the absolute tolerance of each coordinate; none if all are 0."""
         if self.absolute_tolerance is None:
             return ()
-        from scvi_codegen.runs.stepping.step_plan import ErrorControl, absolute_tolerances
+        from scvi_codegen.runs.stepping.step_plan import Steps, absolute_tolerances
 
-        values = ErrorControl(absolute_tolerance=self.absolute_tolerance).checked()["absolute_tolerance"]
+        values = Steps(absolute_tolerance=self.absolute_tolerance).checked()["absolute_tolerance"]
         return tuple(absolute_tolerances(interface, interface.dimension, values).tolist())
 
     @property

@@ -7,9 +7,9 @@ of round-off; what its error exceeds is confirmed until the time at which it doe
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ from scvi_codegen.runs.accuracy.narrow_forces import differences_in_pieces, long
 from scvi_codegen.runs.accuracy.run_error import DEVIATIONS, ROUNDINGS, RunError, leave_out_rounding
 from scvi_codegen.runs.accuracy.size import LOST, relative, roundoff
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
+from scvi_codegen.runs.nouns import Execution, Save
+from scvi_codegen.runs.states.layout import Initial
+from scvi_codegen.runs.stepping.step_plan import Span, Steps
 
 Array = NDArray[np.float64]
 
@@ -145,10 +148,10 @@ def warn_of_unconfirmed(confirmations: Sequence[GlobalError | None]) -> None:
         )
 
 
-def checked_error(error: Any, others: Mapping[str, Any], stepper: Any) -> float:
-    """Return the requested global error; raise StateError if it is unattainable or another option sets step sizes."""
-    check_agreement({"error": error, **others})
-    bound: float = OPTION["error"].checked(error)
+def checked_error(steps: Steps, span: Span, stepper: Any) -> Steps:
+    """Return the steps with the checked error; StateError if it is unattainable or another option sets step sizes."""
+    check_agreement({"error": steps.error, "h": steps.h, "steps": span.steps, "tolerance": steps.tolerance})
+    bound: float = OPTION["error"].checked(steps.error)
     words = max(stepper.interface.words, 1 + (stepper._precise is not None))
     if bound < (least := smallest_estimate(words)):
         remedy = ", or precision='double-double'" if words == 1 else ""
@@ -156,7 +159,7 @@ def checked_error(error: Any, others: Mapping[str, Any], stepper: Any) -> float:
             f"{OPTION['error']} = {bound:g} is below {least:.1e}, the least error that {NAMES_OF_PRECISIONS[words]} "
             f"arithmetic confirms: give a larger one{remedy}"
         )
-    return bound
+    return steps._replace(error=bound)
 
 
 def smallest_estimate(words: int) -> float:
@@ -209,15 +212,20 @@ def _is_better(one: GlobalError, other: GlobalError, start: float) -> bool:
 
 
 class Runs:
-    """Runs of one motion by tolerance, one of which is returned with its global error.
+    """Runs of one motion by one stepper that differ in their steps, one of which is returned with its global error.
 
     Args:
-        motion: makes the runs (:class:`~scvi_codegen.runs.driver.bounded_motion.BoundedMotion`).
+        initial, end: initial data and final time.
+        asked: the error, and absolute tolerance, largest and first step of all runs.
+        save: states of the returned run to save; ``progress`` is called in each run.
+        inputs: validated inputs by name, or ``None``.
     """
 
-    def __init__(self, motion: Any) -> None:
-        self.motion, self.requested, interface = motion, motion.error, motion.stepper.interface
-        self.words, self.has_tau = interface.words, motion.stepper._has_tau
+    def __init__(self, stepper: Any, initial: Initial, asked: Steps, end: float, save: Save, inputs: Any) -> None:
+        self.stepper, self.initial, self.asked, self.end = stepper, initial, asked, end
+        self.save, self.inputs = save, inputs
+        self.requested, interface = cast(float, asked.error), stepper.interface
+        self.words, self.has_tau = interface.words, stepper._has_tau
         self.is_examined = not (self.has_tau or interface.kinks or self.words > 1)
         self.examinations, self.largest, self.count = 0, math.inf, 0
 
@@ -269,14 +277,22 @@ class Runs:
 
     def _steps(self, tolerance: float | None) -> dict[str, float | None]:
         if self.has_tau:
-            return {"h": self.motion.step_of_tau(roundoff(self.words) if tolerance is None else tolerance)}
+            least = roundoff(self.words) if tolerance is None else tolerance
+            return {"h": self.stepper._step_of_tau(self.initial, self.end, least)}
         limit = {} if self.largest == math.inf else {"max_step": self.largest}
         return {"tolerance": tolerance, **limit}
+
+    def _integrated(self, save: Save, **steps: Any) -> Any:
+        """Return a run by these steps that saves these states."""
+        if "max_step" in steps and self.asked.max_step is not None:
+            steps["max_step"] = min(steps["max_step"], self.asked.max_step)
+        size, way = self.asked._replace(error=None, **steps), Execution(inputs=self.inputs, check_growth=False)
+        return self.stepper._integrate(self.initial, size, Span(t_end=self.end), save, way)
 
     def _run(self, tolerance: float | None) -> Any:
         """Return a run with all states and its confirmation."""
         steps = self._steps(tolerance)
-        run = self.motion.run(**steps)
+        run = self._integrated(Save(progress=self.save.progress), **steps)
         self.count += 1
         h, floor, start = steps.get("h"), smallest_estimate(self.words), float(run.t[0])
         estimate, until, reason = math.inf, start, ""
@@ -321,7 +337,7 @@ class Runs:
         if not self.is_examined or self.examinations == MOST_EXAMINATIONS or self.count == MOST_RUNS:
             return False
         start, end = float(run.t[0]), float(run.t[-1])
-        size = longest_piece(run, self.motion.end - start) * FINER_PIECES**self.examinations
+        size = longest_piece(run, self.end - start) * FINER_PIECES**self.examinations
         self.examinations += 1
         rounding = roundoff(1) * max(1.0, max(abs(start), abs(end)) / abs(end - start))  # also of times
         bound = max(PART_OF_STEP * self.requested, ROUNDINGS * rounding)
@@ -337,10 +353,9 @@ class Runs:
 
     def _with_output(self, run: Any) -> Any:
         """Return the states of a run that were asked for, with its confirmation."""
-        output = {name: value for name, value in self.motion.output.items() if value not in (None, 1)}
-        if not output:
+        if self.save.save_every == 1 and self.save.t_eval is None:
             return run
         result = replace(run.confirmation, runs=self.count + 1)
-        saved = self.motion.run(**result.steps, **output)
+        saved = self._integrated(self.save, **result.steps)
         saved.confirmation = result
         return saved

@@ -37,11 +37,10 @@ from scvi_codegen.runs.accuracy.size import (
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runs.results.dense_output import parameters_set_until
 from scvi_codegen.runs.results.joining import concatenated
-from scvi_codegen.runs.results.output import ALL_STATES
 from scvi_codegen.runs.results.recomputation import motion_by_reactions, steps_after
 from scvi_codegen.runs.results.saved_states import Array, SavedStates, times_of_changes
 from scvi_codegen.runs.states.rotations import members_of
-from scvi_codegen.runs.states.words import low_words, with_low
+from scvi_codegen.runs.states.words import sum_of
 from scvi_codegen.runs.stepping.features import refusal, require
 from scvi_codegen.runs.stepping.projection import determined_coordinates, projected
 from scvi_codegen.runs.stepping.step_derivatives import Curves, Starts
@@ -441,7 +440,7 @@ class _Replay:
         changes = self.finer.changes_states or interface.kinks or interface.modes or interface.contacts
         start = np.split(state if changes else state - self.now, 2)
         plan, parameters = ending_at(Adaptive(stop), stop), parameters_set_until(piece, t)
-        fine = self.finer._run(*start, plan=plan, t=t, parameters=parameters)._recorded(None, ALL_STATES)
+        fine = self.finer._run(*start, plan=plan, t=t, parameters=parameters)._recorded(None)
         after = self._state(piece, end)
         if changes:
             is_on_constraints = self.finer.constraints or interface.contacts  # rounded states are not
@@ -519,20 +518,14 @@ def _states_of(run: Any, finer: Any, seed: int) -> tuple[Any, Any]:
         for first, last in pairwise(breaks):
             if seed:
                 rounding = math.sqrt(max(1, run.steps) / (len(breaks) - 1)) * roundoff(words)
-                start = [_rounded(x, rounding * random.standard_normal(x.shape[-1]), words) for x in start]
+                start = [sum_of(x, rounding * random.standard_normal(x.shape[-1]) * np.asarray(x)) for x in start]
             stop = float(piece.t[last])
             plan = ending_at(piece.plan if run.stepper.in_tau else Adaptive(stop, tolerance), stop)
-            fine = finer._run(*start, plan=plan, t=t, parameters=parameters)._recorded(None, ALL_STATES)
+            fine = finer._run(*start, plan=plan, t=t, parameters=parameters)._recorded(None)
             parts.append(fine._states_at(piece.t[first : last + 1]))
             t, start = piece.t[last], [x[-1] for x in parts[-1]]
     q, p = (concatenated(list(of)) for of in zip(*parts, strict=True))
     return q, p
-
-
-def _rounded(x: Any, relative_change: Array, words: int) -> Any:
-    """Return a state of one or two words with relative changes."""
-    change = relative_change * np.asarray(x)
-    return with_low(np.asarray(x), low_words(x) + change) if words > 1 else np.asarray(x) + change
 
 
 def corrected_states(run: Any, error: RunError) -> CorrectedStates:

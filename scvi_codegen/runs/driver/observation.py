@@ -20,8 +20,8 @@ from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.driver.run_loop import end_run, record, trajectory_of
 from scvi_codegen.runs.driver.singular_time import ProgressWatch
 from scvi_codegen.runs.events.refinement import search_of
+from scvi_codegen.runs.nouns import Save
 from scvi_codegen.runs.results.dense_output import states_and_steps_at, step_sizes_at, stepped_to
-from scvi_codegen.runs.results.output import Output
 from scvi_codegen.runs.results.time_transformation import part_of_step
 from scvi_codegen.runs.states.times import WHOLE, number_until
 from scvi_codegen.runs.states.validation import Array
@@ -251,13 +251,13 @@ class Observed(Saver):
         return {"q": q, "p": p, "observed": np.array(observed), "conserved": np.array(self.conserved)}
 
 
-def saver_of(output: Output) -> Saver:
-    """Return the observer that saves the states of an output, or calls its observer; StateError for others."""
-    observe = output.observe
-    if output.times is not None:
-        return AtTimes(output.times)
+def saver_of(save: Save) -> Saver:
+    """Return the observer that saves the states that are saved, or calls its observer; StateError for others."""
+    observe = save.observe
+    if save.t_eval is not None:
+        return AtTimes(save.t_eval)
     if observe is None:
-        return Saver(output.save_every)
+        return Saver(save.save_every)
     if isinstance(observe, str):
         if observe not in OBSERVERS:
             names = ", ".join(OBSERVERS)
@@ -265,7 +265,7 @@ def saver_of(output: Output) -> Saver:
         observe = OBSERVERS[observe]()
     if not (isinstance(observe, Observer) or callable(observe)):
         raise StateError(f"observe must be a function of the run, an observer or its name, not {observe!r}")
-    return Observed(observe, output.save_every)
+    return Observed(observe, save.save_every)
 
 
 CHUNK_NUMBERS = 2**18

@@ -14,19 +14,19 @@ from scvi_codegen.runs.accuracy.local_error import warn_of_inaccuracy
 from scvi_codegen.runs.accuracy.warning_switch import warn_of_failed_check
 from scvi_codegen.runs.driver.observation import Observation, Saver, saver_of
 from scvi_codegen.runs.driver.run_loop import ShortRuns, plain_trajectory, record
-from scvi_codegen.runs.results.output import ALL_STATES, Output, every
+from scvi_codegen.runs.nouns import ALL_STATES, Save
 from scvi_codegen.runs.results.quantities import describe_run
 from scvi_codegen.runs.results.recorded import OfMethod
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
-from scvi_codegen.runs.states.layout import InitialData
+from scvi_codegen.runs.states.layout import Initial
 from scvi_codegen.runs.states.validation import Array, Parameters, States
 from scvi_codegen.runs.states.words import scalar
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.memory import Memory, alone
-from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, BathReport, Noise, report_of
+from scvi_codegen.runs.stepping.noise import BathReport, Noise, report_of
 from scvi_codegen.runs.stepping.projection import constraint_values, multipliers
 from scvi_codegen.runs.stepping.state_functions import neither_or_both
-from scvi_codegen.runs.stepping.step_plan import Fixed, FixedSteps, StepPlan, Until
+from scvi_codegen.runs.stepping.step_plan import Fixed, StepPlan, Until
 from scvi_codegen.runs.trajectory import Trajectory
 
 MOST_KEPT = 2**16
@@ -78,7 +78,7 @@ class Run(Memory, AttitudeHistory, OfMethod):
             EventError: if an event function is not finite.
         """
         before = 0.0 if self._leaving else self.step_error
-        trajectory = self._recorded(steps, Output(save_every, progress=progress))
+        trajectory = self._recorded(steps, Save(save_every, progress=progress))
         try:
             warn_of_inaccuracy(trajectory, self, before=math.inf if self._leaving else before)
         except Exception as error:  # noqa: BLE001  (the run is complete)
@@ -93,30 +93,29 @@ class Run(Memory, AttitudeHistory, OfMethod):
             Observation(self, Saver(LARGEST_COUNT)).advance(steps, progress, stop)
 
     def _recorded(
-        self, steps: int | None, output: Output = ALL_STATES, stop: Callable[[], bool] | None = None
+        self, steps: int | None, save: Save = ALL_STATES, stop: Callable[[], bool] | None = None
     ) -> Trajectory:
         """Return the states as :meth:`record` does, without its warnings and its lock."""
-        is_observed = output.times is not None or output.observe is not None
+        is_observed = save.t_eval is not None or save.observe is not None
         if self.stepper.searched or is_observed or isinstance(self._plan, Until):
-            return Observation(self, saver_of(output)).advance(steps, output.progress, stop or (lambda: False))
-        return record(self, steps, save_every=output.save_every, progress=output.progress, stop=stop)
+            return Observation(self, saver_of(save)).advance(steps, save.progress, stop or (lambda: False))
+        return record(self, steps, save_every=save.save_every, progress=save.progress, stop=stop)
 
-    def _integrated(
-        self, initial: InitialData, begins_by: int, growth: bool, steps: int | None, output: Output
-    ) -> Trajectory:
+    def _integrated(self, initial: Initial, begins_by: int, growth: bool, steps: int | None, save: Save) -> Trajectory:
         """Start a run that is set up and record it: by one C call if it ends within its number of states.
 
         ``begins_by``: its value in C; ``growth``: whether the run carries its error.
         """
-        plan, h, save_every, short = self._plan, self._h, output.save_every, self._rows
-        most = self._first_steps(save_every)
+        plan, h, save_every, short = self._plan, self._h, save.save_every, self._rows
+        most = self._first_saved * save_every
+        most = most if most < self._longest_first else self._longest_first  # without a call
         fits = steps is None if h is None else steps is not None and steps <= most
         special = self._takes_noise or short is None or self._has_tau or self._unset_inputs or self.stepper.searched
-        is_plain = output is ALL_STATES or output.has_states_alone
+        is_plain = save.t_eval is save.observe is save.progress is None
         self._remarks = True
         if special or not (fits and is_plain and (isinstance(plan, Fixed) or initial.t != plan.t_end)):
             self._start_from(initial, begins_by, growth)
-            return self._recorded(steps, output)
+            return self._recorded(steps, save)
         q, p, velocity, t, _, _ = initial
         if velocity is None:
             short.begin(t, q, p)
@@ -142,7 +141,7 @@ class Run(Memory, AttitudeHistory, OfMethod):
         states, sizes = short.recorded(1 + stored, h, save_every)
         return plain_trajectory(self, states, sizes, done, error, error_t, rejected, fallbacks)
 
-    def _start_from(self, initial: InitialData, begins_by: int, growth: bool) -> None:
+    def _start_from(self, initial: Initial, begins_by: int, growth: bool) -> None:
         """Start a run that is set up, as the initial state is given."""
         q, p = cast(Any, self.stepper)._consistent_state(initial, self._plan) if begins_by else initial[:2]
         self._begin(q, cast(States, p), initial.t, growth=growth)
@@ -206,18 +205,18 @@ def _restored(
 
 def integrated(
     stepper: Any,
-    initial: InitialData,
+    initial: Initial,
     plan: StepPlan,
     steps: int | None,
-    output: Output | int,
+    save: Save,
     segments: Any,
     check_growth: bool | None,
-    noise: Noise | None,
+    noise: Noise,
 ) -> Trajectory:
     """Return a run of validated steps, ``None`` to the target time, with its warnings.
 
     Args:
-        output: a number of steps for every such state alone.
+        save: states to save.
         segments: of inputs, :class:`~scvi_codegen.runs.driver.segments.InputSegments` or ``None``.
     """
     by_velocity, begins_by = initial.velocity is not None, stepper._begins_by
@@ -228,20 +227,19 @@ def integrated(
     else:
         q, p = stepper._consistent_state(initial, plan)
         initial, begins_by = initial._replace(q=q, p=p, velocity=None), 0
-    fixed, output = isinstance(plan, FixedSteps), every(output) if isinstance(output, int) else output
-    growth = not (fixed and not check_growth) and measures_growth(stepper, plan, check_growth)
     try:
         run: Run = stepper._released_runs.pop()
     except IndexError:  # all are in use
         run = Run._reusable(stepper)
     run._set_up(plan, initial)
-    run._noise = DEFAULT_NOISE if noise is None else noise
+    run._noise = noise
+    growth = not (run._h is not None and not check_growth) and measures_growth(stepper, plan, check_growth)
     if segments is None:
-        trajectory = run._integrated(initial, begins_by, growth, steps, output)
+        trajectory = run._integrated(initial, begins_by, growth, steps, save)
     else:
         run._start_from(initial, begins_by, growth)
         run._remarks = True
-        trajectory = segments.record(run, output.save_every, output.progress)
+        trajectory = segments.record(run, save.save_every, save.progress)
     if run._remarks:
         _warn(trajectory, run, segments, growth, check_growth is True)
     if run._rows is not None:  # large memory is freed instead

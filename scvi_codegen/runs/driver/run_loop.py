@@ -215,7 +215,7 @@ class _StateRecorder:
     def __init__(self, memory: Memory, save_every: int, steps: int | None, filled: int) -> None:
         plan, first = memory._plan, 0 if filled else memory._memory.step
         self.memory, self.save_every, self.first, self.filled = memory, save_every, first, filled or 1
-        self.first_size = memory._first_steps(save_every)
+        self.first_size = min(memory._first_saved * save_every, memory._longest_first)
         if memory._h is not None:
             assert steps is not None  # by the caller
             rows = (first + steps) // save_every - first // save_every + 1

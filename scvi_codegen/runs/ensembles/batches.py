@@ -23,7 +23,7 @@ from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.ensembles.ensemble import Ensemble
 from scvi_codegen.runs.ensembles.result import INTERRUPTED, OK
 from scvi_codegen.runs.states.validation import Array
-from scvi_codegen.runs.states.words import Word, block_of, from_block
+from scvi_codegen.runs.states.words import Word, block_of
 from scvi_codegen.runs.stepping.chunks import drive
 from scvi_codegen.runs.stepping.step_plan import step_control
 
@@ -69,17 +69,6 @@ class Rows(NamedTuple):
         rows = before.repeat(self.numbers)
         return rows + np.arange(len(rows)), self.trajectories.repeat(self.numbers)
 
-    def put(self, *pairs: tuple[Array | None, Array]) -> None:
-        """Store values of the states in (n, k, ..) arrays of all trajectories; ``None`` is not stored."""
-        k, row, count = (int(numbers[0]) for numbers in self[:3])
-        equal = bool((self.first == row).all() and (self.numbers == count).all())
-        rectangle = slice(row, row + count), slice(k, k + len(self.first))
-        places: Any = rectangle if equal else self.indices()
-        for array, values in pairs:
-            if array is not None:
-                shape = (-1, count, *values.shape[1:])
-                array[places] = values.reshape(shape).swapaxes(0, 1) if equal else values
-
 
 class Batch:
     """Trajectories of an ensemble as C integrates them.
@@ -108,8 +97,7 @@ class Batch:
         self.segments = None if ensemble.fixed is None else ensemble.fixed.fixed_segments
         numbers = ensemble.q, ensemble.p, ensemble.parameters
         self.q, self.p, self.parameters = (np.ascontiguousarray(block_of(values)) for values in numbers)
-        if ensemble.inputs:
-            self.parameters = self.parameters.copy()
+        self.parameters = self.parameters.copy()  # which inputs change
         self.status = np.full(len(self.q), -1, np.int32)
         self.done = np.zeros(len(self.q), np.int64)
 
@@ -135,8 +123,7 @@ class Batch:
         if isinstance(t0, Word):
             struct.t_low = t0.low
         struct.pauses = bool(self.ensemble.inputs)
-        if self.ensemble.stepper.interface.temperature is not None:
-            self.ensemble.noise.store(struct)
+        self.ensemble.noise.store(struct)
         self.take = binding.each(struct)
 
     def completed(self) -> float:
@@ -286,8 +273,7 @@ class SuccessiveRuns(Batch):
         first = np.ones(len(trajectories), np.int64)
         first[0] += self.before
         numbers = self.stored[trajectories] + 1 - first
-        states = (block[:count] if self.words == 1 else from_block(block[:count]) for block in self.states)
-        t, q, p = states
+        t, q, p = (self.ensemble.stepper._states.numbers(block[:count]) for block in self.states)
         self.receive(Rows(trajectories, first, numbers, t[:, 0], q, p, self.actions[:count]))
         self.flushed = int(call.next)
         self.before = int(self.stored[self.flushed]) if self.flushed < call.end and call.segment >= 0 else 0

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from typing import Any, Self, cast
 
 import numpy as np
@@ -44,10 +43,8 @@ from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE, Noise, check_strengths, with_sequences
 from scvi_codegen.runs.stepping.projection import make_consistent
 from scvi_codegen.runs.stepping.state_functions import neither_or_both
-from scvi_codegen.runs.stepping.step_plan import Adaptive, ErrorControl, KindOfSteps, check_max_step, planned_steps
+from scvi_codegen.runs.stepping.step_plan import Adaptive, Span, Steps, check_max_step
 
-checked_steps = lru_cache(maxsize=64, typed=True)(partial(planned_steps, KindOfSteps()))
-"""Check of the arguments of :func:`planned_steps`, which those of earlier ensembles have passed."""
 RANGE = np.finfo(np.float32)
 """Range of single precision."""
 
@@ -105,7 +102,7 @@ def start_of_ensemble(
             for k, lasts in enumerate(np.broadcast_to(durations, len(values)).tolist()):
                 with of_trajectory(k):
                     positions[k], momenta[k] = in_first_modes(stepper, positions[k], momenta[k], t, values[k], lasts)
-        elif len(stepper.interface.constraints) > stepper.interface.masked:
+        elif stepper.interface.imposed:
             make_consistent(stepper, positions, momenta, t, values)
     return positions, momenta, values
 
@@ -135,9 +132,9 @@ class EnsembleSettings:
     trajectory: int = 0
 
     @property
-    def control(self) -> ErrorControl:
-        """Arguments of adaptive steps."""
-        return ErrorControl(self.tolerance, self.absolute_tolerance, self.max_step, self.first_step)
+    def size(self) -> Steps:
+        """Sizes of the steps."""
+        return tuple.__new__(Steps, size_in(self))
 
     def check(self, stepper: Any) -> None:
         """Raise an error for arguments that exclude each other, or that the stepper excludes."""
@@ -189,11 +186,10 @@ class EnsembleSettings:
         """Return whether trajectories record the events of the stepper, which may be counted instead."""
         return bool(stepper.searched) and self.observe != "events"
 
-    def steps_or_ends(self, t: float, words: int) -> tuple[int | None, Array | None]:
+    def steps_or_ends(self, stepper: Any, t: float) -> tuple[int | None, Array | None]:
         """Return the number of common steps or the final times; StateError for missing or contradictory arguments."""
         h, t_end = self.h, self.t_end
-        if words > 1:
-            check_doubles(t_end=t_end, t_eval=self.t_eval)
+        check_doubles(stepper.interface.words, t_end=t_end, t_eval=self.t_eval)
         if self.t_eval is not None:
             check_together(inputs=self.inputs, t_eval=self.t_eval)
             check_has_end(self.t_eval, t, h, t_end)
@@ -205,16 +201,17 @@ class EnsembleSettings:
         if ends is not None and not ends.size:
             raise StateError("t_end has no final time: give one number, or one for each trajectory")
         first = None if ends is None else float(ends.flat[0])
-        schedule = h, self.steps, first, *self.control, 1, 0.0 if first is None else hashed(t)
+        schedule = self.size, Span(self.steps, first), 1, 0.0 if first is None else hashed(t)
         try:
-            checked_steps(*schedule)
+            stepper._planned(*schedule)
         except TypeError:  # of an argument that is not hashable, as an array
-            checked_steps.__wrapped__(*schedule)
+            stepper._planned.__wrapped__(*schedule)
         if h is None or (self.inputs is None and first is None):
             return self.steps, ends
         return None, np.array(final_time(t, h, self.steps, first))
 
 
+size_in = attrgetter(*Steps._fields)
 settings_in = itemgetter(*EnsembleSettings.__slots__[:-1])
 """The values of :class:`EnsembleSettings` among the arguments of ``integrate_ensemble``, in order."""
 
@@ -260,8 +257,8 @@ class Ensemble:
         settings.check(stepper)
         layout, parameters = stepper._states, settings.parameters
         t0 = layout.time(settings.t)
-        steps, ends = settings.steps_or_ends(t0, layout.words)
         require(stepper, "ensembles")
+        steps, ends = settings.steps_or_ends(stepper, t0)
         if settings.h is None:
             require(stepper, "adaptive")
         checked_options(settings.options)
@@ -284,7 +281,7 @@ class Ensemble:
         durations = cast(Array, ends) - t0 if settings.h is None else settings.h
         positions, momenta, values = start_of_ensemble(stepper, q, momenta, t0, parameters, durations)
         settings.check_range(values, positions, momenta)
-        noise = Noise.checked(stepper, settings.seed, settings.metropolis, settings.trajectory, settings.inputs)
+        noise = Noise(settings.seed, settings.trajectory, settings.metropolis).checked(stepper, settings.inputs)
         for member in np.unique(values, axis=0) if stepper.interface.temperature is not None else ():
             check_strengths(stepper, t0, settings.h, member)
         start = t0, positions, momenta, values
@@ -307,7 +304,7 @@ class Ensemble:
         if ends.shape not in ((), (len(self),)):
             raise StateError(f"t_end must be one time or {len(self)} times, not of shape {ends.shape}")
         worst = int(np.argmin(np.isfinite(ends)))  # the first one that is not finite
-        self.plan = settings.control.to(float(ends.flat[worst]))
+        self.plan = settings.size.to(float(ends.flat[worst]))
         if (ends > t0).any() and (ends < t0).any():
             raise StateError(f"t_end lies on both sides of t = {t0:g}: split the ensemble into two")
         latest = replace(self.plan, t_end=float(ends.flat[np.abs(ends).argmax()]))

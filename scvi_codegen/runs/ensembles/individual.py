@@ -1,7 +1,7 @@
-"""Ensembles whose trajectories have steps or ends of their own: adaptive steps, events, t_end in transformed time.
+"""Ensembles whose trajectories are integrated one by one: with steps or ends of their own, or not in SIMD lanes.
 
-C integrates them one after the other, bitwise equal to single runs, or :meth:`Stepper.integrate` does: with inputs,
-output times, changes by events or a bound of the global error.
+C integrates them one after the other, bitwise equal to single runs, or :meth:`Stepper.integrate` does: with inputs of
+adaptive steps, output times, events, t_end in transformed time or a bound of the global error.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.codegen.native.arguments import empty_array
+from scvi_codegen.codegen.native.binding import Binding
 from scvi_codegen.codegen.native.capacity import TOO_MANY_STATES, room_for_states, too_many_states
 from scvi_codegen.codegen.native.options import FAILURES
 from scvi_codegen.common.errors import AccuracyWarning, EventError, StateError, StepFailedError, of_trajectory, warn
@@ -28,13 +30,16 @@ from scvi_codegen.runs.ensembles.batches import Rows, SuccessiveRuns
 from scvi_codegen.runs.ensembles.ensemble import Ensemble
 from scvi_codegen.runs.ensembles.lanes import CommonRuns
 from scvi_codegen.runs.ensembles.observation import EnsembleObservation
-from scvi_codegen.runs.ensembles.result import EVENT_FAILED, INTERRUPTED, OK, EnsembleTrajectory, Span
+from scvi_codegen.runs.ensembles.result import EVENT_FAILED, INTERRUPTED, OK, EnsembleTrajectory, SpanOfRows
 from scvi_codegen.runs.ensembles.schedule import CommonSteps
+from scvi_codegen.runs.nouns import Execution, Save
 from scvi_codegen.runs.results.saved_states import ModeHistory
+from scvi_codegen.runs.states.layout import Initial
 from scvi_codegen.runs.states.times import WHOLE, number_until
 from scvi_codegen.runs.states.validation import Array, columns_of_inputs
 from scvi_codegen.runs.states.words import unnamed
-from scvi_codegen.runs.stepping.step_plan import Adaptive, AdaptivePlans
+from scvi_codegen.runs.stepping.noise import DEFAULT_NOISE
+from scvi_codegen.runs.stepping.step_plan import Adaptive, AdaptivePlans, Span, Steps
 from scvi_codegen.runs.trajectory import Trajectory
 from scvi_codegen.systems.event import Crossings
 
@@ -63,6 +68,7 @@ class IndividualRuns:
             self.plans = AdaptivePlans(self.ends, ensemble.plan)
         if fixed is not None:
             self.t_eval, self.ends = self._common_times(), np.full(count, fixed.times(tau=False)[-1])
+            empty_array((len(fixed.numbers), count, 2 * stepper.dimension))  # rejects states beyond any memory
         self.confirmations = list[GlobalError | None]()
         if ensemble.settings.error is not None:
             self.plans, self.confirmations = list(self.plans), [None] * count
@@ -81,8 +87,9 @@ class IndividualRuns:
 
     @property
     def length(self) -> int:
-        """Final value of ``progress``: the number of trajectories."""
-        return len(self)
+        """Final value of ``progress``: the number of trajectories, or of common steps."""
+        fixed = self.ensemble.fixed
+        return len(self) if fixed is None or self.ensemble.stepper.searched else fixed.steps
 
     def _common_times(self) -> Array | None:
         """Return the times of fixed steps, without terminal events and t_end in transformed time.
@@ -108,10 +115,14 @@ class IndividualRuns:
 
     def _successive(self) -> SuccessiveRuns | None:
         """Return the trajectories that C integrates one after the other, ``None`` for other ensembles."""
-        ensemble, stepper, t_eval = self.ensemble, self.ensemble.stepper, self.t_eval
-        if ensemble.inputs or stepper.searched or stepper.in_tau or not stepper.binding.reusable or self.confirmations:
+        ensemble, stepper, t_eval, fixed = self.ensemble, self.ensemble.stepper, self.t_eval, self.ensemble.fixed
+        if stepper.searched or not stepper.binding.reusable or self.confirmations:
             return None
-        if t_eval is None:
+        if ensemble.inputs and (fixed is None or stepper.interface.constraints):  # which single runs check for jumps
+            return None
+        if stepper.in_tau and (fixed is None or fixed.t_end is not None):
+            return None
+        if t_eval is None or fixed is not None:
             receive = partial(_receive, self.stored, 0)  # without self, so that no cycle keeps the memory
             return SuccessiveRuns(ensemble, receive, save_every=ensemble.save_every, most_states=self.most_states)
         later = t_eval[t_eval != ensemble.t0]
@@ -125,18 +136,21 @@ class IndividualRuns:
         Afterwards, also after an exception, :meth:`result` returns what was computed.
 
         Args:
-            progress: called with the number of completed trajectories, see :attr:`length`.
+            progress: called with a part of :attr:`length`.
             threads: number of threads, by default one per core.
         """
+        unit = self.length / len(self)
+        report = None if progress is None else lambda done: progress(int(done * unit))
         if self.successive is None:
-            run_jobs(len(self), self._integrate, progress=progress, threads=threads)
+            run_jobs(len(self), self._integrate, progress=report, threads=threads)
             return
         try:
-            report = None if progress is None else lambda done: progress(int(done))
             self.successive.run(progress=report, threads=threads)
         finally:
             self.status, self.steps = self.successive.names, self.successive.done
             self.fallback_steps = self.successive.fallback_steps
+            if self.ensemble.fixed is not None and not self.ensemble.stepper.in_tau:
+                self.messages = self.ensemble.fixed.failures(self.status, self.steps)
 
     def _integrate(self, j: int, check_stop: StopCheck) -> None:
         """Integrate trajectory j as :meth:`Stepper.integrate` does; with ``error`` keep its confirmed local tolerance.
@@ -144,21 +158,21 @@ class IndividualRuns:
         One whose confirming runs fail has errors at round-off level.
         """
         ensemble, rows, status = self.ensemble, slice(None), OK
-        arguments, error = self._arguments(j, check_stop), ensemble.settings.error
+        initial, size, span, save, way = self._asked(j, check_stop)
         if ensemble.fixed is None and self.t_eval is not None:
             times = self.t_eval[np.abs(self.t_eval - ensemble.t0) <= abs(self.ends[j] - ensemble.t0)]
             rows = slice(None if times.size else 0)
-            arguments["t_eval"] = times if times.size else self.ends[j : j + 1]  # runs have at least one
-        integrate = partial(ensemble.stepper.integrate, ensemble.q[j], ensemble.p[j], **arguments)
+            save = save._replace(t_eval=times if times.size else self.ends[j : j + 1])  # runs have at least one
+        integrate = partial(ensemble.stepper._integrate, initial, span=span, save=save, way=way)
         with without_accuracy_warnings():
-            if error is not None:
+            if size.error is not None:
                 with suppress(StateError, StepFailedError, EventError):
-                    states = integrate(error=error)
+                    states = integrate(size=size)
                     self.confirmations[j], cast(list[Any], self.plans)[j] = states.confirmation, states.plan
                     self._store(j, states, rows, OK)
                     return
             try:
-                states = integrate()
+                states = integrate(size=size._replace(error=None))
             except (StepFailedError, EventError) as failure:
                 if failure.trajectory is None:
                     with of_trajectory(j):
@@ -172,24 +186,26 @@ class IndividualRuns:
             rows = self._common_rows(states, ensemble.fixed.h)
         self._store(j, states, rows, status)
 
-    def _arguments(self, j: int, check_stop: StopCheck) -> dict[str, Any]:
-        """Return the arguments of :meth:`Stepper.integrate` for trajectory j, without its state and output times."""
+    def _asked(self, j: int, check_stop: StopCheck) -> tuple[Initial, Steps, Span, Save, Execution]:
+        """Return what trajectory j is asked for, without its output times."""
         ensemble, stepper, parameters = self.ensemble, self.ensemble.stepper, self.ensemble.parameters[j]
         if stepper.interface.words == 1:
             of_inputs = columns_of_inputs(stepper.interface) if ensemble.inputs else ()
             values = zip(stepper.interface.parameters, parameters.tolist(), strict=True)
             parameters = {name: value for k, (name, value) in enumerate(values) if k not in of_inputs}
-        steps: dict[str, Any] = {"t_end": float(self.ends[j]), **ensemble.settings.control.named}
+        size, span, noise = ensemble.settings.size, Span(t_end=float(self.ends[j])), DEFAULT_NOISE
         if ensemble.fixed is not None:
-            steps = ensemble.fixed.arguments
-        return steps | {
-            "parameters": parameters,
-            "inputs": inputs_of_slice(ensemble.inputs, j),
-            "t": ensemble.t0,
-            "save_every": 1 if ensemble.inputs and self.t_eval is not None else ensemble.save_every,
-            "options": ensemble.settings.options,
-            "progress": partial(self._check, check_stop),
-        }
+            size, span = Steps(h=ensemble.fixed.h), ensemble.fixed.span
+        if stepper.interface.temperature is not None:
+            noise = ensemble.noise._replace(trajectory=ensemble.noise.trajectory + j)
+        save_every = 1 if ensemble.inputs and self.t_eval is not None else ensemble.save_every
+        return (
+            Initial(ensemble.q[j], ensemble.p[j], None, ensemble.t0, parameters, ensemble.settings.options),
+            size,
+            span,
+            Save(save_every, progress=partial(self._check, check_stop)),
+            Execution(inputs=inputs_of_slice(ensemble.inputs, j), noise=noise),
+        )
 
     def _check(self, check_stop: StopCheck, steps: int) -> None:
         """Raise an error if another trajectory failed, or if a run has more states than :attr:`most_states`."""
@@ -252,12 +268,16 @@ class IndividualRuns:
         def ordered(values: Array) -> Array:  # by rows and trajectories, NaN after their ends
             return values[index] if stepper._states.words > 1 else values.take(index, axis=0)
 
+        tau = None
+        if stepper.in_tau and fixed is not None:
+            tau = ordered(states.tau) if self.successive is None else fixed.times(tau=True)
         t = self.t_eval if fixed is None else None
         if t is None:
             t = self._times(ordered(states.t))
+        spans = self._spans(t) if fixed is None or self.t_eval is None else fixed.spans(ensemble.values_at)
         return EnsembleTrajectory(
             t=t,
-            tau=ordered(states.tau) if stepper.in_tau else None,
+            tau=tau,
             q=ordered(states.q),
             p=ordered(states.p),
             actions=ordered(states.actions) if stepper.sums_action else None,
@@ -273,14 +293,16 @@ class IndividualRuns:
             parameters=ensemble.parameters,
             initial=(ensemble.t0, ensemble.q, ensemble.p),
             stepper=stepper,
-            spans=tuple(self._spans(t)) if ensemble.inputs else (),
+            spans=tuple(spans) if ensemble.inputs else (),
         )
 
     def _all_states(self) -> Rows:
         """Return all states in the order in which they were stored, and NaN as the last row, of no trajectory."""
         missing, m, none = self.ensemble.stepper._states.missing, self.ensemble.q.shape[1], np.empty(0, np.int64)
         undefined = Rows(none, none, none, missing((1,)), *(missing((1, m)) for _ in "qp"), *np.full((2, 1), np.nan))
-        return Rows(*map(np.concatenate, zip(*self.stored, undefined, strict=True)))
+        states = Rows(*map(np.concatenate, zip(*self.stored, undefined, strict=True)))
+        self.stored[:] = [Rows(*states[:3], *(values[:-1] for values in states[3:]))]  # frees the parts
+        return states
 
     def _places(self, states: Rows) -> NDArray[np.intp]:
         """Return the (n, k) places of the rows of all trajectories among the stored states, -1 after their ends.
@@ -309,7 +331,7 @@ class IndividualRuns:
                 return times[:, complete[0]]
         return times if self.t_eval is None else self.t_eval
 
-    def _spans(self, t: Array) -> Iterator[Span]:
+    def _spans(self, t: Array) -> Iterator[SpanOfRows]:
         """Yield the rows of each trajectory, of states at the times t, in each piece of its inputs."""
         t0 = self.ensemble.t0
         for j, end_of_run in enumerate(self.ends.tolist()):
@@ -342,18 +364,34 @@ def _receive(stored: list[Rows], shift: int, states: Rows) -> None:
 
 def runs_of(ensemble: Ensemble) -> CommonRuns | IndividualRuns:
     """Return the way in which the trajectories of an ensemble are integrated, before its first step."""
-    stepper, settings, fixed = ensemble.stepper, ensemble.settings, ensemble.fixed
-    common = fixed is not None and not settings.records_events(stepper)
-    if fixed is not None and fixed.words > 1:
-        common = common and not ensemble.inputs and stepper.ensemble is not None
-    if fixed is not None and fixed.t_end is not None and stepper.in_tau:  # after steps of their own
-        common = False
-    if not common:
-        if settings.observe is not None:
+    stepper, settings = ensemble.stepper, ensemble.settings
+    common = ensemble.fixed is not None and not settings.records_events(stepper)
+    observation = None
+    if settings.observe is not None:
+        if not common:
             raise StateError(
                 f"observe={settings.observe!r} requires a fixed step size: give h and steps, or observe each "
                 "trajectory by integrate"
             )
-        return IndividualRuns(ensemble)
-    observation = None if settings.observe is None else EnsembleObservation(stepper, settings.observe, len(ensemble))
-    return CommonRuns(ensemble, observation)
+        observation = EnsembleObservation(stepper, settings.observe, len(ensemble))
+    binding = _binding_of_lanes(ensemble, observation) if common else None
+    return IndividualRuns(ensemble) if binding is None else CommonRuns(ensemble, binding, observation)
+
+
+def _binding_of_lanes(ensemble: Ensemble, observation: EnsembleObservation | None) -> Binding | None:
+    """Return the library of trajectories in SIMD lanes, ``None`` for others.
+
+    These are without the steps of the method, of constraints with inputs, which single runs check for jumps, of
+    constraints whose actions are summed, of inputs in two words, and where a rule of Metropolis has no lanes.
+    """
+    stepper, interface, inputs = ensemble.stepper, ensemble.stepper.interface, ensemble.inputs
+    if observation is not None:
+        return observation.binding
+    if (inputs and (interface.constraints or interface.words > 1)) or (interface.constraints and stepper.sums_action):
+        return None
+    binding: Binding | None = (
+        stepper._binding_in_single if ensemble.settings.precision == "single" else stepper._ensemble_binding
+    )
+    if binding is not None and ensemble.noise.metropolis and not binding.constant("HAS_METROPOLIS"):
+        return None
+    return binding

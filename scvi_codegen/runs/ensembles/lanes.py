@@ -1,4 +1,4 @@
-"""Ensembles with common fixed steps: trajectories in the SIMD lanes of blocks of C, or one after the other.
+"""Ensembles with common fixed steps in the SIMD lanes of blocks of C.
 
 A lane whose step fails keeps its last good state. When its block has ended, the single integrator (which falls back on
 Newton's iteration) continues it; if that fails too, its later states are NaN and its status gives the reason. Other
@@ -8,7 +8,6 @@ lanes are unaffected.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -16,12 +15,12 @@ import numpy as np
 from scvi_codegen.codegen.native.arguments import empty_array
 from scvi_codegen.codegen.native.binding import Binding
 from scvi_codegen.common.errors import StateError, StepFailedError
-from scvi_codegen.common.thread_pool import StopCheck, run_jobs
+from scvi_codegen.common.thread_pool import StopCheck
 from scvi_codegen.runs.driver.run_loop import record
-from scvi_codegen.runs.ensembles.batches import CHUNK_SECONDS, FIRST_CHUNK_STEPS, GROWTH, Batch, Rows, SuccessiveRuns
+from scvi_codegen.runs.ensembles.batches import CHUNK_SECONDS, FIRST_CHUNK_STEPS, GROWTH, Batch
 from scvi_codegen.runs.ensembles.ensemble import Ensemble
 from scvi_codegen.runs.ensembles.observation import EnsembleObservation
-from scvi_codegen.runs.ensembles.result import INTERRUPTED, OK, EnsembleTrajectory, failure_after
+from scvi_codegen.runs.ensembles.result import INTERRUPTED, OK, EnsembleTrajectory
 from scvi_codegen.runs.ensembles.schedule import CommonSteps
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.chunks import drive
@@ -31,28 +30,28 @@ from scvi_codegen.runs.trajectory import Trajectory
 
 
 class CommonRuns:
-    """Trajectories with common fixed steps: the arrays of all states, which C and single runs fill.
+    """Trajectories in SIMD lanes: the arrays of all states, which C and single runs fill.
 
     Args:
-        ensemble: the trajectories.
+        ensemble: the trajectories, with common fixed steps.
+        binding: of their lanes.
         observation: functions of the state that are observed along the runs, or ``None``.
 
     Attributes:
         steps: the steps.
         q, p: (n, k, m) saved states; NaN where not reached.
         blocks: their memory, which has both words of numbers of two.
-        times: (n, k) times in transformed time, else ``None``.
         actions: (n, k) actions up to each state if runs sum them, NaN where unknown, else ``None``.
         status, done: reason of the end and number of completed steps of each trajectory.
         fallback_steps: numbers of steps that the iteration did not solve, but its fallback.
     """
 
-    def __init__(self, ensemble: Ensemble, observation: EnsembleObservation | None = None) -> None:
-        self.ensemble, self.observation, self.steps = ensemble, observation, cast(CommonSteps, ensemble.fixed)
+    def __init__(self, ensemble: Ensemble, binding: Binding, observation: EnsembleObservation | None = None) -> None:
+        self.ensemble, self.binding, self.observation = ensemble, binding, observation
+        self.steps = cast(CommonSteps, ensemble.fixed)
         count = len(ensemble)
         self.status = np.full(count, OK, dtype="<U32")
         self.done, self.fallback_steps = np.zeros((2, count), np.int64)
-        self.times: Array | None = None
         self.actions: Array | None = None
         stepper = ensemble.stepper
         (count, m), words = ensemble.q.shape, stepper.interface.words
@@ -64,9 +63,6 @@ class CommonRuns:
         if stepper.sums_action:
             self.actions = np.full(shape, np.nan)
             self.actions[0] = 0.0
-        if stepper.in_tau:
-            self.times = np.full(shape, np.nan)
-            self.times[0] = ensemble.t0
 
     def __len__(self) -> int:
         return len(self.ensemble)
@@ -78,60 +74,27 @@ class CommonRuns:
 
     def run(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> None:
         """Integrate all trajectories as :meth:`IndividualRuns.run`; ``progress`` is called with the number of steps."""
-        batch, steps, count = self.batch(), self.steps.steps, len(self)
-        if batch is None:
-            starts = [Departure(j, 0, self.q[0, j], self.p[0, j]) for j in range(count)]
-            report = None if progress is None else lambda done: progress(done * steps // count)
-            run_jobs(count, lambda j, check: follow(self, starts[j], check), progress=report, threads=threads)
-            return
-        unit = steps / count
-        try:
-            batch.run(progress=None if progress is None else lambda done: progress(int(done * unit)), threads=threads)
-        finally:
-            if isinstance(batch, SuccessiveRuns):
-                self.status, self.done, self.fallback_steps = batch.names, batch.done, batch.fallback_steps
+        unit = self.steps.steps / len(self)
+        self.batch().run(
+            progress=None if progress is None else lambda done: progress(int(done * unit)), threads=threads
+        )
 
-    def batch(self) -> LaneRuns | SuccessiveRuns | None:
-        """Return the trajectories as C integrates many in one call.
-
-        ``None`` if memory of runs is not reusable, and of constraints with inputs, which single runs check for jumps.
-        Actions of constrained steps are summed by runs one after the other.
-        """
-        stepper, observation = self.ensemble.stepper, self.observation
-        constrained = bool(stepper.interface.constraints)
-        binding = None
-        if observation is not None:
-            binding = observation.binding
-        elif not (constrained and (self.ensemble.inputs or stepper.sums_action)):
-            in_single = self.ensemble.settings.precision == "single"
-            binding = stepper._binding_in_single if in_single else stepper._ensemble_binding
-        if binding is not None and not (self.ensemble.noise.metropolis and not binding.constant("HAS_METROPOLIS")):
-            lanes = LaneRuns(binding, self.ensemble, self._fields(), common=self)
-            self.done = lanes.done
-            return lanes
-        if observation is not None or not stepper.binding.reusable or (self.ensemble.inputs and constrained):
-            return None
-        return SuccessiveRuns(self.ensemble, self._store)
-
-    def _fields(self) -> dict[str, Array]:
-        """Return the arrays that C fills, and reads, by name."""
+    def batch(self) -> LaneRuns:
+        """Return the trajectories as C integrates many in one call."""
         fields = {"positions": self.blocks[0], "momenta": self.blocks[1]}
         if self.actions is not None:
             fields["actions"] = self.actions
         if self.observation is not None:
             fields["observed"] = self.observation.values
-        return fields
-
-    def _store(self, states: Rows) -> None:
-        states.put((self.q, states.q), (self.p, states.p), (self.times, states.t), (self.actions, states.actions))
+        lanes = LaneRuns(self.binding, self.ensemble, fields, common=self)
+        self.done = lanes.done
+        return lanes
 
     def keep(self, part: slice, trajectories: EnsembleTrajectory) -> None:
         """Store the results of a slice that was integrated elsewhere."""
         self.q[:, part], self.p[:, part] = trajectories.q, trajectories.p
         self.status[part], self.done[part] = trajectories.status, trajectories.steps
         self.fallback_steps[part] = cast(Array, trajectories.fallback_steps)
-        if self.times is not None:
-            self.times[:, part] = trajectories.t
         if self.actions is not None:
             self.actions[:, part] = trajectories.actions
         if self.observation is not None:
@@ -142,14 +105,10 @@ class CommonRuns:
         ensemble, status, unfinished = self.ensemble, self.status, self.done < self.steps.steps
         if unfinished.any():
             status = np.where(unfinished & (status == OK), INTERRUPTED, status)
-        spans = self.steps.spans() if ensemble.inputs else ()
-        failed = np.flatnonzero((status != OK) & (status != INTERRUPTED)).tolist() if self.times is None else ()
-        steps = {j: int(self.done[j]) for j in failed}
         return EnsembleTrajectory(
-            t=self.steps.t.copy() if self.times is None else self.times,
+            t=self.steps.t.copy(),
             q=self.q,
             p=self.p,
-            tau=None if self.times is None else self.steps.times(tau=True),
             status=status,
             steps=self.done,
             h=self.steps.h,
@@ -159,8 +118,8 @@ class CommonRuns:
             observed=None if self.observation is None else self.observation.result(),
             actions=self.actions,
             fallback_steps=self.fallback_steps,
-            messages={j: failure_after(self.steps.at(n)[1][0], n, str(status[j])) for j, n in steps.items()},
-            spans=tuple((rows, slice(None), partial(ensemble.values_at, segment.middle)) for rows, segment in spans),
+            messages=self.steps.failures(status, self.done),
+            spans=tuple(self.steps.spans(ensemble.values_at) if ensemble.inputs else ()),
         )
 
 
@@ -269,7 +228,7 @@ class Departure(NamedTuple):
         j: the trajectory.
         step: number of completed steps.
         q, p: (m,) state.
-        low: compensation of the sums of q and p by the lane that the trajectory has left, ``None`` at the start.
+        low: compensation of the sums of q and p by the lane that the trajectory has left.
         unknowns: of the last step, if a single run predicts the next step by them.
     """
 
@@ -277,7 +236,7 @@ class Departure(NamedTuple):
     step: int
     q: Array
     p: Array
-    low: tuple[Array, Array] | None = None
+    low: tuple[Array, Array]
     unknowns: Array | None = None
 
 
@@ -322,8 +281,7 @@ def _started(common: CommonRuns, departure: Departure) -> Memory | None:
     except StateError:  # a sum of finite terms has overflowed
         common.status[j] = "not finite"
         return None
-    if low is not None:
-        run._resume_at(step, time, low, unknowns)
+    run._resume_at(step, time, low, unknowns)
     return run
 
 
@@ -342,8 +300,5 @@ def _advance(common: CommonRuns, departure: Departure, run: Memory, step: int, s
         saved = saved[(first + saved) % save_every == 0]
     rows = slice(row, row + len(saved))
     common.q[rows, j], common.p[rows, j] = trajectory.q[saved], trajectory.p[saved]
-    if common.times is not None:
-        common.times[rows, j] = trajectory.t[saved]
     if common.actions is not None:
-        unknown = departure.low is not None or trajectory.actions is None
-        common.actions[rows, j] = np.nan if unknown else cast(Array, trajectory.actions)[saved]
+        common.actions[rows, j] = np.nan

@@ -48,7 +48,7 @@ MOST_DRAWN = 64
 MOST_SHOWN = 3
 """Largest number of trajectories, and of coordinates, that a notebook shows."""
 
-Span: TypeAlias = tuple[slice, slice, Callable[[slice], Array]]
+SpanOfRows: TypeAlias = tuple[slice, slice, Callable[[slice], Array]]
 """Rows of states, a slice of trajectories, and a function returning the parameters of trajectories in these rows."""
 
 
@@ -100,7 +100,7 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble, OfEnsembles, TwoWor
     observed: Array | None = field(default=None, repr=False)
     actions: Array | None = field(default=None, repr=False)
     fallback_steps: NDArray[np.int64] | None = field(default=None, repr=False)
-    spans: tuple[Span, ...] = field(default=(), repr=False)
+    spans: tuple[SpanOfRows, ...] = field(default=(), repr=False)
     confirmations: tuple[GlobalError | None, ...] = field(default=(), repr=False)
     events: tuple[tuple[Crossings, ...], ...] = field(default=(), repr=False)
     modes: tuple[ModeHistory | None, ...] = field(default=(), repr=False)

@@ -1,10 +1,10 @@
 """Common fixed steps of an ensemble, in segments of equal steps between the breakpoints of inputs."""
 
 from bisect import bisect_right
-from collections.abc import Iterator, Mapping
-from functools import cached_property, lru_cache
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property, lru_cache, partial
 from itertools import accumulate
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,11 @@ from scvi_codegen.codegen.native.arguments import empty_array
 from scvi_codegen.codegen.native.option_table import checked_step
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.driver.segments import Input, Segment, planned_segments, time_after_steps
+from scvi_codegen.runs.ensembles.result import INTERRUPTED, OK, SpanOfRows, failure_after
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.states.words import exact_sum, with_low
+from scvi_codegen.runs.stepping.step_plan import Span
 
 
 class StepChunk(NamedTuple):
@@ -82,9 +84,9 @@ class CommonSteps:
         self.words, self.ends = words, list(accumulate(segment.steps for segment in self.segments))
 
     @property
-    def arguments(self) -> dict[str, Any]:
-        """Arguments of :meth:`Stepper.integrate` for these steps."""
-        return {"h": self.h} | ({"steps": self.steps} if self.t_end is None else {"t_end": self.t_end})
+    def span(self) -> Span:
+        """Their number, or the final time."""
+        return Span(self.steps) if self.t_end is None else Span(t_end=self.t_end)
 
     def row(self, step: int) -> int:
         """Return the index of the first saved state after ``step`` steps."""
@@ -142,12 +144,18 @@ class CommonSteps:
                 times[self.row(end) - 1], lows[self.row(end) - 1] = segment.end, 0.0
         return with_low(times, lows) if self.words > 1 else np.asarray(times)
 
-    def spans(self) -> Iterator[tuple[slice, Segment]]:
-        """Yield the saved states of each segment; a breakpoint belongs to the earlier one."""
+    def spans(self, values_at: Callable[..., Array]) -> Iterator[SpanOfRows]:
+        """Yield the saved states of each segment, of all trajectories; a breakpoint belongs to the earlier one."""
         first = 0
         for end, segment in zip(self.ends, self.segments, strict=True):
-            yield slice(first, self.row(end)), segment
+            yield slice(first, self.row(end)), slice(None), partial(values_at, segment.middle)
             first = self.row(end)
+
+    def failures(self, status: NDArray[np.str_], done: NDArray[np.int64]) -> dict[int, str]:
+        """Return why trajectories failed, by their numbers, which ended after ``done`` steps."""
+        failed = np.flatnonzero((status != OK) & (status != INTERRUPTED)).tolist()
+        steps = {j: int(done[j]) for j in failed}
+        return {j: failure_after(self.at(n)[1][0], n, str(status[j])) for j, n in steps.items()}
 
 
 FEW_STEPS = 1000

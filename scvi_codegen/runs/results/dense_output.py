@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.codegen.native.arguments import checked_number, real_array
 from scvi_codegen.codegen.native.options import step_failure
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.runs.results.output import Output
+from scvi_codegen.runs.nouns import Save
 from scvi_codegen.runs.results.saved_states import ROUNDINGS, SavedStates
 from scvi_codegen.runs.results.time_transformation import part_of_step, states_in_transformed_time
 from scvi_codegen.runs.states.times import number_until
@@ -94,7 +94,7 @@ def _integrate_to_each(
         start = states.t[left[rows[0]]]
         settings = {"t": start, "parameters": parameters_set_until(states, start), "options": states.options}
         run = stepper._run(q[rows[0]], p[rows[0]], plan=to_last, **settings)
-        reached = run._recorded(None, Output(times=times[rows]))
+        reached = run._recorded(None, Save(t_eval=times[rows]))
         q[rows], p[rows] = reached.q, reached.p
     return q, p
 

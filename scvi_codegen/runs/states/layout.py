@@ -45,7 +45,7 @@ Start = tuple[Any, Any, Any]
 """Positions, momenta and velocities of a state, of which one of the last two is ``None``."""
 
 
-class InitialData(NamedTuple):
+class Initial(NamedTuple):
     """Initial state of a run, and what holds for all of its steps.
 
     Attributes:

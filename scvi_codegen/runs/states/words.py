@@ -287,10 +287,10 @@ def hashed(t: float) -> float | Fraction:
     return fraction_of(t) if isinstance(t, Word) else t
 
 
-def check_doubles(**times: Any) -> None:
-    """Raise ``StateError`` if a time is not a double, which rounding would change."""
+def check_doubles(words: int, **times: Any) -> None:
+    """Raise ``StateError`` if a time of a run of two words is not a double, which rounding would change."""
     for name, time in times.items():
-        if type(time) is not float and time is not None:
+        if words > 1 and type(time) is not float and time is not None:
             low = split(time, name)[1]
             if np.any(low):
                 raise StateError(f"{name} must be doubles, such as 0.125 or float({name}): it has digits beyond those")

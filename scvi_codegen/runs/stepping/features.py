@@ -60,54 +60,50 @@ BY_FORMULAS = ("flow", "chaos_ensemble", "path")
 """Operations with many steps that do not locate kinks."""
 SHORT_STEPS = ("svi-1-", "svi-2-", "stoermer-verlet", "composition")
 """Beginnings of the names of methods whose steps are short enough for the interpolation of the shadow energy."""
-PROPERTIES: dict[str, Callable[[Any], Any]] = {
-    "with a time transformation": attrgetter("interface.time_transformation"),
-    "in transformed time": attrgetter("in_tau"),
-    "in transformed time of a first-order system": lambda stepper: stepper.in_tau and stepper.interface.variables,
-    "for a first-order system": attrgetter("interface.variables"),
-    "in a heat bath": attrgetter("interface.temperature"),
-    "with events that change the state": attrgetter("changes_states"),
-    "with constraints": lambda stepper: (
-        len(stepper.interface.constraints) > stepper.interface.masked or stepper.interface.layout.constraints
-    ),
+PROPERTIES: dict[str, str | Callable[[Any], Any]] = {
+    "with a time transformation": "interface.time_transformation",
+    "in transformed time": "in_tau",
+    "in transformed time of a first-order system": "in_tau interface.variables",
+    "for a first-order system": "interface.variables",
+    "in a heat bath": "interface.temperature",
+    "with events that change the state": "changes_states",
+    "with constraints": lambda stepper: stepper.interface.imposed or stepper.interface.layout.constraints,
     "with nonholonomic constraints": lambda stepper: any(
         name in formula
         for name in ("_dot", *(f"{rate}_" for text in stepper.interface.rotations for rate in text.split()[2:]))
-        for formula in stepper.interface.constraints[: len(stepper.interface.constraints) - stepper.interface.masked]
+        for formula in stepper.interface.imposed
     ),
-    "with constraints of arrays": attrgetter("interface.layout.constraints"),
+    "with constraints of arrays": "interface.layout.constraints",
     "with constraints of arrays by a composition": lambda stepper: (
         stepper.interface.layout.constraints and stepper.interface.method.startswith("composition")
     ),
-    "with kinks that runs locate": attrgetter("interface.modes"),
+    "with kinks that runs locate": "interface.modes",
     "where L or H jumps": lambda stepper: any("jumps" in mode for mode in stepper.interface.modes),
     "with events that set parameters": lambda stepper: len(stepper.modes) > len(stepper.interface.mode_names),
-    "with contacts": attrgetter("interface.masked"),
-    "with contacts by steps": attrgetter("by_steps"),
+    "with contacts": "interface.masked",
+    "with contacts by steps": "by_steps",
     "without steps of contacts": lambda stepper: "motion_terms" not in stepper._plain.contents.functions,
-    "without constraints": lambda stepper: not (stepper.interface.constraints or stepper.interface.layout.constraints),
+    "without constraints": "!interface.constraints !interface.layout.constraints",
     "with the long steps of this method": lambda stepper: not stepper.interface.method.startswith(SHORT_STEPS),
-    "where the energy changes": attrgetter("interface.changes_energy"),
-    "without a mesh": lambda stepper: not stepper.interface.layout.mesh,
-    "with sizes known when compiled": lambda stepper: not stepper.run_time_sizes,
-    "with sizes known at run time": attrgetter("run_time_sizes"),
+    "where the energy changes": "interface.changes_energy",
+    "without a mesh": "!interface.layout.mesh",
+    "with sizes known when compiled": "!run_time_sizes",
+    "with sizes known at run time": "run_time_sizes",
     "with precision='double-double'": lambda stepper: stepper.interface.words > 1,
-    "without trajectories in SIMD lanes": lambda stepper: not (stepper.run_time_sizes or stepper.ensemble),
+    "without trajectories in SIMD lanes": "!run_time_sizes !ensemble",
     "without derivatives": lambda stepper: stepper._lacks(Derivatives()),
     "without second derivatives": lambda stepper: stepper._lacks(Derivatives(order=2)),
-    "without a tangent vector along runs": lambda stepper: not stepper._carries_errors,
-    "without an error estimate": lambda stepper: not (stepper._has_error_estimate or stepper._has_tau),
+    "without a tangent vector along runs": "!_carries_errors",
+    "without an error estimate": "!_has_error_estimate !_has_tau",
 }
-"""Whether a stepper has a property: a value that is true if it has."""
+"""Whether a stepper has a property: attributes that are then all true, or false after a ``!``, or a function."""
 
-PROPERTIES_OF_SIZES: dict[str, Callable[[Any], Any]] = {
-    "with constraints that prescribe the motion": lambda stepper: (
-        len(stepper.interface.constraints) - stepper.interface.masked == stepper.dimension
-    ),
-    "with forces": attrgetter("interface.exchange_names"),
-    "without the work of forces": lambda stepper: not stepper.interface.exchange_names,
-    "without an action": lambda stepper: not stepper.interface.has_action,
-    "without a sum of L along steps": lambda stepper: not stepper.interface.sums_action,
+PROPERTIES_OF_SIZES: dict[str, str | Callable[[Any], Any]] = {
+    "with constraints that prescribe the motion": lambda stepper: len(stepper.interface.imposed) == stepper.dimension,
+    "with forces": "interface.exchange_names",
+    "without the work of forces": "!interface.exchange_names",
+    "without an action": "!interface.has_action",
+    "without a sum of L along steps": "!interface.sums_action",
 }
 """Properties of a stepper of known sizes; one of arrays of run-time sizes has none of them."""
 
@@ -320,13 +316,20 @@ def require(stepper: Any, operation: str, *together: str) -> None:
         warn_of_formulas(stepper.interface, OPERATIONS[operation])
 
 
+def _has(stepper: Any, trait: str | Callable[[Any], Any]) -> bool:
+    """Return whether a stepper has a property of the table."""
+    if callable(trait):
+        return bool(trait(stepper))
+    return all(bool(attrgetter(name.lstrip("!"))(stepper)) != (name[0] == "!") for name in trait.split())
+
+
 def refusal_of(stepper: Any, operation: str, *together: str) -> ScviCodegenError | None:
     """Return the refusal of an operation of a stepper, or of one together with others; ``None`` if it is available."""
     for property_ in _EXCLUDING.get(operation, ()):
         if property_ in PROPERTIES_OF_SIZES:
-            applies = not stepper.run_time_sizes and PROPERTIES_OF_SIZES[property_](stepper.known)
+            applies = not stepper.run_time_sizes and _has(stepper.known, PROPERTIES_OF_SIZES[property_])
         else:
-            applies = PROPERTIES[property_](stepper) if property_ in PROPERTIES else property_[5:] in together
+            applies = _has(stepper, PROPERTIES[property_]) if property_ in PROPERTIES else property_[5:] in together
         if applies:
             return refusal(operation, property_, stepper.title)
     return None

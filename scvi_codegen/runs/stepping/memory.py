@@ -17,7 +17,7 @@ from scvi_codegen.codegen.native.option_table import checked_step
 from scvi_codegen.codegen.native.options import SolverOptions, checked_options, step_failure
 from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.common.validation import LARGEST_COUNT, checked_count
-from scvi_codegen.runs.states.layout import InitialData
+from scvi_codegen.runs.states.layout import Initial
 from scvi_codegen.runs.states.validation import Array, Parameters, States, inputs_not_given, missing_input, no_input
 from scvi_codegen.runs.states.words import Word, Words, stacked, with_low, word
 from scvi_codegen.runs.stepping.chunks import drive
@@ -151,11 +151,6 @@ class Memory:
         self._inputs = {name: slice(first, first + 5) for name, first in firsts.items()}
         self._ranges = {name: limits for name, *limits in stepper.interface.input_ranges}
 
-    def _first_steps(self, save_every: int) -> int:
-        """Return the largest number of steps of the first C call, of a run that saves every ``save_every``-th state."""
-        steps, most = self._first_saved * save_every, self._longest_first
-        return steps if steps < most else most
-
     def _new_call(self, t: Any, q: Any, p: Any, iterations: Any) -> Any:
         """Return the arguments of C calls that store states in this memory."""
         call = self.stepper.binding.new("call *")
@@ -183,11 +178,11 @@ class Memory:
         t: float = 0.0,
         parameters: Parameters = None,
         options: SolverOptions | None = None,
-        noise: Noise | None = None,
+        noise: Noise = DEFAULT_NOISE,
     ) -> None:
         """Start at (q, p) and t; nothing of an earlier run remains."""
-        self._noise = DEFAULT_NOISE if noise is None else noise
-        initial = InitialData(q, p, None, self.stepper._states.time(t), parameters, options)
+        self._noise = noise
+        initial = Initial(q, p, None, self.stepper._states.time(t), parameters, options)
         self._set_up(plan, initial)
         self._begin(q, p, initial.t)
 
@@ -206,7 +201,7 @@ class Memory:
             check_strengths(self.stepper, t, self._h, self._parameters, self._q)
             self._noise.store(self._memory)
 
-    def _set_up(self, plan: StepPlan, initial: InitialData) -> None:
+    def _set_up(self, plan: StepPlan, initial: Initial) -> None:
         """Set what holds for all steps of a run; momenta are required in transformed time only."""
         q, p, _, _, parameters, options = initial
         if parameters is not None or not self._has_defaults:

@@ -118,12 +118,9 @@ class Noise(NamedTuple):
     trajectory: int = 0
     metropolis: bool = False
 
-    @classmethod
-    def checked(
-        cls, stepper: Any, seed: int, metropolis: bool, trajectory: int = 0, inputs: Mapping[str, Any] | None = None
-    ) -> Noise:
-        """Return the stream of these arguments of a run; raise an error for those that the stepper excludes."""
-        interface = stepper.interface
+    def checked(self, stepper: Any, inputs: Mapping[str, Any] | None = None) -> Noise:
+        """Return the stream of a run; raise an error for what the stepper excludes."""
+        (seed, _, metropolis), interface = self, stepper.interface
         coloured = any(isinstance(value, ColouredNoise) for value in (inputs or {}).values())
         if interface.temperature is None and ((seed != 0 and not coloured) or metropolis):
             raise StateError(f"{OPTION['metropolis' if metropolis else 'seed']} {NO_BATH} '{interface.system}'")
@@ -136,11 +133,12 @@ class Noise(NamedTuple):
                 f"{OPTION['metropolis']} is not available for '{interface.title}' ({', '.join(interface.notes)}; "
                 f"{interface.changes_energy}): it requires a symmetric method and no forces, inputs and time; omit it"
             )
-        return cls(OPTION["seed"].checked(seed), trajectory, metropolis)
+        return self._replace(seed=OPTION["seed"].checked(seed))
 
     def store(self, memory: Any) -> None:
-        """Set the stream of a run that starts, in C."""
-        memory.seed, memory.trajectory, memory.metropolis = self
+        """Set the stream of a run that starts, in C, which has none without a bath."""
+        if hasattr(memory, "seed"):
+            memory.seed, memory.trajectory, memory.metropolis = self
 
 
 def negative_strength(stepper: Any, t: float, parameters: Array, q: Array | None = None) -> str:

@@ -13,7 +13,7 @@ from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.states.words import block_of
 from scvi_codegen.runs.stepping.array_interface import RunSizes, check_accesses, read_tables
 from scvi_codegen.runs.stepping.integrator import Integrator
-from scvi_codegen.runs.stepping.step_plan import Adaptive, ErrorControl, FixedSteps
+from scvi_codegen.runs.stepping.step_plan import Adaptive, FixedSteps, Steps
 from scvi_codegen.systems.formulas.indices import MOST_THREADS
 
 MAGIC = b"scvi run 4\n"
@@ -48,7 +48,7 @@ def checkpoint(run: Any) -> bytes:
         "sizes": sizes,
         "unset inputs": run._unset_inputs,
         "adaptive": not isinstance(run.plan, FixedSteps),
-        **({"control": ErrorControl.of(run.plan).named} if isinstance(run.plan, Adaptive) else {}),
+        **({"control": Steps.of(run.plan).named} if isinstance(run.plan, Adaptive) else {}),
     }
     arrays: list[Any] = [*places.values(), block_of(run.parameters)]
     return sealed(b"".join([json.dumps(header).encode(), b"\n", *(array.tobytes() for array in arrays), run.snapshot]))
@@ -56,7 +56,7 @@ def checkpoint(run: Any) -> bytes:
 
 def read_checkpoint(
     saved: bytes, stepper: Integrator, *, threads: int | None, adaptive: bool
-) -> tuple[Integrator, bytes, dict[str, Any], ErrorControl]:
+) -> tuple[Integrator, bytes, dict[str, Any], Steps]:
     """Return the stepper, bound to the sizes of the run, the state, the parameters by name and the error control.
 
     ``adaptive``: whether the run continues with adaptive steps.
@@ -72,7 +72,7 @@ def read_checkpoint(
 
 def _read(
     body: bytes, stepper: Integrator, threads: int | None, *, adaptive: bool
-) -> tuple[Integrator, bytes, dict[str, Any], ErrorControl]:
+) -> tuple[Integrator, bytes, dict[str, Any], Steps]:
     # body: header in JSON, newline, tables of int32, words of the parameters, memory of the run
     text, _, arrays = body.partition(b"\n")
     header, layout = json.loads(text), stepper.interface.layout
@@ -106,7 +106,7 @@ def _read(
     parameters = stepper.parameters_by_name(stepper._states.numbers(values))
     for name in header["unset inputs"]:
         del parameters[f"{name}_0"]
-    control = ErrorControl(**header.get("control", {}))
+    control = Steps(**header.get("control", {}))
     control.checked()
     return stepper, arrays[offset + values.nbytes :], parameters, control
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any, ClassVar, NamedTuple, Self, TypeAlias
+from typing import Any, ClassVar, NamedTuple, Self, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -99,7 +99,7 @@ class Adaptive:
     @property
     def record(self) -> dict[str, Any]:
         """Numbers by name for files; also arguments for users."""
-        return {"t_end": self.t_end} | ErrorControl.of(self).named
+        return {"t_end": self.t_end} | Steps.of(self).named
 
     @property
     def admissible_error(self) -> float:
@@ -160,40 +160,35 @@ class AdaptivePlans(Sequence[Adaptive]):
         return replace(self.plan, t_end=float(self.ends[j]))
 
 
-class KindOfSteps(NamedTuple):
-    """Kind of the steps of a stepper.
+class Span(NamedTuple):
+    """Duration of a run: its number of fixed steps, or its final time; ``None`` where a user omits it."""
+
+    steps: int | None = None
+    t_end: Any = None
+
+
+class Steps(NamedTuple):
+    """Sizes of steps as users ask for them; ``None`` where a user omits them.
 
     Attributes:
-        time_transformation: of the reversible controller, if there is one.
-        in_tau: whether the system is one in transformed time, which has fixed steps only.
-        words: number of words of the states.
-        has_unseen_growth: whether the error estimate of a step does not see that masses grow.
-    """
-
-    time_transformation: str | None = None
-    in_tau: bool = False
-    words: int = 1
-    has_unseen_growth: bool = False
-
-
-class ErrorControl(NamedTuple):
-    """Arguments of users for adaptive steps; ``None`` where a user omits them.
-
-    Attributes:
-        tolerance: relative error of a step.
+        tolerance: relative error of an adaptive step.
         absolute_tolerance: smallest size of a coordinate, relative to which errors are measured: a number, or by name.
         max_step, first_step: largest step size; size of the first trial.
+        h: fixed step size.
+        error: bound of the relative global error.
     """
 
     tolerance: float | None = None
     absolute_tolerance: float | Mapping[str, float] | None = None
     max_step: float | None = None
     first_step: float | None = None
+    h: float | None = None
+    error: float | None = None
 
     @property
     def named(self) -> dict[str, Any]:
-        """The arguments that are not omitted, by name."""
-        return {name: value for name, value in zip(self._fields, self, strict=True) if value is not None}
+        """The arguments of adaptive steps that are not omitted, by name."""
+        return {name: value for name, value in zip(self._fields[:4], self, strict=False) if value is not None}
 
     @classmethod
     def of(cls, plan: Adaptive) -> Self:
@@ -234,7 +229,7 @@ def plan_from_record(*, h: Any = None, tau: Any = None, **control: Any) -> Fixed
         if control or not checked_number(tau, "tau") > 0.0:
             raise StateError(f"steps of tau = {tau:g} must be positive and have no tolerance")
         return InTau(checked_number(t_end, "t_end"), tau)
-    return ErrorControl(**control).to(t_end)
+    return Steps(**control).to(t_end)
 
 
 def absolute_tolerances(interface: Interface, dimension: int, absolute: AbsoluteTolerance) -> NDArray[np.float64]:
@@ -322,65 +317,53 @@ def _check_resolved(tolerance: float | None, least: float) -> None:
         )
 
 
-def checked_plan(kind: KindOfSteps, h: float | None, t_end: float | None, control: ErrorControl) -> StepPlan:
+def checked_plan(interface: Interface, steps: Steps, t_end: float | None) -> StepPlan:
     """Return the step plan of arguments of users; StateError if they are invalid or do not determine the steps."""
-    if kind.time_transformation is not None:
-        if h is None or t_end is None or control.named:
+    h, named = steps.h, steps.named
+    if interface.time_transformation is not None:
+        if h is None or t_end is None or named:
             remedy = in_words(FEATURES["adaptive", "with a time transformation"])
-            remedy += f"; omit {', '.join(str(OPTION[name]) for name in control.named)}" if control.named else ""
-            raise StateError(f"the time transformation {kind.time_transformation} determines the step size: {remedy}")
+            remedy += f"; omit {', '.join(str(OPTION[name]) for name in named)}" if named else ""
+            raise StateError(
+                f"the time transformation {interface.time_transformation} determines the step size: {remedy}"
+            )
         tau = checked_step(h)
         if tau < 0.0:
             raise StateError(f"h = {h:g} must be positive with a time transformation: t_end determines the direction")
         return InTau(checked_number(t_end, "t_end"), tau)
-    if h is None and kind.in_tau:
+    if h is None and interface.in_tau:
         raise refusal("adaptive", "in transformed time")
     if h is None:
         if t_end is None:
             raise StateError("give either h (fixed step size) or t_end (adaptive step size); got neither")
-        if kind.has_unseen_growth:
+        if interface.has_unseen_growth:
             warn(UNSEEN_GROWTH, AccuracyWarning)
-        return control.to(t_end)
-    if named := control.named:
-        check_agreement({"h": h, **named})
+        return steps.to(t_end)
+    check_agreement({"h": h, **named})
     if t_end is not None:
         raise StateError("give either h (fixed step size) or t_end (adaptive step size); got both")
     return Fixed(checked_step(h))
 
 
 def planned_steps(
-    kind: KindOfSteps,
-    h: float | None,
-    steps: int | None,
-    t_end: float | None,
-    tolerance: float | None,
-    absolute_tolerance: float | Mapping[str, float] | None,
-    max_step: float | None,
-    first_step: float | None,
-    save_every: int,
-    t: float | Fraction,
-    /,
+    interface: Interface, size: Steps, span: Span, save_every: int, t: float | Fraction
 ) -> tuple[StepPlan, int | None]:
     """Return the plan of :meth:`Stepper.integrate` and its number of steps, ``None`` to t_end.
 
-    Runs in double-double end at t_end to 32 digits; t matters with h and t_end.
+    Runs in double-double end at t_end to 32 digits; t matters with t_end.
     """
-    fixed = h is not None and kind.time_transformation is None
-    control = ErrorControl(tolerance, absolute_tolerance, max_step, first_step)
-    given = {"steps": steps, "t_end": t_end}
-    if kind.time_transformation is None:
-        given |= {"h": h, **control.named}
-    check_agreement(given, partly="h" not in given)
-    plan = checked_plan(kind, h, None if fixed else t_end, control)
-    if kind.words > 1:
-        check_doubles(t_end=t_end)
+    in_time, (steps, t_end) = interface.time_transformation is None, span
+    check_agreement(span._asdict() | (size._asdict() if in_time else {}), partly=not in_time)
+    plan = checked_plan(interface, size, None if in_time and size.h is not None else t_end)
+    check_doubles(interface.words, t_end=t_end)
     if not isinstance(plan, FixedSteps):
+        check_max_step(plan, cast(float, t), interface.words)
         return plan, None
     if t_end is None:
         if steps is None:
             raise StateError(lacking(DURATION))
         return plan, OPTION["steps"].checked(steps)
-    count = None if kind.in_tau else steps_to(t, t_end, plan.h, exactly=kind.words > 1)
+    count = None if interface.in_tau else steps_to(t, t_end, plan.h, exactly=interface.words > 1)
     if count is not None and count % OPTION["save_every"].checked(save_every) == 0:
         return plan, count
     end = checked_number(t_end, "t_end")
