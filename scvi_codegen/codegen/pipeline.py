@@ -41,12 +41,14 @@ from scvi_codegen.codegen.ir.variants import (
     Lanes,
     NewtonFallback,
     Observing,
+    StepTerms,
     Sums,
     TangentVectors,
     Variant,
 )
 from scvi_codegen.codegen.lowering.arrays import check_solver
 from scvi_codegen.codegen.lowering.bath import heat_bath_of
+from scvi_codegen.codegen.lowering.constraints import terms_of_steps
 from scvi_codegen.codegen.lowering.control import control_of, error_growth_of
 from scvi_codegen.codegen.lowering.derivatives import correction_of, derivatives_of
 from scvi_codegen.codegen.lowering.loops import transforms, with_sums
@@ -66,6 +68,7 @@ from scvi_codegen.codegen.rendering.program_source import (
     render_embedded,
     render_ensemble,
     render_ensemble_in_pairs,
+    render_step_terms,
     workspace_in_pairs,
     workspace_size,
 )
@@ -417,6 +420,14 @@ class Sources:
         with announced(f"deriving the {'second ' * second}derivatives of {self.system.name} by {self.method.name}"):
             return render_derivatives(derivatives_of(self.system, stages, program, second=second))
 
+    def step_terms(self) -> Source:
+        """Return the source of the terms of contacts by steps with their derivatives by all inputs of a step."""
+        system = self.system
+        with announced(f"deriving the derivatives of contacts of {system.name} by steps"):
+            kernel, entries = terms_of_steps(system)
+        values = 3 * (system.dimension + len(system.contacts)) + 2 * len(system.constraints)
+        return render_step_terms(self.prefix, system, kernel, entries, values)
+
     def _acting_program(self) -> Program | None:
         """Return the program of runs that sum the action of their steps; ``None`` if they are computed again for it."""
         program = self.program()
@@ -503,6 +514,8 @@ class Sources:
     @without_collection
     def variant(self, variant: Variant) -> Source | None:
         """Return the source of a variant; ``None`` if the method lacks it."""
+        if isinstance(variant, StepTerms):
+            return self.step_terms() if "motion_terms" in self.integrator()[0].contents.functions else None
         if self.solver == BY_STEPS:
             return None
         if self.precision == DOUBLE_DOUBLE:

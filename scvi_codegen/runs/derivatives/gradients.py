@@ -156,7 +156,7 @@ def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], ve
     Modes, which are parameters of the steps, have no variations but those of the directions of slips in space.
     """
     jumps: dict[int, Jump] = {}
-    if states.stepper.divides_steps:
+    if states.stepper.divides_steps and not states.stepper.by_steps:
         more = back or bool(vectors[..., 2 * states.stepper.dimension :].any())
         jumps = jumps_within(states, starts, numbers, all_inputs=more)
     start = jumps.pop(0, None)
@@ -211,6 +211,8 @@ def starts_of(states: SavedStates, first: int, last: int) -> tuple[Starts, NDArr
         return starts, np.arange(first, last + 1)
     t, h = states.t[first] + length * np.arange(count), np.full(count, length)
     starts = Starts.chain(states.q[first], states.p[first], t, h)
+    if states.stepper.by_steps:
+        return starts, np.array([first, *[-1] * (count - 1), last])
     times, starts.q[1:], starts.p[1:] = states._restarted(first, length)._fill(count)
     if states.tau is not None:
         starts.t[1:] = times[:-1]

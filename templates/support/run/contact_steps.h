@@ -46,6 +46,18 @@ typedef struct {
   real x[STEP_SIZE][CONTACT_ROWS];
 } responses;
 
+/* Forces of all rows that solve a problem, and modes of contacts: 0 open, 1 sticks, 2 slips. */
+typedef struct {
+  real force[STEP_ROWS], mode[EVENT_CONTACTS];
+} step_solution;
+
+/* A solved step, or part of one, from (t, q, p) to (q1, p1): the problem of positions, that of velocities without and
+ * with restitution, of whose difference it has a part, and the factor by which velocities shrank (strict energy). */
+typedef struct {
+  real number, t, h, q[M], p[M], q1[M], p1[M], part, factor;
+  step_solution positions, plastic, elastic;
+} step_trace;
+
 /* A step of length h from (t, q, p, v) to q1; contacts that exist, and of all rows the impulses f1. A problem has the
  * near contacts alone, in the order in which they join: `contact` and `row` are their numbers among all. */
 typedef struct {
@@ -63,6 +75,7 @@ typedef struct {
   responses response, at_start;
   real W[CONTACT_ROWS * CONTACT_ROWS];
   cone_problem problem;
+  step_trace *trace; /* of this step; NULL: none */
 } contact_step;
 
 static real times_row(const real *row, const real *x)
@@ -301,12 +314,38 @@ static void note_impulses(contact_step *in)
     in->pushes[in->contact[k]] = in->place[k].normal >= 0 && in->problem.mode[k].pushes;
 }
 
+/* Whether the contacts that push are those of the last step, whose equations have the curvature of this one. */
+static int pushes_as_before(const contact_step *in, const contact_memory *from)
+{
+  int same = 1;
+  for (int k = 0; k < in->problem.contacts; k++)
+    same &= in->place[k].normal < 0 || in->problem.mode[k].pushes == from->pushes[in->contact[k]];
+  return same;
+}
+
 /* y += part X f with responses X. */
 static void add_responses(const responses *of, real part, const real *f, real *y)
 {
   for (int i = 0; i < M; i++)
     for (int c = 0; c < of->count; c++)
       y[i] += part * of->x[i][c] * f[c];
+}
+
+/* Notes a solution with x, of which x[M ..] are the forces of constraints without contacts. */
+static void note_solution(const contact_step *in, const real *x, step_solution *to)
+{
+  const cone_problem *const of = &in->problem;
+  memset(to, 0, sizeof *to);
+  for (int c = 0; c < STEP_FIXED; c++) {
+    to->force[c] = x[M + c];
+    for (int r = 0; r < of->rows; r++)
+      to->force[c] += in->response.x[M + c][r] * of->f[r];
+  }
+  for (int r = 0; r < of->rows; r++)
+    to->force[in->row[r]] = of->f[r];
+  for (int k = 0; k < of->contacts; k++)
+    if (in->place[k].normal < 0 || of->mode[k].pushes)
+      to->mode[in->contact[k]] = of->mode[k].sticks && cone_limit(of, k) > 0.0 ? 1.0 : 2.0;
 }
 
 /* Solves the first problem for q1 and the impulses f1: Newton's method on both, a contact problem an iteration. */
@@ -347,15 +386,19 @@ static int find_positions(contact_step *in, const contact_memory *from)
       in->curvature = update / fmax(before * before, DBL_MIN);
     before = update;
     if (!(update <= (slow ? STEP_SLOW_UPDATE / STEP_UPDATE : 1.0) * size + smallest) &&
-        !(iteration == 0 && in->curvature > 0.0 && !slow && in->curvature * update * update <= STEP_UPDATE * size))
+        !(iteration == 0 && in->curvature > 0.0 && !slow && in->curvature * update * update <= STEP_UPDATE * size &&
+            pushes_as_before(in, from)))
       continue;
     for (int i = 0; i < M; i++) /* L_v is linear in v */
       in->first.momentum[i] += times_row(in->first.by_state[i] + M, x) / in->h;
     TRY(terms_between(in, 0));
     const int contacts = in->problem.contacts; /* those join whose gaps only the forces of others close */
     TRY(find_near(in, from, still, 0.0));
-    if (contacts == in->problem.contacts)
+    if (contacts == in->problem.contacts) {
+      if (in->trace)
+        note_solution(in, x, &in->trace->positions);
       return OK;
+    }
   }
   return NOT_CONVERGED;
 }
@@ -397,8 +440,11 @@ static int limit_energy(const contact_step *in, real *v, real *workspace)
   real room;
   TRY(energy_before(in, v, &room, workspace));
   room = fmax(room, 0.0);
-  for (int i = 0; i < M && kinetic > room; i++)
-    v[i] *= sqrt(room / kinetic);
+  const real factor = kinetic > room ? sqrt(room / kinetic) : 1.0;
+  for (int i = 0; i < M; i++)
+    v[i] *= factor;
+  if (in->trace)
+    in->trace->factor = factor;
   return OK;
 }
 
@@ -425,7 +471,9 @@ static int rebound(contact_step *in, const contact_memory *from, real by_surface
   room += by_surfaces;
   if (!solve_cone_within(of, STEP_POINTS))
     return NOT_CONVERGED;
-  memcpy(w, before, sizeof w);
+  if (in->trace)
+    note_solution(in, before, &in->trace->elastic);
+  memcpy(w, before, BYTES(M));
   add_responses(&in->response, 1.0, of->f, w);
   for (int i = 0; i < M; i++)
     w[i] -= v[i];
@@ -435,6 +483,8 @@ static int rebound(contact_step *in, const contact_memory *from, real by_surface
   const real rest = half_product(in, v, v) - plastic - room;
   if (square + linear + rest > 0.0)
     part = rest >= 0.0 ? 0.0 : fmin(1.0, (-linear + sqrt(linear * linear - 4.0 * square * rest)) / (2.0 * square));
+  if (in->trace)
+    in->trace->part = part;
   for (int i = 0; i < M; i++)
     v[i] += part * w[i];
   for (int r = 0; r < of->rows; r++)
@@ -453,7 +503,7 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
 {
   cone_problem *const of = &in->problem;
   const contact_memory from = *to;
-  real x[STEP_SIZE], before[M], v[M], work = 0.0, fastest = 0.0;
+  real before[STEP_SIZE], v[M], work = 0.0, fastest = 0.0;
   const real by_surfaces = work_of_surfaces(in, &in->start, of->f);
   int changes = 0;
   note_impulses(in);
@@ -462,15 +512,14 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   for (int r = 0; r < of->rows; r++)
     work += of->f[r] * times_row(in->start.G[in->row[r]], v);
   for (int i = 0; i < M; i++) {
-    x[i] = 0.5 * (in->h * in->last.force[i] + in->first.momentum[i] - in->last.momentum[i]);
+    before[i] = 0.5 * (in->h * in->last.force[i] + in->first.momentum[i] - in->last.momentum[i]);
     for (int j = 0; j < M; j++)
-      x[i] += in->last.by_state[i][M + j] * (in->q1[j] - in->q[j]) / in->h;
+      before[i] += in->last.by_state[i][M + j] * (in->q1[j] - in->q[j]) / in->h;
   }
   for (int c = 0; c < STEP_FIXED; c++)
-    x[M + c] = -in->end.drift[c];
+    before[M + c] = -in->end.drift[c];
   TRY(factorise_step(NULL, &in->last, &in->end, &in->end, &in->moving));
-  solve_step(&in->moving, x);
-  memcpy(before, x, sizeof before);
+  solve_step(&in->moving, before);
   clear_problem(in);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
@@ -489,6 +538,8 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   to->compliance = fmax(to->compliance, of->compliance);
   if (!solve_cone_within(of, STEP_POINTS))
     return NOT_CONVERGED;
+  if (in->trace)
+    note_solution(in, before, &in->trace->plastic);
   memcpy(v, before, sizeof v);
   add_responses(&in->response, 1.0, of->f, v);
   TRY(rebound(in, &from, by_surfaces, before, v, workspace));
@@ -528,6 +579,10 @@ static void take_state(contact_step *in, const contact_memory *memory, real t, r
   if (in->continues)
     in->resting = in->moving;
   in->solved = 0;
+  if (in->trace) {
+    in->trace->part = 0.0;
+    in->trace->factor = 1.0;
+  }
   in->t = t;
   in->h = h;
   memcpy(in->q, q, BYTES(M));
@@ -556,6 +611,20 @@ static int find_existing(contact_step *in, const contact_memory *from, real *wor
   return OK;
 }
 
+/* Completes the trace of a part of a step. */
+static void end_trace(contact_step *in, const real *p1)
+{
+  step_trace *const of = in->trace;
+  of->t = in->t;
+  of->h = in->h;
+  memcpy(of->q, in->q, BYTES(M));
+  memcpy(of->p, in->p, BYTES(M));
+  memcpy(of->q1, in->q1, BYTES(M));
+  memcpy(of->p1, p1, BYTES(M));
+  of[1].number = of->number;
+  in->trace++;
+}
+
 /* One step of length h from (t, q, p), which become those at its end; where it does not converge, two halves. */
 static int step_by_steps(contact_step *in, contact_memory *memory, real t, real h, real *q, real *p, int depth,
     real *workspace)
@@ -576,6 +645,8 @@ static int step_by_steps(contact_step *in, contact_memory *memory, real t, real 
     memcpy(q, in->q1, BYTES(M));
     *memory = next;
     in->solved = 1;
+    if (in->trace)
+      end_trace(in, p);
     return OK;
   }
   if (depth == STEP_HALVINGS)
@@ -592,6 +663,16 @@ static void put_memory(const contact_memory *memory, real *mode)
     for (int i = 0; i < 2 && now.closed && !now.sticks; i++)
       now.direction[i] = memory->direction[k][i];
     put_mode(CONTACTS + k, now, AT_REST, 0.0, mode);
+  }
+}
+
+/* Takes modes of contacts from the parameters of a run. */
+static void take_modes(const real *parameters, contact_memory *memory)
+{
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const contact_places *const at = CONTACTS + k;
+    memory->is_closed[k] = at->closed < 0 || parameters[MODE_PLACE[at->closed]] > 0.0;
+    memory->sticks[k] = at->slips > 0 && parameters[MODE_PLACE[at->sticks]] > 0.0;
   }
 }
 
@@ -671,6 +752,47 @@ static int note_events(const event_step *step, event_run *run, const event_sampl
     copy_state(right->q, right->p, end->q, end->p);
     set_run(run, end->t, right);
   }
+  return OK;
+}
+
+int NAME(trace_by_steps)(long long steps, const real *t, const real *h, real *q, real *p, int chained,
+    real *parameters, int is_strict, long long room, real *traces, long long *filled, solver_report *report,
+    real *workspace)
+{
+  contact_step in;
+  event_watch watch;
+  event_run run;
+  real idle[PARAMETERS], imposed[PARAMETERS];
+  memset(report, 0, sizeof *report);
+  memset(&in, 0, sizeof in);
+  memset(&watch, 0, sizeof watch);
+  memset(&run, 0, sizeof run);
+  memcpy(idle, parameters, sizeof idle);
+  memcpy(imposed, parameters, sizeof imposed);
+  put_in_all(CONTACT_IS_OPEN, idle);
+  put_in_all(CONTACT_STICKS, imposed);
+  in.idle = idle;
+  in.imposed = imposed;
+  in.trace = (step_trace *)traces;
+  *filled = 0;
+  set_run(&run, t[0], &(event_sample){.q = q, .p = p});
+  run.h = h[0];
+  TRY(begin_by_steps(&in, &run, &watch, workspace));
+  take_modes(parameters, &watch.steps);
+  watch.steps.is_strict = is_strict;
+  for (long long k = 0; k < steps && room - *filled >= 1 << STEP_HALVINGS; k++) {
+    real q1[M], p1[M];
+    report->t = t[k];
+    in.trace->number = (real)k;
+    copy_state(q1, p1, q + k * M, p + k * M);
+    TRY(step_by_steps(&in, &watch.steps, t[k], h[k], q1, p1, 0, workspace));
+    if (chained)
+      copy_state(q + (k + 1) * M, p + (k + 1) * M, q1, p1);
+    *filled = in.trace - (step_trace *)traces;
+    report->steps++;
+  }
+  put_memory(&watch.steps, watch.mode);
+  put_modes(watch.mode, parameters);
   return OK;
 }
 
