@@ -25,7 +25,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from sympy import Expr
 
@@ -420,6 +420,12 @@ class Sources:
         with announced(f"deriving the {'second ' * second}derivatives of {self.system.name} by {self.method.name}"):
             return render_derivatives(derivatives_of(self.system, stages, program, second=second))
 
+    def lanes(self, precision: Literal["double", "single"]) -> Source | None:
+        """Return the source of trajectories in SIMD lanes; ``None`` if the method has none."""
+        if precision == "single" and self.system.bath is not None:
+            raise MethodError("precision='single' is not available with a heat bath: omit it")
+        return render_ensemble(self.program(), precision=precision)
+
     def step_terms(self) -> Source:
         """Return the source of the terms of contacts by steps with their derivatives by all inputs of a step."""
         system = self.system
@@ -514,21 +520,19 @@ class Sources:
     @without_collection
     def variant(self, variant: Variant) -> Source | None:
         """Return the source of a variant; ``None`` if the method lacks it."""
-        if isinstance(variant, StepTerms):
-            return self.step_terms() if "motion_terms" in self.integrator()[0].contents.functions else None
-        if self.solver == BY_STEPS:
+        if self.solver == BY_STEPS and not isinstance(variant, StepTerms):
             return None
         if self.precision == DOUBLE_DOUBLE:
             return self._variant_in_pairs(variant)
         match variant:
             case Lanes(precision):
-                if precision == "single" and self.system.bath is not None:
-                    raise MethodError("precision='single' is not available with a heat bath: omit it")
-                source = render_ensemble(self.program(), precision=precision)
+                source = self.lanes(precision)
             case NewtonFallback():
                 source = self.fallback()
             case Derivatives(order):
                 source = self.tangent(second=order == 2)
+            case StepTerms():
+                source = self.step_terms()
             case Acting(in_lanes):
                 source = self.acting_ensemble() if in_lanes else self.acting()
             case TangentVectors(count):

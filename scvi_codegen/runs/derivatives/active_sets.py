@@ -5,16 +5,17 @@ A step solves for q1, f1 and for v1, f2 (``contact_steps.h``)
     p0 + G0^T f1 = -D1 Ld(q0, q1),                     p1 = L_v(q1, v1) = D2 Ld(q0, q1) + G1^T f2,
 
 with the rates u of each problem: of open contacts f = 0, of closed ones u_n = 0 (a rebound: u_n = -e u_n(before)), of
-those that stick u_t = 0, of those that slip f_t = -mu f_n u_t / |u_t|. Where no contact changes its mode these equations
-define (q1, p1) as a smooth function of q0, p0, the parameters, t and h, whose derivatives follow by elimination: with
-A dq1 = r + G0^T df and du = y + S df, S = U A^-1 G0^T, rows of either f or u vanish. Redundant rows have dependent
+those that stick u_t = 0, of those that slip f_t = -mu f_n u_t / |u_t|. Where no contact changes its mode these
+equations define (q1, p1) as a smooth function of q0, p0, the parameters, t and h; derivatives follow by elimination:
+with A dq1 = r + G0^T df and du = y + S df, S = U A^-1 G0^T, rows of either f or u vanish. Redundant rows have dependent
 equations, which the solution of least norm satisfies; q1 does not depend on the choice.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -22,18 +23,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native.options import step_failure
-from scvi_codegen.common.errors import StateError
+from scvi_codegen.common.errors import AccuracyWarning, StateError, warn
+from scvi_codegen.runs.events.contacts import contact_modes
 
 if TYPE_CHECKING:
     from scvi_codegen.runs.stepping.step_derivatives import LinearisedMethod, Starts
 
 Array = NDArray[np.float64]
 DEPENDENT = 1e-12
-"""Singular values of scaled rows below which these depend on others, relative to the largest: rounding of their sums."""
+"""Singular values of scaled rows below which these depend on others, relative to the largest: rounding of sums."""
 PARTS = 256
 """Largest number of parts of a step (contact_steps.h)."""
 NUMBERS = 2**22
 """Derivatives of terms that are kept at a time."""
+OF_IMPULSES = 1e-12
+"""Deviations of steps that are taken again, relative to impulses, which count as rounding."""
+SHOWN = 3
+"""Changes of modes that a warning names."""
 OPEN, STICKS, SLIPS = 0, 1, 2
 
 
@@ -44,21 +50,49 @@ def propagate_by_steps(
     count, size = len(starts.h), method._input_size
     maps = np.empty((count, size, size))
     q, p = (np.array(x) for x in (starts.q, starts.p))
-    ends = np.empty((2, count, method.dimension))
+    ends, impulses = np.empty((2, count, method.dimension)), np.empty(count)
     for first, last, traces in _traces(method, starts, q, p, parameters):
         one = np.array([*_maps_of(method, traces, starts.h[first:last][traces.number], parameters)])
         bounds = np.searchsorted(traces.number, np.arange(last - first + 1))
         for k, (begin, end) in enumerate(pairwise(bounds)):
-            maps[first + k] = np.linalg.multi_dot([*one[begin:end][::-1], np.eye(size)])
+            maps[first + k] = reduce(np.matmul, one[begin:end][::-1])
+            impulses[first + k] = abs(traces.positions.force[begin:end]).max()
         ends[:, first:last] = traces.q1[bounds[1:] - 1], traces.p1[bounds[1:] - 1]
     if starts.chained:
         starts.q[1:], starts.p[1:] = ends
+    else:  # at rest states are the rounding errors of impulses that cancel others
+        saved = np.array([starts.q[1:], starts.p[1:]])
+        ends = np.where(abs(ends - saved) <= OF_IMPULSES * impulses[:, np.newaxis], saved, ends)
     for k in range(count)[:: -1 if transpose else 1]:
         if transpose:
             vectors[k] += vectors[k + 1] @ maps[k]
         else:
             vectors[k + 1] += vectors[k] @ maps[k].T
     return ends[0], ends[1]
+
+
+def check_modes(runs: Sequence[Any]) -> None:
+    """Warn of the changes of modes of runs by steps, and refuse those that an event ended within a step."""
+    if any(of.event.terminal and len(of.t) for run in runs for of in run.events):
+        raise StateError("a terminal event ended the run within a step by steps, which has no derivatives: omit it")
+    changes = [change for run in runs for change in _changes(run)]
+    if changes:
+        more = f" and {len(changes) - SHOWN} more" if len(changes) > SHOWN else ""
+        warn(
+            f"contacts change their modes along the run by steps ({', '.join(changes[:SHOWN])}{more}): derivatives are "
+            "those of its steps, which for small steps do not tend to the derivative of the motion across such "
+            "changes. Omit transitions= (located) for that",
+            AccuracyWarning,
+        )
+
+
+def _changes(run: Any) -> Iterator[str]:
+    """Yield contact, new mode and time of each change of modes of a run, and times of rebounds."""
+    titles, changes = [contact.title for contact in run.stepper.interface.contacts], contact_modes(run)
+    for (_, before), (t, after) in pairwise(changes):
+        modes = zip(titles, before, after, strict=True)
+        yield from (f"{title} {is_now}s at t = {t:.6g}" for title, was, is_now in modes if was != is_now)
+    yield from (f"a rebound at t = {t:.6g}" for t in run.modes.t.tolist() if t not in [t for t, _ in changes])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,9 +115,12 @@ class _Traces:
         self.q, self.p, self.q1, self.p1 = columns[3:7]
         self.positions, plastic, elastic = (_Solution(*columns[k : k + 2]) for k in (9, 11, 13))
         bounces = self.part[:, np.newaxis] > 0.0
-        self.velocities = _Solution(*(np.where(bounces, *pair) for pair in zip(
-            (elastic.force, elastic.mode), (plastic.force, plastic.mode), strict=True
-        )))
+        self.velocities = _Solution(
+            *(
+                np.where(bounces, *pair)
+                for pair in zip((elastic.force, elastic.mode), (plastic.force, plastic.mode), strict=True)
+            )
+        )
 
 
 def _traces(method: LinearisedMethod, starts: Starts, q: Array, p: Array, parameters: Array) -> Any:
@@ -243,7 +280,7 @@ class _Linearised:
     def rebounds(self) -> Array:
         """Return (n, rows, inputs) changes of e u_n(before) in the rates of gaps that rebound."""
         values, changes = self.laws_before
-        before, result = self.before.along("rate", self.at_before), np.zeros((*self.of.positions.force.shape, 1))
+        before = self.before.along("rate", self.at_before)
         result = np.zeros_like(before)
         for k, contact in enumerate(self.method.interface.contacts):
             if contact.normal is None:
@@ -257,9 +294,17 @@ class _Linearised:
         return result
 
     def solved(
-        self, A: Array, rest: Array, directions: Array, by_x: Array, rates: Array, speeds: Array, of: _Solution, laws: Any
+        self,
+        A: Array,
+        rest: Array,
+        directions: Array,
+        by_x: Array,
+        rates: Array,
+        speeds: Array,
+        of: _Solution,
+        laws: Any,
     ) -> tuple[Array, Array]:
-        """Return changes of x and of impulses G^T f with A dx = rest + G^T df, and du = rates + U dx in the active set.
+        """Return changes of x and of impulses G^T f: A dx = rest + G^T df, and du = rates + U dx in the active set.
 
         Args:
             A, rest: (n, m, m) and (n, m, inputs).
@@ -280,8 +325,8 @@ class _Linearised:
     ) -> tuple[Array, Array]:
         """Return the inverse of the equations of df in the active set, of least norm if rows depend, and their right.
 
-        With du = y + S df: df = 0, or du = 0, or df_t + d (d(limit) f_n + limit df_n) + limit f_n du_t'/|u_t| = 0, du_t'
-        the part across the direction d of slip.
+        With du = y + S df: df = 0, or du = 0, or df_t + d (d(limit) f_n + limit df_n) + limit f_n du_t'/|u_t| = 0,
+        du_t' the part across the direction d of slip.
         """
         n, rows, fixed = len(S), S.shape[1], self.fixed
         scale = np.sqrt(abs(np.einsum("nii->ni", S)))
@@ -304,8 +349,11 @@ class _Linearised:
             if slips and len(here):
                 self._slide(K, b, S, y, here, k, slips, speeds, of, law, by_law)
         K *= weight[:, :, np.newaxis] / scale[:, np.newaxis]
-        inverse = np.linalg.pinv(K, rcond=DEPENDENT) * weight[:, np.newaxis] / scale[:, :, np.newaxis]
-        return inverse, b
+        inverse = np.broadcast_to(np.eye(rows), S.shape).copy()
+        used = np.flatnonzero((inverse != K).any(axis=(0, 2)))
+        part = np.ix_(range(n), used, used)
+        inverse[part] = np.linalg.pinv(K[part], rcond=DEPENDENT)
+        return inverse * weight[:, np.newaxis] / scale[:, :, np.newaxis], b
 
     def _slide(
         self, K: Array, b: Array, S: Array, y: Array, here: NDArray[np.intp], k: int, slips: list[int],

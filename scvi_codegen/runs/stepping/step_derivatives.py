@@ -19,7 +19,6 @@ from scvi_codegen.codegen.native.option_table import checked_step
 from scvi_codegen.codegen.native.options import NOT_CONVERGED, REASONS, STATUS, SolverOptions, step_failure
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.representation import summary
-from scvi_codegen.runs.derivatives.active_sets import propagate_by_steps
 from scvi_codegen.runs.states.validation import Array, Parameters, check_step_given
 from scvi_codegen.runs.stepping.state_functions import StateFunctions
 
@@ -291,6 +290,8 @@ class LinearisedMethod(StateFunctions):
             (n, m) recomputed positions and momenta at the ends of the steps.
         """
         if self.by_steps:
+            from scvi_codegen.runs.derivatives.active_sets import propagate_by_steps  # here: few runs have contacts
+
             return propagate_by_steps(self, starts, vectors, parameters, transpose=transpose)
         binding, m = self.tangent, self.dimension
         report = binding.new("report *")

@@ -492,10 +492,11 @@ static int rebound(contact_step *in, const contact_memory *from, real by_surface
   return OK;
 }
 
-/* Whether a contact is open, sticks or slips unlike before. */
+/* Whether a contact is open, sticks or slips unlike before, or rebounds. */
 static int has_changed(const contact_memory *before, const contact_memory *now, int k)
 {
-  return before->is_closed[k] != now->is_closed[k] || before->sticks[k] != now->sticks[k];
+  return before->is_closed[k] != now->is_closed[k] || before->sticks[k] != now->sticks[k] ||
+      (now->pushes[k] && !now->is_closed[k]);
 }
 
 /* Solves the second problem for the velocities at q1, and keeps forces and modes. */
