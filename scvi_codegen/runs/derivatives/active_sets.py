@@ -350,7 +350,8 @@ class _Linearised:
                 self._slide(K, b, S, y, here, k, slips, speeds, of, law, by_law)
         K *= weight[:, :, np.newaxis] / scale[:, np.newaxis]
         inverse = np.broadcast_to(np.eye(rows), S.shape).copy()
-        used = np.flatnonzero((inverse != K).any(axis=(0, 2)))
+        meet = (inverse != K).any(axis=0)
+        used = np.flatnonzero(meet.any(axis=0) | meet.any(axis=1))
         part = np.ix_(range(n), used, used)
         inverse[part] = np.linalg.pinv(K[part], rcond=DEPENDENT)
         return inverse * weight[:, np.newaxis] / scale[:, :, np.newaxis], b

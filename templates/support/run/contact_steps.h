@@ -667,43 +667,47 @@ static void put_memory(const contact_memory *memory, real *mode)
   }
 }
 
-/* Takes modes of contacts from the parameters of a run. */
-static void take_modes(const real *parameters, contact_memory *memory)
+/* Notes the direction of the slip of contact k at the start of a step, and returns its speed. */
+static real note_slip(const contact_step *in, contact_memory *memory, int k)
 {
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const contact_places *const at = CONTACTS + k;
-    memory->is_closed[k] = at->closed < 0 || parameters[MODE_PLACE[at->closed]] > 0.0;
-    memory->sticks[k] = at->slips > 0 && parameters[MODE_PLACE[at->sticks]] > 0.0;
-  }
+  real w[2] = {0.0};
+  for (int i = 0; i < CONTACTS[k].slips; i++)
+    w[i] = rate_of(&in->start, STEP_FIXED + CONTACTS[k].tangential + i, memory->v);
+  const real speed = length_of(w, 2);
+  for (int i = 0; i < 2; i++)
+    memory->direction[k][i] = w[i] / fmax(speed, DBL_MIN);
+  return speed;
+}
+
+/* Velocities of a run at a state, its rows and existing contacts. */
+static int find_start(contact_step *in, const event_run *run, contact_memory *memory, real *workspace)
+{
+  TRY(NAME(velocity)(run->t, run->q, run->p, in->idle, memory->v, workspace));
+  take_state(in, memory, run->t, run->h, run->q, run->p);
+  TRY(find_existing(in, memory, workspace));
+  memcpy(memory->exists, in->exists, sizeof memory->exists);
+  return OK;
 }
 
 /* Velocities of a run at its start, and slips that rest there. */
 static int begin_by_steps(contact_step *in, event_run *run, event_watch *watch, real *workspace)
 {
   contact_memory *const memory = &watch->steps;
-  TRY(NAME(velocity)(run->t, run->q, run->p, in->idle, memory->v, workspace));
-  take_state(in, memory, run->t, run->h, run->q, run->p);
-  TRY(find_existing(in, memory, workspace));
+  TRY(find_start(in, run, memory, workspace));
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
     const real size = normal < 0 ? 0.0 : size_by_position(in->start.G[row], run->q);
     const real gap = normal < 0 ? 0.0 : in->start.value[row];
-    real w[2] = {0.0};
     if (in->exists[k] && gap < -CONTACT_PENETRATION * size) {
       watch->refusal = CONTACT_PENETRATES;
       watch->refused = k + 1;
       watch->behind = gap;
       return NOT_CONVERGED;
     }
-    for (int i = 0; i < CONTACTS[k].slips; i++)
-      w[i] = rate_of(&in->start, STEP_FIXED + CONTACTS[k].tangential + i, memory->v);
-    const real speed = length_of(w, 2);
+    const real speed = note_slip(in, memory, k);
     memory->is_closed[k] = in->exists[k] && gap <= CONTACT_ROUNDING * size;
     memory->sticks[k] = memory->is_closed[k] && CONTACTS[k].slips > 0 && speed <= CONTACT_ROUNDING * in->fastest;
-    for (int i = 0; i < 2; i++)
-      memory->direction[k][i] = w[i] / fmax(speed, DBL_MIN);
   }
-  memcpy(memory->exists, in->exists, sizeof memory->exists);
   memory->begun = 1;
   put_memory(memory, watch->mode);
   return OK;
@@ -778,8 +782,13 @@ int NAME(trace_by_steps)(long long steps, const real *t, const real *h, real *q,
   *filled = 0;
   set_run(&run, t[0], &(event_sample){.q = q, .p = p});
   run.h = h[0];
-  TRY(begin_by_steps(&in, &run, &watch, workspace));
-  take_modes(parameters, &watch.steps);
+  TRY(find_start(&in, &run, &watch.steps, workspace));
+  for (int k = 0; k < EVENT_CONTACTS; k++) { /* modes are those of the run */
+    const contact_places *const at = CONTACTS + k;
+    note_slip(&in, &watch.steps, k);
+    watch.steps.is_closed[k] = at->closed < 0 || parameters[MODE_PLACE[at->closed]] > 0.0;
+    watch.steps.sticks[k] = at->slips > 0 && parameters[MODE_PLACE[at->sticks]] > 0.0;
+  }
   watch.steps.is_strict = is_strict;
   for (long long k = 0; k < steps && room - *filled >= 1 << STEP_HALVINGS; k++) {
     real q1[M], p1[M];
