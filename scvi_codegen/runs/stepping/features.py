@@ -177,7 +177,7 @@ FEATURES = {
         ("with contacts by steps", "adaptive error recording", "give {h}, or omit {transitions=}"),
         (
             "with contacts by steps",
-            "run_error jacobian chaos periodic_orbit fit",
+            "run_error chaos periodic_orbit fit",
             "locate the transitions: omit {transitions=}; runs have tangent, pullback and sensitivity",
         ),
         ("with nonholonomic constraints", "by_steps", "locate the transitions"),
