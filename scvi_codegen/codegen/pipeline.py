@@ -82,7 +82,7 @@ from scvi_codegen.methods.discretise import discretise, discretised_form
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import tables_in_two_words
 from scvi_codegen.systems.arrays.symmetry import momentum_maps
-from scvi_codegen.systems.constraints import dissipates
+from scvi_codegen.systems.constraints import dissipates, masks_of_contacts
 from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.derived_systems import with_tangent_vectors
@@ -432,7 +432,8 @@ class Sources:
         with announced(f"deriving the derivatives of contacts of {system.name} by steps"):
             kernel, entries = terms_of_steps(system)
         values = 3 * (system.dimension + len(system.contacts)) + 2 * len(system.constraints)
-        return render_step_terms(self.prefix, system, kernel, entries, values)
+        columns = 2 * system.dimension + len(system.parameters) - len(masks_of_contacts(system)) + 1
+        return render_step_terms(self.prefix, system, kernel, entries, values, columns)
 
     def _acting_program(self) -> Program | None:
         """Return the program of runs that sum the action of their steps; ``None`` if they are computed again for it."""

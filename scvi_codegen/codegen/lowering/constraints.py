@@ -333,7 +333,7 @@ def terms_of_steps(system: LagrangianSystem) -> tuple[Kernel, tuple[tuple[int, i
     """Return the kernel of the terms of contacts by steps, and the entries of their derivatives by all inputs.
 
     At u = (q, v, f) these are L_v, L_q + F without contacts, G^T f of all constraints, their values and rates, and the
-    coefficients of contacts; inputs are q, v, parameters and time.
+    coefficients of contacts; inputs are q, v, parameters but modes, and time.
     """
     regular = replace(system, lagrangian=system.lagrangian + system.gauge) if system.gauge != 0 else system
     forms, modes = forms_of(regular), masks_of_contacts(system)
@@ -351,7 +351,8 @@ def terms_of_steps(system: LagrangianSystem) -> tuple[Kernel, tuple[tuple[int, i
         *rates,
         *(value.xreplace(imposed) for value in coefficients(system)),
     ]
-    partials = jacobian(values, (*system.coordinates, *system.velocities, *system.parameters, system.time))
+    given = [parameter for parameter in system.parameters if parameter not in modes]
+    partials = jacobian(values, (*system.coordinates, *system.velocities, *given, system.time))
     purpose = "Terms of contacts by steps at u = (q, v, f), and their nonzero derivatives by q, v, parameters and time."
     u = (*system.coordinates, *system.velocities, *impulses)
     return system_kernel(system, "step_terms", values, u=u, partials=partials.values(), purpose=purpose), (*partials,)

@@ -647,17 +647,17 @@ def render_events(search: EventSearch) -> Source:
 
 
 def render_step_terms(
-    prefix: str, system: Any, kernel: Kernel, entries: Sequence[tuple[int, int]], values: int
+    prefix: str, system: Any, kernel: Kernel, entries: Sequence[tuple[int, int]], values: int, columns: int
 ) -> Source:
-    """Return the source of the terms of contacts by steps with their derivatives by rows, ``values`` of them."""
-    moving, given = 2 * system.dimension, len(system.parameters)
+    """Return the source of the terms of contacts by steps, so many values, with their derivatives by rows."""
+    moving = 2 * system.dimension
     context = {
         "kernel": kernel,
         "entries": entries,
         "arguments": moving + len(system.constraints),
         "values": values,
-        "columns": moving + given + 1,
-        "inputs": moving + given + 2,
+        "columns": columns,
+        "inputs": moving + len(system.parameters) + 2,
         "cut": is_divided((kernel,)),
         "inverse_roots": inverse_roots((kernel,)),
     }

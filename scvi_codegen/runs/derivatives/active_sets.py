@@ -47,8 +47,8 @@ def propagate_by_steps(
     method: LinearisedMethod, starts: Starts, vectors: Array, parameters: Array, *, transpose: bool
 ) -> tuple[Array, Array]:
     """Propagate tangent vectors or cotangents along steps; see :meth:`LinearisedMethod._propagate`."""
-    count, size = len(starts.h), method._input_size
-    maps = np.empty((count, size, size))
+    count, varied = len(starts.h), _varied(method)
+    maps = np.empty((count, len(varied), len(varied)))
     q, p = (np.array(x) for x in (starts.q, starts.p))
     ends, impulses = np.empty((2, count, method.dimension)), np.empty(count)
     for first, last, traces in _traces(method, starts, q, p, parameters):
@@ -63,12 +63,18 @@ def propagate_by_steps(
     else:  # at rest states are the rounding errors of impulses that cancel others
         saved = np.array([starts.q[1:], starts.p[1:]])
         ends = np.where(abs(ends - saved) <= OF_IMPULSES * impulses[:, np.newaxis], saved, ends)
+    modes = slice(varied[-3] + 1, varied[-2])
     for k in range(count)[:: -1 if transpose else 1]:
-        if transpose:
-            vectors[k] += vectors[k + 1] @ maps[k]
-        else:
-            vectors[k + 1] += vectors[k] @ maps[k].T
+        after, before = (k, k + 1) if transpose else (k + 1, k)
+        vectors[after, :, modes] += vectors[before, :, modes]
+        vectors[after][:, varied] += vectors[before][:, varied] @ (maps[k] if transpose else maps[k].T)
     return ends[0], ends[1]
+
+
+def _varied(method: LinearisedMethod) -> list[int]:
+    """Return the indices of the inputs of a step but modes, which the steps choose."""
+    size, given = method._input_size, 2 * method.dimension + len(method.parameters)
+    return [*range(given), size - 2, size - 1]
 
 
 def check_modes(runs: Sequence[Any]) -> None:
@@ -128,7 +134,7 @@ def _traces(method: LinearisedMethod, starts: Starts, q: Array, p: Array, parame
     m, interface, binding = method.dimension, method.interface, method.binding
     numbers = 5 + 4 * m + 3 * (len(interface.constraints) + len(interface.contacts))
     rows = 3 * (m + len(interface.contacts)) + 2 * len(interface.constraints)
-    room = PARTS + max(1, NUMBERS // (rows * method._input_size))
+    room = PARTS + max(1, NUMBERS // (rows * len(_varied(method))))
     traces, filled, report = np.zeros((room + 1, numbers)), binding.numbers("long long *"), binding.new("report *")
     values = np.array(parameters)  # with modes
     first = 0
@@ -161,7 +167,7 @@ class _Terms:
     def __init__(self, method: LinearisedMethod, q: Array, v: Array, force: Array, t: Array, parameters: Array) -> None:
         n, m, c, k = len(t), method.dimension, len(method.interface.constraints), len(method.interface.contacts)
         binding, rows = method.tangent, 3 * (m + k) + 2 * c
-        values, self.by = np.empty((n, rows)), np.empty((n, rows, method._input_size - 1))
+        values, self.by = np.empty((n, rows)), np.empty((n, rows, len(_varied(method)) - 1))
         u, at = (np.ascontiguousarray(x) for x in (np.concatenate([q, v, force], axis=1), t))
         if not binding.function("terms")(n, *map(binding.pointer, (u, at, parameters, values, self.by))):
             raise StateError(f"derivatives of the steps after t = {t[0]:g} are not finite")
@@ -197,7 +203,7 @@ class _Linearised:
     """Parts of steps with the changes of their variables by those of (q, p, parameters, t, h)."""
 
     def __init__(self, method: LinearisedMethod, of: _Traces, whole: Array, parameters: Array) -> None:
-        n, m, size = len(of.t), method.dimension, method._input_size
+        n, m, size = len(of.t), method.dimension, len(_varied(method))
         self.method, self.of, self.m, self.h = method, of, m, of.h[:, np.newaxis, np.newaxis]
         self.inputs = np.broadcast_to(np.eye(size), (n, size, size))
         self.by_h = self.inputs[:, -1:]
