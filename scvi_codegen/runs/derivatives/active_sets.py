@@ -29,7 +29,7 @@ from scvi_codegen.runs.events.contacts import contact_modes
 if TYPE_CHECKING:
     from scvi_codegen.runs.stepping.step_derivatives import LinearisedMethod, Starts
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 DEPENDENT = 1e-12
 """Singular values of scaled rows below which these depend on others, relative to the largest: rounding of sums."""
 PARTS = 256
@@ -184,6 +184,21 @@ class _Terms:
     def along(self, name: str, change: Array) -> Array:
         """Return (n, rows, inputs) changes by those (n, 2m + parameters + 1, inputs) of (q, v, parameters, t)."""
         return self.by[:, self.rows[name]] @ change
+
+
+def _inverse(K: Array) -> Array:
+    """Return the inverses of (n, k, k) matrices, of least norm where rows depend on each other."""
+    try:
+        inverse = np.linalg.inv(K)
+    except np.linalg.LinAlgError:
+        return np.linalg.pinv(K, rcond=DEPENDENT)
+    largest = abs(inverse).max(axis=(1, 2), initial=0.0) * abs(K).max(axis=(1, 2), initial=0.0)
+    dependent = ~(
+        largest * DEPENDENT * K.shape[1] < 1.0
+    )  # the inverse of the least singular value is at most k times it
+    if dependent.any():  # seldom: singular values take 30 times as long
+        inverse[dependent] = np.linalg.pinv(K[dependent], rcond=DEPENDENT)
+    return inverse
 
 
 def _maps_of(method: LinearisedMethod, of: _Traces, whole: Array, parameters: Array) -> Array:
@@ -348,7 +363,7 @@ class _Linearised:
             mode = of.mode[:, k]
             if contact.normal is not None:
                 impose(mode > OPEN, fixed + contact.normal)
-            slips = [fixed + contact.tangential + i for i in range(contact.slips)] if contact.slips else []
+            slips = [fixed + (contact.tangential or 0) + i for i in range(contact.slips)]
             for row in slips:
                 impose(mode == STICKS, row)
             here = np.flatnonzero(mode == SLIPS)
@@ -358,8 +373,8 @@ class _Linearised:
         inverse = np.broadcast_to(np.eye(rows), S.shape).copy()
         meet = (inverse != K).any(axis=0)
         used = np.flatnonzero(meet.any(axis=0) | meet.any(axis=1))
-        part = np.ix_(range(n), used, used)
-        inverse[part] = np.linalg.pinv(K[part], rcond=DEPENDENT)
+        part = np.ix_(np.arange(n), used, used)
+        inverse[part] = _inverse(K[part])
         return inverse * weight[:, np.newaxis] / scale[:, :, np.newaxis], b
 
     def _slide(

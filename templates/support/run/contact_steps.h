@@ -70,7 +70,7 @@ typedef struct {
   int is_full; /* 1 + the contact that found no room, else 0 */
   int exists[EVENT_CONTACTS], is_near[EVENT_CONTACTS], pushes[EVENT_CONTACTS], has_begun[EVENT_CONTACTS];
   real impulse[ALL_CONTACT_ROWS];
-  int contact[EVENT_CONTACTS], row[CONTACT_ROWS];
+  int contact[EVENT_CONTACTS], row[CONTACT_ROWS], former[CONTACT_ROWS]; /* rows of the last solved step */
   contact_places place[EVENT_CONTACTS];
   responses response, at_start;
   real W[CONTACT_ROWS * CONTACT_ROWS];
@@ -133,6 +133,20 @@ static void respond(const contact_step *in, const step_matrix *of, const row_ter
     for (int i = 0; i < k; i++)
       subtract(x[k], of->matrix[k * STEP_SIZE + i], 0, to->count, x[i]);
   }
+}
+
+/* Whether a problem has the rows of that of velocities at the end of the last step. */
+static int has_former_rows(const contact_step *in)
+{
+  const size_t size = sizeof *in->row * (size_t)in->problem.rows;
+  return in->response.count == in->problem.rows && memcmp(in->row, in->former, size) == 0;
+}
+
+static void keep_responses(const responses *from, responses *to)
+{
+  to->count = from->count;
+  for (int i = 0; i < STEP_SIZE; i++)
+    memcpy(to->x[i], from->x[i], BYTES(from->count));
 }
 
 /* W of a problem, a part of G times responses. */
@@ -233,9 +247,11 @@ static int solve_positions(contact_step *in, const contact_memory *from, const r
   const responses *const at = &in->at_start;
   real force[CONTACT_ROWS];
   memcpy(force, of->f, BYTES(of->rows));
-  respond(in, &in->moving, &in->start, &in->response);
-  if (first || at->count != of->rows) /* contacts only join */
+  if (first && in->continues && has_former_rows(in))
+    keep_responses(&in->response, &in->at_start);
+  else if (first || at->count != of->rows) /* contacts only join */
     respond(in, &in->resting, &in->start, &in->at_start);
+  respond(in, &in->moving, &in->start, &in->response);
   pose_matrix(in, &in->end, &in->response, 1.0 / in->h);
   *slow = 0;
   for (int r = 0; r < of->rows; r++) {
@@ -594,7 +610,12 @@ static void take_state(contact_step *in, const contact_memory *memory, real t, r
 /* Rows at the start, and contacts whose conditions hold there: those that existed, and those that it is not behind. */
 static int find_existing(contact_step *in, const contact_memory *from, real *workspace)
 {
-  TRY(NAME(row_terms)(in->t, in->q, in->v, in->imposed, in->start.value));
+  if (in->continues) { /* rows are those at the end of the last step, laws may depend on velocities */
+    in->start = in->end;
+    TRY(NAME(contact_laws)(in->t, in->q, in->v, in->imposed, in->start.coefficient[0]));
+  } else {
+    TRY(NAME(row_terms)(in->t, in->q, in->v, in->imposed, in->start.value));
+  }
   in->fastest = 0.0;
   for (int r = 0; r < ALL_CONTACT_ROWS; r++)
     in->fastest = fmax(in->fastest, fabs(rate_of(&in->start, STEP_FIXED + r, in->v)));
@@ -645,6 +666,7 @@ static int step_by_steps(contact_step *in, contact_memory *memory, real t, real 
     }
     memcpy(q, in->q1, BYTES(M));
     *memory = next;
+    memcpy(in->former, in->row, sizeof in->former);
     in->solved = 1;
     if (in->trace)
       end_trace(in, p);
