@@ -13,7 +13,6 @@ equations, which the solution of least norm satisfies; q1 does not depend on the
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from itertools import pairwise
@@ -23,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native.options import step_failure
-from scvi_codegen.common.errors import AccuracyWarning, StateError, warn
-from scvi_codegen.runs.events.contacts import contact_modes
+from scvi_codegen.common.errors import StateError
 
 if TYPE_CHECKING:
     from scvi_codegen.runs.stepping.step_derivatives import LinearisedMethod, Starts
@@ -38,8 +36,6 @@ NUMBERS = 2**22
 """Derivatives of terms that are kept at a time."""
 OF_IMPULSES = 1e-12
 """Deviations of steps that are taken again, relative to impulses, which count as rounding."""
-SHOWN = 3
-"""Changes of modes that a warning names."""
 OPEN, STICKS, SLIPS = 0, 1, 2
 
 
@@ -75,30 +71,6 @@ def _varied(method: LinearisedMethod) -> list[int]:
     """Return the indices of the inputs of a step but modes, which the steps choose."""
     size, given = method._input_size, 2 * method.dimension + len(method.parameters)
     return [*range(given), size - 2, size - 1]
-
-
-def check_modes(runs: Sequence[Any]) -> None:
-    """Warn of the changes of modes of runs by steps, and refuse those that an event ended within a step."""
-    if any(of.event.terminal and len(of.t) for run in runs for of in run.events):
-        raise StateError("a terminal event ended the run within a step by steps, which has no derivatives: omit it")
-    changes = [change for run in runs for change in _changes(run)]
-    if changes:
-        more = f" and {len(changes) - SHOWN} more" if len(changes) > SHOWN else ""
-        warn(
-            f"contacts change their modes along the run by steps ({', '.join(changes[:SHOWN])}{more}): derivatives are "
-            "those of its steps, which for small steps do not tend to the derivative of the motion across such "
-            "changes. Omit transitions= (located) for that",
-            AccuracyWarning,
-        )
-
-
-def _changes(run: Any) -> Iterator[str]:
-    """Yield contact, new mode and time of each change of modes of a run, and times of rebounds."""
-    titles, changes = [contact.title for contact in run.stepper.interface.contacts], contact_modes(run)
-    for (_, before), (t, after) in pairwise(changes):
-        modes = zip(titles, before, after, strict=True)
-        yield from (f"{title} {is_now}s at t = {t:.6g}" for title, was, is_now in modes if was != is_now)
-    yield from (f"a rebound at t = {t:.6g}" for t in run.modes.t.tolist() if t not in [t for t, _ in changes])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -167,9 +167,13 @@ def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], ve
         if back and last in jumps:
             vectors[last] = vectors[last] @ jumps[last].matrix
         part = starts.part(first, last) if jumps else starts
-        ends = states.stepper._propagate(
-            part, vectors[first : last + 1], states.parameters_on_sides(part.t[0]), states.options, transpose=back
-        )
+        settings = part, vectors[first : last + 1], states.parameters_on_sides(part.t[0])
+        if states.stepper.by_steps:
+            from scvi_codegen.runs.derivatives.active_sets import propagate_by_steps  # here: few runs have contacts
+
+            ends = propagate_by_steps(states.stepper, *settings, transpose=back)
+        else:
+            ends = states.stepper._propagate(*settings, states.options, transpose=back)
         saved = np.concatenate([part.q, part.p], axis=1)
         if last in jumps:
             saved[-1] = jumps[last].before

@@ -116,7 +116,7 @@ class TrajectoryDerivatives(SavedStates):
         """Raise the error of an operation that the stepper or the inputs of the run exclude."""
         require(self.stepper, operation, *["inputs"] * (operation == "sensitivity" and self._runs != (self,)))
         if self.stepper.by_steps:
-            from scvi_codegen.runs.derivatives.active_sets import check_modes  # here: few runs have contacts
+            from scvi_codegen.runs.derivatives.mode_changes import check_modes  # here: few runs have contacts
 
             check_modes(self._runs)
 

@@ -289,10 +289,6 @@ class LinearisedMethod(StateFunctions):
         Returns:
             (n, m) recomputed positions and momenta at the ends of the steps.
         """
-        if self.by_steps:
-            from scvi_codegen.runs.derivatives.active_sets import propagate_by_steps  # here: few runs have contacts
-
-            return propagate_by_steps(self, starts, vectors, parameters, transpose=transpose)
         binding, m = self.tangent, self.dimension
         report = binding.new("report *")
         chained = starts.chained and not transpose

@@ -782,52 +782,6 @@ static int note_events(const event_step *step, event_run *run, const event_sampl
   return OK;
 }
 
-int NAME(trace_by_steps)(long long steps, const real *t, const real *h, real *q, real *p, int chained,
-    real *parameters, int is_strict, long long room, real *traces, long long *filled, solver_report *report,
-    real *workspace)
-{
-  contact_step in;
-  event_watch watch;
-  event_run run;
-  real idle[PARAMETERS], imposed[PARAMETERS];
-  memset(report, 0, sizeof *report);
-  memset(&in, 0, sizeof in);
-  memset(&watch, 0, sizeof watch);
-  memset(&run, 0, sizeof run);
-  memcpy(idle, parameters, sizeof idle);
-  memcpy(imposed, parameters, sizeof imposed);
-  put_in_all(CONTACT_IS_OPEN, idle);
-  put_in_all(CONTACT_STICKS, imposed);
-  in.idle = idle;
-  in.imposed = imposed;
-  in.trace = (step_trace *)traces;
-  *filled = 0;
-  set_run(&run, t[0], &(event_sample){.q = q, .p = p});
-  run.h = h[0];
-  TRY(find_start(&in, &run, &watch.steps, workspace));
-  for (int k = 0; k < EVENT_CONTACTS; k++) { /* modes are those of the run */
-    const contact_places *const at = CONTACTS + k;
-    note_slip(&in, &watch.steps, k);
-    watch.steps.is_closed[k] = at->closed < 0 || parameters[MODE_PLACE[at->closed]] > 0.0;
-    watch.steps.sticks[k] = at->slips > 0 && parameters[MODE_PLACE[at->sticks]] > 0.0;
-  }
-  watch.steps.is_strict = is_strict;
-  for (long long k = 0; k < steps && room - *filled >= 1 << STEP_HALVINGS; k++) {
-    real q1[M], p1[M];
-    report->t = t[k];
-    in.trace->number = (real)k;
-    copy_state(q1, p1, q + k * M, p + k * M);
-    TRY(step_by_steps(&in, &watch.steps, t[k], h[k], q1, p1, 0, workspace));
-    if (chained)
-      copy_state(q + (k + 1) * M, p + (k + 1) * M, q1, p1);
-    *filled = in.trace - (step_trace *)traces;
-    report->steps++;
-  }
-  put_memory(&watch.steps, watch.mode);
-  put_modes(watch.mode, parameters);
-  return OK;
-}
-
 int NAME(advance_by_steps)(event_run *run, event_watch *watch, real t_end, const step_control *control,
     long long steps, const real *parameters, const solver_options *options, long long states, real *t, real *q, real *p,
     real *length, int *iterations, long long *number, long long room, event_crossing *found, long long *filled,
