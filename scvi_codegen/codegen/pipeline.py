@@ -25,7 +25,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from sympy import Expr
 
@@ -41,12 +41,14 @@ from scvi_codegen.codegen.ir.variants import (
     Lanes,
     NewtonFallback,
     Observing,
+    StepTerms,
     Sums,
     TangentVectors,
     Variant,
 )
 from scvi_codegen.codegen.lowering.arrays import check_solver
 from scvi_codegen.codegen.lowering.bath import heat_bath_of
+from scvi_codegen.codegen.lowering.constraints import terms_of_steps
 from scvi_codegen.codegen.lowering.control import control_of, error_growth_of
 from scvi_codegen.codegen.lowering.derivatives import correction_of, derivatives_of
 from scvi_codegen.codegen.lowering.loops import transforms, with_sums
@@ -66,6 +68,7 @@ from scvi_codegen.codegen.rendering.program_source import (
     render_embedded,
     render_ensemble,
     render_ensemble_in_pairs,
+    render_step_terms,
     workspace_in_pairs,
     workspace_size,
 )
@@ -79,7 +82,7 @@ from scvi_codegen.methods.discretise import discretise, discretised_form
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import tables_in_two_words
 from scvi_codegen.systems.arrays.symmetry import momentum_maps
-from scvi_codegen.systems.constraints import dissipates
+from scvi_codegen.systems.constraints import dissipates, masks_of_contacts
 from scvi_codegen.systems.contacts.rows import ContactRows
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.derived_systems import with_tangent_vectors
@@ -417,6 +420,21 @@ class Sources:
         with announced(f"deriving the {'second ' * second}derivatives of {self.system.name} by {self.method.name}"):
             return render_derivatives(derivatives_of(self.system, stages, program, second=second))
 
+    def lanes(self, precision: Literal["double", "single"]) -> Source | None:
+        """Return the source of trajectories in SIMD lanes; ``None`` if the method has none."""
+        if precision == "single" and self.system.bath is not None:
+            raise MethodError("precision='single' is not available with a heat bath: omit it")
+        return render_ensemble(self.program(), precision=precision)
+
+    def step_terms(self) -> Source:
+        """Return the source of the terms of contacts by steps with their derivatives by all inputs of a step."""
+        system = self.system
+        with announced(f"deriving the derivatives of contacts of {system.name} by steps"):
+            kernel, entries = terms_of_steps(system)
+        values = 3 * (system.dimension + len(system.contacts)) + 2 * len(system.constraints)
+        columns = 2 * system.dimension + len(system.parameters) - len(masks_of_contacts(system)) + 1
+        return render_step_terms(self.prefix, system, kernel, entries, values, columns)
+
     def _acting_program(self) -> Program | None:
         """Return the program of runs that sum the action of their steps; ``None`` if they are computed again for it."""
         program = self.program()
@@ -503,19 +521,19 @@ class Sources:
     @without_collection
     def variant(self, variant: Variant) -> Source | None:
         """Return the source of a variant; ``None`` if the method lacks it."""
-        if self.solver == BY_STEPS:
+        if self.solver == BY_STEPS and not isinstance(variant, StepTerms):
             return None
         if self.precision == DOUBLE_DOUBLE:
             return self._variant_in_pairs(variant)
         match variant:
             case Lanes(precision):
-                if precision == "single" and self.system.bath is not None:
-                    raise MethodError("precision='single' is not available with a heat bath: omit it")
-                source = render_ensemble(self.program(), precision=precision)
+                source = self.lanes(precision)
             case NewtonFallback():
                 source = self.fallback()
             case Derivatives(order):
                 source = self.tangent(second=order == 2)
+            case StepTerms():
+                source = self.step_terms()
             case Acting(in_lanes):
                 source = self.acting_ensemble() if in_lanes else self.acting()
             case TangentVectors(count):

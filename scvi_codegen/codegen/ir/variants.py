@@ -50,6 +50,13 @@ class Derivatives(Variant):
 
 
 @dataclass(frozen=True, slots=True)
+class StepTerms(Variant):
+    """Derivatives of the terms of contacts by steps, from which those of steps follow."""
+
+    of_known_sizes = True
+
+
+@dataclass(frozen=True, slots=True)
 class Acting(Variant):
     """Runs that sum the action of their steps; ``in_lanes``: of trajectories in SIMD lanes."""
 

@@ -37,7 +37,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, TypeAlias
 
-from sympy import Integer, Symbol
+from sympy import Expr, Integer, Symbol
 from sympy.utilities.iterables import connected_components
 
 from scvi_codegen.codegen.ir.equations import (
@@ -327,6 +327,35 @@ def _reactions(system: LagrangianSystem) -> dict[str, Any]:
             of_rounding=True,
         ),
     }
+
+
+def terms_of_steps(system: LagrangianSystem) -> tuple[Kernel, tuple[tuple[int, int], ...]]:
+    """Return the kernel of the terms of contacts by steps, and the entries of their derivatives by all inputs.
+
+    At u = (q, v, f) these are L_v, L_q + F without contacts, G^T f of all constraints, their values and rates, and the
+    coefficients of contacts; inputs are q, v, parameters but modes, and time.
+    """
+    regular = replace(system, lagrangian=system.lagrangian + system.gauge) if system.gauge != 0 else system
+    forms, modes = forms_of(regular), masks_of_contacts(system)
+    idle, imposed = (dict.fromkeys(modes, Integer(n)) for n in (0, 0))
+    imposed |= {reaction.active: Integer(1) for reaction in system.reactions}
+    impulses = [Symbol(f"impulse_{k}_of_step", real=True) for k in range(len(system.constraints))]
+    rates = [rate.xreplace(imposed) for rate in constraint_rates(system)]
+    forces: list[Expr] = [Integer(0)] * system.dimension
+    for (k, i), entry in jacobian(rates, system.velocities).items():
+        forces[i] += impulses[k] * entry
+    values = [
+        *(value.xreplace(idle) for value in (*forms.momentum, *forms.force)),
+        *forces,
+        *(value.xreplace(imposed) for value in position_conditions(system)),
+        *rates,
+        *(value.xreplace(imposed) for value in coefficients(system)),
+    ]
+    given = [parameter for parameter in system.parameters if parameter not in modes]
+    partials = jacobian(values, (*system.coordinates, *system.velocities, *given, system.time))
+    purpose = "Terms of contacts by steps at u = (q, v, f), and their nonzero derivatives by q, v, parameters and time."
+    u = (*system.coordinates, *system.velocities, *impulses)
+    return system_kernel(system, "step_terms", values, u=u, partials=partials.values(), purpose=purpose), (*partials,)
 
 
 def _steps_of_contacts(system: LagrangianSystem) -> dict[str, Any]:

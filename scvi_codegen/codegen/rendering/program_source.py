@@ -65,6 +65,7 @@ DECLARATIONS = {
     "ensemble": "parts/ensemble_declarations.h.jinja",
     "events": "parts/events_declarations.h.jinja",
     "array_events": "parts/array_events_declarations.h.jinja",
+    "step_terms": "parts/step_terms_declarations.h.jinja",
 }
 """Inner part of a header by the name of its template."""
 
@@ -545,6 +546,7 @@ CONTENTS: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
     "arrays": lambda context: {"threads": True},
     "events": lambda context: {},
     "array_events": lambda context: {},
+    "step_terms": lambda context: {},
     "ensemble": _contents_of_lanes,
 }
 """Contents of the C of an entry template, from its context."""
@@ -642,6 +644,24 @@ def render_events(search: EventSearch) -> Source:
         "inverse_roots": inverse_roots(search.kernels),
     }
     return _render(f"{search.prefix}_events", context, search.ENTRY)
+
+
+def render_step_terms(
+    prefix: str, system: Any, kernel: Kernel, entries: Sequence[tuple[int, int]], values: int, columns: int
+) -> Source:
+    """Return the source of the terms of contacts by steps, so many values, with their derivatives by rows."""
+    moving = 2 * system.dimension
+    context = {
+        "kernel": kernel,
+        "entries": entries,
+        "arguments": moving + len(system.constraints),
+        "values": values,
+        "columns": columns,
+        "inputs": moving + len(system.parameters) + 2,
+        "cut": is_divided((kernel,)),
+        "inverse_roots": inverse_roots((kernel,)),
+    }
+    return _render(prefix, context, "step_terms")
 
 
 def render_example(interface: Interface, start: ExampleRun, precision: Embedded = "double") -> dict[str, str]:

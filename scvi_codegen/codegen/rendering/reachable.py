@@ -38,7 +38,7 @@ FILES = {
         (
             *("momentum", "velocity", "energy", "energies", "momentum_maps", "rates"),
             *("constraint_values", "project", "apart", "multipliers", "contact_terms"),
-            *("motion_terms", "row_terms"),
+            *("motion_terms", "row_terms", "contact_laws"),
             *("discrete_legendre", "work_and_impulses"),
         ),
     ),

@@ -156,7 +156,7 @@ def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], ve
     Modes, which are parameters of the steps, have no variations but those of the directions of slips in space.
     """
     jumps: dict[int, Jump] = {}
-    if states.stepper.divides_steps:
+    if states.stepper.divides_steps and not states.stepper.by_steps:
         more = back or bool(vectors[..., 2 * states.stepper.dimension :].any())
         jumps = jumps_within(states, starts, numbers, all_inputs=more)
     start = jumps.pop(0, None)
@@ -167,9 +167,13 @@ def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], ve
         if back and last in jumps:
             vectors[last] = vectors[last] @ jumps[last].matrix
         part = starts.part(first, last) if jumps else starts
-        ends = states.stepper._propagate(
-            part, vectors[first : last + 1], states.parameters_on_sides(part.t[0]), states.options, transpose=back
-        )
+        settings = part, vectors[first : last + 1], states.parameters_on_sides(part.t[0])
+        if states.stepper.by_steps:
+            from scvi_codegen.runs.derivatives.active_sets import propagate_by_steps  # here: few runs have contacts
+
+            ends = propagate_by_steps(states.stepper, *settings, transpose=back)
+        else:
+            ends = states.stepper._propagate(*settings, states.options, transpose=back)
         saved = np.concatenate([part.q, part.p], axis=1)
         if last in jumps:
             saved[-1] = jumps[last].before
@@ -211,6 +215,8 @@ def starts_of(states: SavedStates, first: int, last: int) -> tuple[Starts, NDArr
         return starts, np.arange(first, last + 1)
     t, h = states.t[first] + length * np.arange(count), np.full(count, length)
     starts = Starts.chain(states.q[first], states.p[first], t, h)
+    if states.stepper.by_steps:
+        return starts, np.array([first, *[-1] * (count - 1), last])
     times, starts.q[1:], starts.p[1:] = states._restarted(first, length)._fill(count)
     if states.tau is not None:
         starts.t[1:] = times[:-1]

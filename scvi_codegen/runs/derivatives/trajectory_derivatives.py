@@ -114,7 +114,11 @@ class TrajectoryDerivatives(SavedStates):
 
     def _require(self, operation: str) -> None:
         """Raise the error of an operation that the stepper or the inputs of the run exclude."""
-        require(self.stepper, operation, *["inputs"] * (self._runs != (self,)))
+        require(self.stepper, operation, *["inputs"] * (operation == "sensitivity" and self._runs != (self,)))
+        if self.stepper.by_steps:
+            from scvi_codegen.runs.derivatives.mode_changes import check_modes  # here: few runs have contacts
+
+            check_modes(self._runs)
 
     def tangent(self, directions: ArrayLike | None = None) -> Array:
         """Return (n, 2m, k) tangent vectors at the states, from (2m, k) initial directions of (q, p), by default all.
@@ -127,7 +131,7 @@ class TrajectoryDerivatives(SavedStates):
         Raises:
             StateError: if the directions have another shape, or the states are not at whole steps.
         """
-        require(self.stepper, "tangent")
+        self._require("tangent")
         size = 2 * self.stepper.dimension
         columns = np.eye(size) if directions is None else finite(directions, "directions")
         tangents, parts = self._initial_tangents(columns), list[Array]()
@@ -159,7 +163,7 @@ class TrajectoryDerivatives(SavedStates):
         Raises:
             StateError: if the shape is another, or the states are not at whole steps.
         """
-        require(self.stepper, "pullback")
+        self._require("pullback")
         derivatives = checked_cotangents(self.stepper, len(self), cotangents)
         seeds = seeds_of(self.stepper, derivatives)
         now, by_runs = np.zeros_like(seeds[0]), list[Array]()

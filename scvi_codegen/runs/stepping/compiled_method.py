@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Any, Self, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.codegen.ir.variants import BY_STEPS, Acting, Derivatives, Lanes, NewtonFallback, Variant, WithEvents
+from scvi_codegen.codegen.ir.variants import (
+    BY_STEPS,
+    Acting,
+    Derivatives,
+    Lanes,
+    NewtonFallback,
+    StepTerms,
+    Variant,
+    WithEvents,
+)
 from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.native.binding import Binding, with_calls
 from scvi_codegen.codegen.rendering.source import Interface, Source
@@ -341,7 +350,7 @@ class CompiledMethod:
             stepper._compile()
         if self._looser is not None:
             self._looser().prepare(tangent=tangent, second=second, ensemble=ensemble, events=events)
-        requested = {Derivatives(): tangent, Derivatives(order=2): second, Lanes(): ensemble}
+        requested = {self.linear_variant: tangent, Derivatives(order=2): second, Lanes(): ensemble}
         for variant in [variant for variant, is_requested in requested.items() if is_requested]:
             if (source := self._variants[variant]) is not None:
                 building.load(source, flags=self.flags)
@@ -351,8 +360,13 @@ class CompiledMethod:
 
     @cached_property
     def tangent(self) -> Binding:
-        """Library with derivatives of steps, compiled on first use."""
-        return self._linearised(Derivatives(), "jacobian")
+        """Library with derivatives of steps, or of the terms of contacts by steps, compiled on first use."""
+        return self._linearised(self.linear_variant, "tangent" if self.by_steps else "jacobian")
+
+    @property
+    def linear_variant(self) -> Variant:
+        """Variant with first derivatives."""
+        return StepTerms() if self.by_steps else Derivatives()
 
     @cached_property
     def _ensemble_binding(self) -> Binding | None:

@@ -15,6 +15,16 @@ int NAME(motion_terms)(real t, const real *q, const real *v, const real *paramet
   return all_finite(terms, 2 * M) && all_finite(derivative, MOTION_ENTRIES) ? OK : NOT_FINITE;
 }
 
+/* Friction, static friction and restitution of the contacts. */
+int NAME(contact_laws)(real t, const real *q, const real *v, const real *parameters, real *laws)
+{
+  real u[2 * M];
+  memcpy(u, q, sizeof(real) * M);
+  memcpy(u + M, v, sizeof(real) * M);
+  contact_coefficients(u, t, parameters, laws);
+  return OK;
+}
+
 int NAME(row_terms)(real t, const real *q, const real *v, const real *parameters, real *terms)
 {
   real u[2 * M], derivative[CONSTRAINT_ENTRIES], *const G = terms + 2 * CONSTRAINTS;

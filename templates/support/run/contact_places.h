@@ -83,6 +83,11 @@ static real size_by_position(const real *G, const real *q)
   real sum = 0.0;
   for (int k = 0, i = 0; k < CONTACT_VECTORS; k++) {
     real gradient = 0.0, position = 0.0;
+    if (CONTACT_VECTOR[k] == 1) {
+      sum += fabs(G[i] * q[i]);
+      i++;
+      continue;
+    }
     for (const int next = i + CONTACT_VECTOR[k]; i < next; i++) {
       gradient += G[i] * G[i];
       position += q[i] * q[i];

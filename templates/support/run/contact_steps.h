@@ -46,6 +46,18 @@ typedef struct {
   real x[STEP_SIZE][CONTACT_ROWS];
 } responses;
 
+/* Forces of all rows that solve a problem, and modes of contacts: 0 open, 1 sticks, 2 slips. */
+typedef struct {
+  real force[STEP_ROWS], mode[EVENT_CONTACTS];
+} step_solution;
+
+/* A solved step, or part of one, from (t, q, p) to (q1, p1): the problem of positions, that of velocities without and
+ * with restitution, of whose difference it has a part, and the factor by which velocities shrank (strict energy). */
+typedef struct {
+  real number, t, h, q[M], p[M], q1[M], p1[M], part, factor;
+  step_solution positions, plastic, elastic;
+} step_trace;
+
 /* A step of length h from (t, q, p, v) to q1; contacts that exist, and of all rows the impulses f1. A problem has the
  * near contacts alone, in the order in which they join: `contact` and `row` are their numbers among all. */
 typedef struct {
@@ -58,11 +70,12 @@ typedef struct {
   int is_full; /* 1 + the contact that found no room, else 0 */
   int exists[EVENT_CONTACTS], is_near[EVENT_CONTACTS], pushes[EVENT_CONTACTS], has_begun[EVENT_CONTACTS];
   real impulse[ALL_CONTACT_ROWS];
-  int contact[EVENT_CONTACTS], row[CONTACT_ROWS];
+  int contact[EVENT_CONTACTS], row[CONTACT_ROWS], former[CONTACT_ROWS]; /* rows of the last solved step */
   contact_places place[EVENT_CONTACTS];
   responses response, at_start;
   real W[CONTACT_ROWS * CONTACT_ROWS];
   cone_problem problem;
+  step_trace *trace; /* of this step; NULL: none */
 } contact_step;
 
 static real times_row(const real *row, const real *x)
@@ -120,6 +133,20 @@ static void respond(const contact_step *in, const step_matrix *of, const row_ter
     for (int i = 0; i < k; i++)
       subtract(x[k], of->matrix[k * STEP_SIZE + i], 0, to->count, x[i]);
   }
+}
+
+/* Whether a problem has the rows of that of velocities at the end of the last step. */
+static int has_former_rows(const contact_step *in)
+{
+  const size_t size = sizeof *in->row * (size_t)in->problem.rows;
+  return in->response.count == in->problem.rows && memcmp(in->row, in->former, size) == 0;
+}
+
+static void keep_responses(const responses *from, responses *to)
+{
+  to->count = from->count;
+  for (int i = 0; i < STEP_SIZE; i++)
+    memcpy(to->x[i], from->x[i], BYTES(from->count));
 }
 
 /* W of a problem, a part of G times responses. */
@@ -220,9 +247,11 @@ static int solve_positions(contact_step *in, const contact_memory *from, const r
   const responses *const at = &in->at_start;
   real force[CONTACT_ROWS];
   memcpy(force, of->f, BYTES(of->rows));
-  respond(in, &in->moving, &in->start, &in->response);
-  if (first || at->count != of->rows) /* contacts only join */
+  if (first && in->continues && has_former_rows(in))
+    keep_responses(&in->response, &in->at_start);
+  else if (first || at->count != of->rows) /* contacts only join */
     respond(in, &in->resting, &in->start, &in->at_start);
+  respond(in, &in->moving, &in->start, &in->response);
   pose_matrix(in, &in->end, &in->response, 1.0 / in->h);
   *slow = 0;
   for (int r = 0; r < of->rows; r++) {
@@ -301,12 +330,38 @@ static void note_impulses(contact_step *in)
     in->pushes[in->contact[k]] = in->place[k].normal >= 0 && in->problem.mode[k].pushes;
 }
 
+/* Whether the contacts that push are those of the last step, whose equations have the curvature of this one. */
+static int pushes_as_before(const contact_step *in, const contact_memory *from)
+{
+  int same = 1;
+  for (int k = 0; k < in->problem.contacts; k++)
+    same &= in->place[k].normal < 0 || in->problem.mode[k].pushes == from->pushes[in->contact[k]];
+  return same;
+}
+
 /* y += part X f with responses X. */
 static void add_responses(const responses *of, real part, const real *f, real *y)
 {
   for (int i = 0; i < M; i++)
     for (int c = 0; c < of->count; c++)
       y[i] += part * of->x[i][c] * f[c];
+}
+
+/* Notes a solution with x, of which x[M ..] are the forces of constraints without contacts. */
+static void note_solution(const contact_step *in, const real *x, step_solution *to)
+{
+  const cone_problem *const of = &in->problem;
+  memset(to, 0, sizeof *to);
+  for (int c = 0; c < STEP_FIXED; c++) {
+    to->force[c] = x[M + c];
+    for (int r = 0; r < of->rows; r++)
+      to->force[c] += in->response.x[M + c][r] * of->f[r];
+  }
+  for (int r = 0; r < of->rows; r++)
+    to->force[in->row[r]] = of->f[r];
+  for (int k = 0; k < of->contacts; k++)
+    if (in->place[k].normal < 0 || of->mode[k].pushes)
+      to->mode[in->contact[k]] = of->mode[k].sticks && cone_limit(of, k) > 0.0 ? 1.0 : 2.0;
 }
 
 /* Solves the first problem for q1 and the impulses f1: Newton's method on both, a contact problem an iteration. */
@@ -347,15 +402,19 @@ static int find_positions(contact_step *in, const contact_memory *from)
       in->curvature = update / fmax(before * before, DBL_MIN);
     before = update;
     if (!(update <= (slow ? STEP_SLOW_UPDATE / STEP_UPDATE : 1.0) * size + smallest) &&
-        !(iteration == 0 && in->curvature > 0.0 && !slow && in->curvature * update * update <= STEP_UPDATE * size))
+        !(iteration == 0 && in->curvature > 0.0 && !slow && in->curvature * update * update <= STEP_UPDATE * size &&
+            pushes_as_before(in, from)))
       continue;
     for (int i = 0; i < M; i++) /* L_v is linear in v */
       in->first.momentum[i] += times_row(in->first.by_state[i] + M, x) / in->h;
     TRY(terms_between(in, 0));
     const int contacts = in->problem.contacts; /* those join whose gaps only the forces of others close */
     TRY(find_near(in, from, still, 0.0));
-    if (contacts == in->problem.contacts)
+    if (contacts == in->problem.contacts) {
+      if (in->trace)
+        note_solution(in, x, &in->trace->positions);
       return OK;
+    }
   }
   return NOT_CONVERGED;
 }
@@ -397,8 +456,11 @@ static int limit_energy(const contact_step *in, real *v, real *workspace)
   real room;
   TRY(energy_before(in, v, &room, workspace));
   room = fmax(room, 0.0);
-  for (int i = 0; i < M && kinetic > room; i++)
-    v[i] *= sqrt(room / kinetic);
+  const real factor = kinetic > room ? sqrt(room / kinetic) : 1.0;
+  for (int i = 0; i < M; i++)
+    v[i] *= factor;
+  if (in->trace)
+    in->trace->factor = factor;
   return OK;
 }
 
@@ -425,7 +487,9 @@ static int rebound(contact_step *in, const contact_memory *from, real by_surface
   room += by_surfaces;
   if (!solve_cone_within(of, STEP_POINTS))
     return NOT_CONVERGED;
-  memcpy(w, before, sizeof w);
+  if (in->trace)
+    note_solution(in, before, &in->trace->elastic);
+  memcpy(w, before, BYTES(M));
   add_responses(&in->response, 1.0, of->f, w);
   for (int i = 0; i < M; i++)
     w[i] -= v[i];
@@ -435,6 +499,8 @@ static int rebound(contact_step *in, const contact_memory *from, real by_surface
   const real rest = half_product(in, v, v) - plastic - room;
   if (square + linear + rest > 0.0)
     part = rest >= 0.0 ? 0.0 : fmin(1.0, (-linear + sqrt(linear * linear - 4.0 * square * rest)) / (2.0 * square));
+  if (in->trace)
+    in->trace->part = part;
   for (int i = 0; i < M; i++)
     v[i] += part * w[i];
   for (int r = 0; r < of->rows; r++)
@@ -442,10 +508,11 @@ static int rebound(contact_step *in, const contact_memory *from, real by_surface
   return OK;
 }
 
-/* Whether a contact is open, sticks or slips unlike before. */
+/* Whether a contact is open, sticks or slips unlike before, or rebounds. */
 static int has_changed(const contact_memory *before, const contact_memory *now, int k)
 {
-  return before->is_closed[k] != now->is_closed[k] || before->sticks[k] != now->sticks[k];
+  return before->is_closed[k] != now->is_closed[k] || before->sticks[k] != now->sticks[k] ||
+      (now->pushes[k] && !now->is_closed[k]);
 }
 
 /* Solves the second problem for the velocities at q1, and keeps forces and modes. */
@@ -453,7 +520,7 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
 {
   cone_problem *const of = &in->problem;
   const contact_memory from = *to;
-  real x[STEP_SIZE], before[M], v[M], work = 0.0, fastest = 0.0;
+  real before[STEP_SIZE], v[M], work = 0.0, fastest = 0.0;
   const real by_surfaces = work_of_surfaces(in, &in->start, of->f);
   int changes = 0;
   note_impulses(in);
@@ -462,15 +529,14 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   for (int r = 0; r < of->rows; r++)
     work += of->f[r] * times_row(in->start.G[in->row[r]], v);
   for (int i = 0; i < M; i++) {
-    x[i] = 0.5 * (in->h * in->last.force[i] + in->first.momentum[i] - in->last.momentum[i]);
+    before[i] = 0.5 * (in->h * in->last.force[i] + in->first.momentum[i] - in->last.momentum[i]);
     for (int j = 0; j < M; j++)
-      x[i] += in->last.by_state[i][M + j] * (in->q1[j] - in->q[j]) / in->h;
+      before[i] += in->last.by_state[i][M + j] * (in->q1[j] - in->q[j]) / in->h;
   }
   for (int c = 0; c < STEP_FIXED; c++)
-    x[M + c] = -in->end.drift[c];
+    before[M + c] = -in->end.drift[c];
   TRY(factorise_step(NULL, &in->last, &in->end, &in->end, &in->moving));
-  solve_step(&in->moving, x);
-  memcpy(before, x, sizeof before);
+  solve_step(&in->moving, before);
   clear_problem(in);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
@@ -489,6 +555,8 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   to->compliance = fmax(to->compliance, of->compliance);
   if (!solve_cone_within(of, STEP_POINTS))
     return NOT_CONVERGED;
+  if (in->trace)
+    note_solution(in, before, &in->trace->plastic);
   memcpy(v, before, sizeof v);
   add_responses(&in->response, 1.0, of->f, v);
   TRY(rebound(in, &from, by_surfaces, before, v, workspace));
@@ -528,6 +596,10 @@ static void take_state(contact_step *in, const contact_memory *memory, real t, r
   if (in->continues)
     in->resting = in->moving;
   in->solved = 0;
+  if (in->trace) {
+    in->trace->part = 0.0;
+    in->trace->factor = 1.0;
+  }
   in->t = t;
   in->h = h;
   memcpy(in->q, q, BYTES(M));
@@ -538,7 +610,12 @@ static void take_state(contact_step *in, const contact_memory *memory, real t, r
 /* Rows at the start, and contacts whose conditions hold there: those that existed, and those that it is not behind. */
 static int find_existing(contact_step *in, const contact_memory *from, real *workspace)
 {
-  TRY(NAME(row_terms)(in->t, in->q, in->v, in->imposed, in->start.value));
+  if (in->continues) { /* rows are those at the end of the last step, laws may depend on velocities */
+    in->start = in->end;
+    TRY(NAME(contact_laws)(in->t, in->q, in->v, in->imposed, in->start.coefficient[0]));
+  } else {
+    TRY(NAME(row_terms)(in->t, in->q, in->v, in->imposed, in->start.value));
+  }
   in->fastest = 0.0;
   for (int r = 0; r < ALL_CONTACT_ROWS; r++)
     in->fastest = fmax(in->fastest, fabs(rate_of(&in->start, STEP_FIXED + r, in->v)));
@@ -554,6 +631,20 @@ static int find_existing(contact_step *in, const contact_memory *from, real *wor
         in->start.value[row] >= -CONTACT_PENETRATION * size_by_position(in->start.G[row], in->q));
   }
   return OK;
+}
+
+/* Completes the trace of a part of a step. */
+static void end_trace(contact_step *in, const real *p1)
+{
+  step_trace *const of = in->trace;
+  of->t = in->t;
+  of->h = in->h;
+  memcpy(of->q, in->q, BYTES(M));
+  memcpy(of->p, in->p, BYTES(M));
+  memcpy(of->q1, in->q1, BYTES(M));
+  memcpy(of->p1, p1, BYTES(M));
+  of[1].number = of->number;
+  in->trace++;
 }
 
 /* One step of length h from (t, q, p), which become those at its end; where it does not converge, two halves. */
@@ -575,7 +666,10 @@ static int step_by_steps(contact_step *in, contact_memory *memory, real t, real 
     }
     memcpy(q, in->q1, BYTES(M));
     *memory = next;
+    memcpy(in->former, in->row, sizeof in->former);
     in->solved = 1;
+    if (in->trace)
+      end_trace(in, p);
     return OK;
   }
   if (depth == STEP_HALVINGS)
@@ -595,33 +689,47 @@ static void put_memory(const contact_memory *memory, real *mode)
   }
 }
 
+/* Notes the direction of the slip of contact k at the start of a step, and returns its speed. */
+static real note_slip(const contact_step *in, contact_memory *memory, int k)
+{
+  real w[2] = {0.0};
+  for (int i = 0; i < CONTACTS[k].slips; i++)
+    w[i] = rate_of(&in->start, STEP_FIXED + CONTACTS[k].tangential + i, memory->v);
+  const real speed = length_of(w, 2);
+  for (int i = 0; i < 2; i++)
+    memory->direction[k][i] = w[i] / fmax(speed, DBL_MIN);
+  return speed;
+}
+
+/* Velocities of a run at a state, its rows and existing contacts. */
+static int find_start(contact_step *in, const event_run *run, contact_memory *memory, real *workspace)
+{
+  TRY(NAME(velocity)(run->t, run->q, run->p, in->idle, memory->v, workspace));
+  take_state(in, memory, run->t, run->h, run->q, run->p);
+  TRY(find_existing(in, memory, workspace));
+  memcpy(memory->exists, in->exists, sizeof memory->exists);
+  return OK;
+}
+
 /* Velocities of a run at its start, and slips that rest there. */
 static int begin_by_steps(contact_step *in, event_run *run, event_watch *watch, real *workspace)
 {
   contact_memory *const memory = &watch->steps;
-  TRY(NAME(velocity)(run->t, run->q, run->p, in->idle, memory->v, workspace));
-  take_state(in, memory, run->t, run->h, run->q, run->p);
-  TRY(find_existing(in, memory, workspace));
+  TRY(find_start(in, run, memory, workspace));
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
     const real size = normal < 0 ? 0.0 : size_by_position(in->start.G[row], run->q);
     const real gap = normal < 0 ? 0.0 : in->start.value[row];
-    real w[2] = {0.0};
     if (in->exists[k] && gap < -CONTACT_PENETRATION * size) {
       watch->refusal = CONTACT_PENETRATES;
       watch->refused = k + 1;
       watch->behind = gap;
       return NOT_CONVERGED;
     }
-    for (int i = 0; i < CONTACTS[k].slips; i++)
-      w[i] = rate_of(&in->start, STEP_FIXED + CONTACTS[k].tangential + i, memory->v);
-    const real speed = length_of(w, 2);
+    const real speed = note_slip(in, memory, k);
     memory->is_closed[k] = in->exists[k] && gap <= CONTACT_ROUNDING * size;
     memory->sticks[k] = memory->is_closed[k] && CONTACTS[k].slips > 0 && speed <= CONTACT_ROUNDING * in->fastest;
-    for (int i = 0; i < 2; i++)
-      memory->direction[k][i] = w[i] / fmax(speed, DBL_MIN);
   }
-  memcpy(memory->exists, in->exists, sizeof memory->exists);
   memory->begun = 1;
   put_memory(memory, watch->mode);
   return OK;
