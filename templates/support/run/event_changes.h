@@ -380,14 +380,17 @@ static int may_be_halved(const event_step *step, int status, real part, real pac
 /* Compares changes of the speeds of slips whose friction varies, in a part of an adaptive step up to `at`, with moments
  * of their rates, integral of s' dt = s(T) - s(0) and of t/T s' dt = s(T) - mean of s, by a quadrature of more points
  * than those of the part, and both ends: stages do not see the friction of slow slips just before a stop. One moment
- * may be right by chance. Errors are relative to the slip of the part, in space to the fastest so far: near a stop its
- * direction turns like a power of the time that is left, which no part resolves. Rounding is that of forces that
- * cancel. */
+ * may be right by chance. Errors are relative to what friction takes of the slip in the part, so that those of all
+ * parts amount to friction that is off by the tolerance; in space to the fastest slip so far: near a stop its direction
+ * turns like a power of the time that is left, which no part resolves. Rounding is that of forces that cancel, and of
+ * the speed by the momenta of all bodies, at which iterations of a step end. */
 static int judge_slips(const event_step *step, const event_sample *left, const event_sample *at, real part,
     real tolerance)
 {
-  real missed[EVENT_CONTACTS][2] = {{0.0}}, fastest[EVENT_CONTACTS] = {0.0}, rounding[EVENT_CONTACTS] = {0.0};
+  const real least = CHANGE_SAFETY * DBL_EPSILON;
+  real missed[EVENT_CONTACTS][2] = {{0.0}}, taken[EVENT_CONTACTS] = {0.0}, rounding[EVENT_CONTACTS] = {0.0};
   real force[CONTACT_ROWS], second[CONTACT_ROWS];
+  int exact = 1;
   contact_mode mode[EVENT_CONTACTS];
   contact_terms of;
   for (int j = 0; j < CONTACT_KNOTS; j++) {
@@ -397,27 +400,28 @@ static int judge_slips(const event_step *step, const event_sample *left, const e
       TRY(step_from_left(step, left, CONTACT_KNOT[j] * part, &knot));
     TRY(terms_at(step, starts ? left : ends ? at : &knot, &of));
     modes_at(&of, step->watch->mode, mode);
-    solve_contacts(&of, mode, of.second, force, second, NULL);
+    exact &= solve_contacts(&of, mode, of.second, force, second, NULL) <= CONTACT_OUTSIDE;
     for (int k = 0; k < EVENT_CONTACTS; k++) {
       const int first = CONTACTS[k].tangential, is_judged = CONTACTS[k].varies && mode[k].closed && !mode[k].sticks;
       const real speed = is_judged ? length_of(of.rate + first, CONTACTS[k].slips) : 0.0;
       real rate = 0.0;
       for (int i = 0; is_judged && i < CONTACTS[k].slips; i++) {
         rate += (speed > 0.0 ? of.rate[first + i] / speed : mode[k].direction[i]) * second[first + i];
-        rounding[k] = fmax(rounding[k], CHANGE_SAFETY * DBL_EPSILON * of.second_terms[first + i] * fabs(part));
+        rounding[k] = fmax(rounding[k], least * fmax(of.second_terms[first + i] * fabs(part), of.speed[first + i]));
       }
       missed[k][0] += CONTACT_WEIGHT[j] * part * rate + (starts - ends) * speed;
       missed[k][1] += CONTACT_WEIGHT[j] * (CONTACT_KNOT[j] * part * rate + speed) - ends * speed;
-      fastest[k] = fmax(fastest[k], speed);
+      if (is_judged)
+        taken[k] += CONTACT_WEIGHT[j] * fabs(part) * length_of(force + first, CONTACTS[k].slips) *
+            of.W[first * (CONTACT_ROWS + 1)];
     }
   }
   for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const real size = fmax(CONTACTS[k].slips > 1 ? step->watch->fastest[k] : 0.0, fastest[k]);
-    const real allowed = fmax(tolerance, CHANGE_SAFETY * DBL_EPSILON) * size + rounding[k];
-    if (fmax(fabs(missed[k][0]), fabs(missed[k][1])) > allowed)
-      return 0.5 * fabs(part) > CONTACT_UNSOLVED * step->watch->pace ? NOT_CONVERGED : OK;
+    const real size = CONTACTS[k].slips > 1 ? step->watch->fastest[k] : taken[k];
+    for (int i = 0; i < 2; i++)
+      exact &= fabs(missed[k][i]) <= tolerance * size + rounding[k];
   }
-  return OK;
+  return exact || 0.5 * fabs(part) <= CONTACT_UNSOLVED * step->watch->pace ? OK : NOT_CONVERGED;
 }
 #endif
 
