@@ -332,29 +332,29 @@ static int renew_sides(const event_step *step, long long first, const event_samp
 }
 #endif
 
-#ifdef EVENT_CONTACTS
-/* Cuts a part of a fixed step to one that resolves slips in space, and to the longest whose iterations converge; the
- * first part was taken by the run unless it is replaced, in its state, too, in other modes. */
+/* Cuts a part of a fixed step to `longest`, and to one that resolves slips in space; the first part was taken by the run
+ * unless it is replaced, in its state, too, in other modes. */
 static int shorten_part(const event_step *step, event_sample *left, event_sample *right, event_run *run, int changes,
     real longest, real *part)
 {
   const real whole = *part;
-  real taken[EVENT_MODES];
   int is_taken = changes == 0;
   longest = fmin(longest, fabs(whole));
+#ifdef EVENT_CONTACTS
+  real taken[EVENT_MODES];
   for (int k = 0; k < EVENT_MODES; k++)
     taken[k] = step->own[MODE_PLACE[k]];
   put_modes(step->watch->mode, step->own);
-  real by_slips = longest;
-  if (longest < fabs(whole))
-    *part = copysign(longest, whole);
 #ifdef CONTACTS_IN_SPACE
+  real by_slips = longest;
   TRY(renew_slips(step, left, &by_slips));
+  longest = fmin(longest, by_slips);
 #endif
-  if (by_slips < longest)
-    *part = copysign(by_slips, whole);
   for (int k = 0; k < EVENT_MODES; k++)
     is_taken &= taken[k] == step->watch->mode[k];
+#endif
+  if (longest < fabs(whole))
+    *part = copysign(longest, whole);
   if (*part == whole && is_taken)
     return OK;
   TRY(evaluate_functions(step, left, values_at(step, 0)));
@@ -365,6 +365,7 @@ static int shorten_part(const event_step *step, event_sample *left, event_sample
   return OK;
 }
 
+#ifdef EVENT_CONTACTS
 /* Whether the stage equations of a part of a step were not solved, of which those of its half may be: of slow slips and
  * nearly straight legs. */
 static int may_be_halved(const event_step *step, int status, real part, real pace)
@@ -425,27 +426,39 @@ static int judge_slips(const event_step *step, const event_sample *left, const e
 }
 #endif
 
-#ifdef EVENT_KINKS
-/* Lets the error of a run contain that of a part of a fixed step, which is that of all of its parts, relative to the
- * motion of the part: a short one in a stiff wall may change the velocity of all that follows. */
-static int observe_part(event_run *run, const event_step *step, const event_sample *left, real part)
+/* Lets the error of a run contain that of a part of a fixed step which a change bounds, up to `at`: the difference from
+ * its two halves, without rounding, of positions and of velocities in the length of the step, relative to the motion in
+ * it. A short part in a stiff wall may change the velocity of all that follows. */
+static int judge_part(event_run *run, const event_step *step, const event_sample *left, const event_sample *at,
+    real part)
 {
+  const real duration = fabs(step->whole);
+  real *const v = step->memory + 2 * M, *const v_at = v + M, far = 0.0, fast = DBL_MIN, error = 0.0;
+  event_sample middle = {.t = left->t + 0.5 * part, .q = v, .p = v_at};
+  event_sample end = {.q = step->memory, .p = step->memory + M};
   event_run own = *run;
-  real t, *const q = step->memory, *const p = q + M;
-  int iterations;
-  solver_report report;
-  set_run(&own, left->t, left);
-  own.h = part;
-  own.t_low = own.error = own.largest_motion = 0.0;
-  const int status = NAME(advance)(&own, 1, 1, step->parameters, step->options, &t, q, p, &iterations, &report,
-      step->workspace);
-  if (status == OK && own.error > run->error) {
-    run->error = own.error;
+  if (!(NAME(step_error)(run) >= 0.0)) /* the method has no estimate */
+    return OK;
+  TRY(step_from_left(step, left, 0.5 * part, &middle));
+  TRY(step_from_left(step, &middle, 0.5 * part, &end));
+  TRY(NAME(velocity)(at->t, at->q, at->p, step->parameters, v_at, step->workspace));
+  TRY(NAME(velocity)(at->t, end.q, end.p, step->parameters, v, step->workspace));
+  for (int i = 0; i < M; i++) {
+    far = fmax(far, fabs(at->q[i]));
+    fast = fmax(fast, fmax(fabs(v[i]), fabs(v_at[i])));
+  }
+  const real rounding = CHANGE_SAFETY * DBL_EPSILON * far * (1.0 + duration / fabs(part));
+  for (int i = 0; i < M; i++) {
+    const real apart = fabs(end.q[i] - at->q[i]) + duration * fabs(v[i] - v_at[i]);
+    error = fmax(error, (apart - rounding) / (duration * (fmax(fabs(v[i]), fabs(v_at[i])) + fast)));
+  }
+  own.error = 2.0;
+  if (error > NAME(step_error)(run)) {
+    run->error = pow(error, 1.0 / log2(NAME(step_error)(&own))); /* of which step_error is a power */
     run->error_t = left->t;
   }
-  return status;
+  return OK;
 }
-#endif
 
 /* Sets the state of a run after a change: of an adaptive step, or of the last part of a fixed one. */
 static void end_at_change(event_run *run, const event_run *before, const event_sample *at, int ends, int adaptive)
@@ -477,6 +490,18 @@ static int search_crossings(const event_step *step, const event_sample *left, co
   note_rates(step);
 #endif
   return OK;
+}
+
+/* Twice the time to the first of the crossings from `first` on that changes the state, if it is before the first inner
+ * node of the search: others before it may have been missed. INFINITY otherwise. */
+static real resolved_part(const event_step *step, long long first)
+{
+  real fraction = INFINITY;
+  for (long long i = first; i < *step->filled; i++)
+    if (step->watch->acts[step->found[i].function])
+      fraction = fmin(fraction, step->found[i].fraction);
+  const real part = fabs(step->h) * fraction;
+  return fraction < EVENT_NODES[1] && part > EVENT_TIE * fabs(step->whole) ? 2.0 * part : INFINITY;
 }
 
 /* Changes a state at the crossings from `first` on: by impacts, then sides of kinks and modes of contacts. */
@@ -527,9 +552,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
   real *const states = step->memory + 9 * M;
   event_sample left = {.t = before->t, .q = states, .p = states + M};
   event_sample right = {.fraction = 1.0, .t = run->t, .q = states + 2 * M, .p = states + 3 * M};
-#ifdef EVENT_CONTACTS
   real longest = INFINITY;
-#endif
   step->whole = step->h = length;
 #ifdef CONTACTS_IN_SPACE
   step->whole = adaptive ? fmax(length, step->watch->pace) : length;
@@ -545,18 +568,14 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       end_at_change(run, before, &left, 0, adaptive);
       return OK;
     }
-    TRY(evaluate_functions(step, &left, values_at(step, 0)));
-    TRY(step_from_left(step, &left, length, &right));
   }
   for (int changes = starts;; changes++) {
     event_sample at = {.q = states + 4 * M, .p = states + 5 * M};
     real part = length;
-    int acts = 0, ends, cut = 0, status = OK;
-#ifdef EVENT_CONTACTS
+    int acts = 0, ends, cut, status = OK;
     if (!adaptive)
       status = shorten_part(step, &left, &right, run, changes, longest, &part);
     cut = part != length;
-#endif
     const real span = part;
     const long long first = *step->filled;
     long long group = first;
@@ -566,8 +585,12 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     step->p = left.p;
     if (status == OK)
       status = search_crossings(step, &left, &right);
+    longest = status == OK && !adaptive ? resolved_part(step, first) : INFINITY;
+    if (longest < INFINITY) {
+      *step->filled = first;
+      continue;
+    }
 #ifdef EVENT_CONTACTS
-    longest = INFINITY;
     if (!adaptive && may_be_halved(step, status, part, 0.0)) {
       int opens = 0;
       *step->filled = first;
@@ -604,10 +627,8 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     if (adaptive)
       TRY(judge_slips(step, &left, acts || step->watch->ended ? &at : &right, part, control->tolerance));
 #endif
-#ifdef EVENT_KINKS
-    if (!adaptive && (changes > 0 || acts))
-      TRY(observe_part(run, step, &left, part));
-#endif
+    if (!adaptive && (acts || (changes > 0 && !cut)))
+      TRY(judge_part(run, step, &left, acts ? &at : &right, part));
     step->watch->time += part;
     cut &= !acts && !step->watch->ended;
     if (cut) {
@@ -641,10 +662,6 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     }
     left.t = at.t;
     copy_state(left.q, left.p, at.q, at.p);
-#ifndef EVENT_CONTACTS /* which shorten the next part first */
-    TRY(evaluate_functions(step, &left, values_at(step, 0)));
-    TRY(step_from_left(step, &left, length, &right));
-#endif
   }
 }
 
