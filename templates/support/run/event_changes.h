@@ -332,7 +332,7 @@ static int renew_sides(const event_step *step, long long first, const event_samp
 }
 #endif
 
-/* Cuts a part of a fixed step to `longest`, and to one that resolves slips in space; the first part was taken by the run
+/* Cuts a part of a fixed step to `longest`, and to one that resolves slips in space; the first was taken by the run
  * unless it is replaced, in its state, too, in other modes. */
 static int shorten_part(const event_step *step, event_sample *left, event_sample *right, event_run *run, int changes,
     real longest, real *part)
