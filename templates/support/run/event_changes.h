@@ -492,8 +492,9 @@ static int search_crossings(const event_step *step, const event_sample *left, co
   return OK;
 }
 
+#ifdef EVENT_KINKS
 /* Twice the time to the first of the crossings from `first` on that changes the state, if it is before the first inner
- * node of the search: others before it may have been missed. INFINITY otherwise. */
+ * node of the search: behind kinks, in stiff walls, others before it may have been missed. INFINITY otherwise. */
 static real resolved_part(const event_step *step, long long first)
 {
   real fraction = INFINITY;
@@ -503,6 +504,7 @@ static real resolved_part(const event_step *step, long long first)
   const real part = fabs(step->h) * fraction;
   return fraction < EVENT_NODES[1] && part > EVENT_TIE * fabs(step->whole) ? 2.0 * part : INFINITY;
 }
+#endif
 
 /* Changes a state at the crossings from `first` on: by impacts, then sides of kinks and modes of contacts. */
 static int change_at(const event_step *step, long long first, event_sample *at)
@@ -585,11 +587,14 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     step->p = left.p;
     if (status == OK)
       status = search_crossings(step, &left, &right);
+    longest = INFINITY;
+#ifdef EVENT_KINKS
     longest = status == OK && !adaptive ? resolved_part(step, first) : INFINITY;
     if (longest < INFINITY) {
       *step->filled = first;
       continue;
     }
+#endif
 #ifdef EVENT_CONTACTS
     if (!adaptive && may_be_halved(step, status, part, 0.0)) {
       int opens = 0;
