@@ -79,7 +79,7 @@ PEAKS = {
 
 
 @cache
-def sliders(order):
+def sliders(order, method):
     """Return a stepper of sliders with friction by a limit, a gap and a formula, and a free companion."""
     contacts = [sc.friction("x_dot", limit=PEAKS["x"]), sc.contact("h", slip="y_dot", friction=f"{PEAKS['y']}/g")]
     system = lagrange(
@@ -87,7 +87,7 @@ def sliders(order):
         forces={"u": f"-{PEAKS['u']}*sign(u_dot)"}, g=9.81, k=0.0,
         **dict.fromkeys("acbdef", 0.1), **dict.fromkeys("wsr", 0.1),
     )  # fmt: skip
-    return sc.compile_stepper(system, "svi:3", contacts=contacts[::order])
+    return sc.compile_stepper(system, method, contacts=contacts[::order])
 
 
 def stop_of(a, b, w, v, k=0.0):
@@ -101,8 +101,10 @@ def stop_of(a, b, w, v, k=0.0):
 
 
 @pytest.mark.second
-@pytest.mark.parametrize("tolerance", [1e-4, 1e-7, 1e-10])
-def test_friction_that_varies_along_slips_is_judged(tolerance):
+@pytest.mark.parametrize(
+    ("method", "tolerance"), [("svi:2", 1e-10), ("svi:3", 1e-4), ("svi:3", 1e-7), ("svi:3", 1e-10)]
+)
+def test_friction_that_varies_along_slips_is_judged(method, tolerance):
     """Peaks of a width from 6e-4 to 1 of the first slip, of which most lie behind the last point of a step."""
     for number in range(12):
         random = np.random.default_rng([97, number])
@@ -112,7 +114,7 @@ def test_friction_that_varies_along_slips_is_judged(tolerance):
         values = dict(zip(["a", "c", "e", "b", "d", "f", "w", "s", "r", "k"], [*a, *b, *w, k], strict=True))
         stops = [stop_of(*data, k * (i == 0)) for i, data in enumerate(zip(a, b, w, v, strict=True))]
         start = {"velocity": [*v, 1.0, 0.0], "t_end": 1.1 * max(t for _, t in stops), "parameters": values}
-        run, permuted = (sliders(order).integrate([0.0] * 5, **start, tolerance=tolerance) for order in (1, -1))
+        run, permuted = (sliders(order, method).integrate([0.0] * 5, **start, tolerance=tolerance) for order in (1, -1))
         for i, (place, t) in enumerate(stops):
             stop = np.flatnonzero(np.abs(run.velocity[:, i]) < 1e-13)[0]
             assert run.q[stop, i] == pytest.approx(place, rel=10 * tolerance), (number, i)

@@ -332,29 +332,29 @@ static int renew_sides(const event_step *step, long long first, const event_samp
 }
 #endif
 
-#ifdef EVENT_CONTACTS
-/* Cuts a part of a fixed step to one that resolves slips in space, and to the longest whose iterations converge; the
- * first part was taken by the run unless it is replaced, in its state, too, in other modes. */
+/* Cuts a part of a fixed step to `longest`, and to one that resolves slips in space; the first was taken by the run
+ * unless it is replaced, in its state, too, in other modes. */
 static int shorten_part(const event_step *step, event_sample *left, event_sample *right, event_run *run, int changes,
     real longest, real *part)
 {
   const real whole = *part;
-  real taken[EVENT_MODES];
   int is_taken = changes == 0;
   longest = fmin(longest, fabs(whole));
+#ifdef EVENT_CONTACTS
+  real taken[EVENT_MODES];
   for (int k = 0; k < EVENT_MODES; k++)
     taken[k] = step->own[MODE_PLACE[k]];
   put_modes(step->watch->mode, step->own);
-  real by_slips = longest;
-  if (longest < fabs(whole))
-    *part = copysign(longest, whole);
 #ifdef CONTACTS_IN_SPACE
+  real by_slips = longest;
   TRY(renew_slips(step, left, &by_slips));
+  longest = fmin(longest, by_slips);
 #endif
-  if (by_slips < longest)
-    *part = copysign(by_slips, whole);
   for (int k = 0; k < EVENT_MODES; k++)
     is_taken &= taken[k] == step->watch->mode[k];
+#endif
+  if (longest < fabs(whole))
+    *part = copysign(longest, whole);
   if (*part == whole && is_taken)
     return OK;
   TRY(evaluate_functions(step, left, values_at(step, 0)));
@@ -365,6 +365,7 @@ static int shorten_part(const event_step *step, event_sample *left, event_sample
   return OK;
 }
 
+#ifdef EVENT_CONTACTS
 /* Whether the stage equations of a part of a step were not solved, of which those of its half may be: of slow slips and
  * nearly straight legs. */
 static int may_be_halved(const event_step *step, int status, real part, real pace)
@@ -380,14 +381,17 @@ static int may_be_halved(const event_step *step, int status, real part, real pac
 /* Compares changes of the speeds of slips whose friction varies, in a part of an adaptive step up to `at`, with moments
  * of their rates, integral of s' dt = s(T) - s(0) and of t/T s' dt = s(T) - mean of s, by a quadrature of more points
  * than those of the part, and both ends: stages do not see the friction of slow slips just before a stop. One moment
- * may be right by chance. Errors are relative to the slip of the part, in space to the fastest so far: near a stop its
- * direction turns like a power of the time that is left, which no part resolves. Rounding is that of forces that
- * cancel. */
+ * may be right by chance. Errors are relative to what friction takes of the slip in the part, so that those of all
+ * parts amount to friction that is off by the tolerance; in space to the fastest slip so far: near a stop its direction
+ * turns like a power of the time that is left, which no part resolves. Rounding is that of forces that cancel, and of
+ * the speed by the momenta of all bodies, at which iterations of a step end. */
 static int judge_slips(const event_step *step, const event_sample *left, const event_sample *at, real part,
     real tolerance)
 {
-  real missed[EVENT_CONTACTS][2] = {{0.0}}, fastest[EVENT_CONTACTS] = {0.0}, rounding[EVENT_CONTACTS] = {0.0};
+  const real least = CHANGE_SAFETY * DBL_EPSILON;
+  real missed[EVENT_CONTACTS][2] = {{0.0}}, taken[EVENT_CONTACTS] = {0.0}, rounding[EVENT_CONTACTS] = {0.0};
   real force[CONTACT_ROWS], second[CONTACT_ROWS];
+  int exact = 1;
   contact_mode mode[EVENT_CONTACTS];
   contact_terms of;
   for (int j = 0; j < CONTACT_KNOTS; j++) {
@@ -397,51 +401,64 @@ static int judge_slips(const event_step *step, const event_sample *left, const e
       TRY(step_from_left(step, left, CONTACT_KNOT[j] * part, &knot));
     TRY(terms_at(step, starts ? left : ends ? at : &knot, &of));
     modes_at(&of, step->watch->mode, mode);
-    solve_contacts(&of, mode, of.second, force, second, NULL);
+    exact &= solve_contacts(&of, mode, of.second, force, second, NULL) <= CONTACT_OUTSIDE;
     for (int k = 0; k < EVENT_CONTACTS; k++) {
       const int first = CONTACTS[k].tangential, is_judged = CONTACTS[k].varies && mode[k].closed && !mode[k].sticks;
       const real speed = is_judged ? length_of(of.rate + first, CONTACTS[k].slips) : 0.0;
       real rate = 0.0;
       for (int i = 0; is_judged && i < CONTACTS[k].slips; i++) {
         rate += (speed > 0.0 ? of.rate[first + i] / speed : mode[k].direction[i]) * second[first + i];
-        rounding[k] = fmax(rounding[k], CHANGE_SAFETY * DBL_EPSILON * of.second_terms[first + i] * fabs(part));
+        rounding[k] = fmax(rounding[k], least * fmax(of.second_terms[first + i] * fabs(part), of.speed[first + i]));
       }
       missed[k][0] += CONTACT_WEIGHT[j] * part * rate + (starts - ends) * speed;
       missed[k][1] += CONTACT_WEIGHT[j] * (CONTACT_KNOT[j] * part * rate + speed) - ends * speed;
-      fastest[k] = fmax(fastest[k], speed);
+      if (is_judged)
+        taken[k] += CONTACT_WEIGHT[j] * fabs(part) * length_of(force + first, CONTACTS[k].slips) *
+            of.W[first * (CONTACT_ROWS + 1)];
     }
   }
   for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const real size = fmax(CONTACTS[k].slips > 1 ? step->watch->fastest[k] : 0.0, fastest[k]);
-    const real allowed = fmax(tolerance, CHANGE_SAFETY * DBL_EPSILON) * size + rounding[k];
-    if (fmax(fabs(missed[k][0]), fabs(missed[k][1])) > allowed)
-      return 0.5 * fabs(part) > CONTACT_UNSOLVED * step->watch->pace ? NOT_CONVERGED : OK;
+    const real size = CONTACTS[k].slips > 1 ? step->watch->fastest[k] : taken[k];
+    for (int i = 0; i < 2; i++)
+      exact &= fabs(missed[k][i]) <= tolerance * size + rounding[k];
   }
-  return OK;
+  return exact || 0.5 * fabs(part) <= CONTACT_UNSOLVED * step->watch->pace ? OK : NOT_CONVERGED;
 }
 #endif
 
-#ifdef EVENT_KINKS
-/* Lets the error of a run contain that of a part of a fixed step, which is that of all of its parts, relative to the
- * motion of the part: a short one in a stiff wall may change the velocity of all that follows. */
-static int observe_part(event_run *run, const event_step *step, const event_sample *left, real part)
+/* Lets the error of a run contain that of a part of a fixed step which a change bounds, up to `at`: the difference from
+ * its two halves, without rounding, of positions and of velocities in the length of the step, relative to the motion in
+ * it. A short part in a stiff wall may change the velocity of all that follows. */
+static int judge_part(event_run *run, const event_step *step, const event_sample *left, const event_sample *at,
+    real part)
 {
+  const real duration = fabs(step->whole);
+  real *const v = step->memory + 2 * M, *const v_at = v + M, far = 0.0, fast = DBL_MIN, error = 0.0;
+  event_sample middle = {.t = left->t + 0.5 * part, .q = v, .p = v_at};
+  event_sample end = {.q = step->memory, .p = step->memory + M};
   event_run own = *run;
-  real t, *const q = step->memory, *const p = q + M;
-  int iterations;
-  solver_report report;
-  set_run(&own, left->t, left);
-  own.h = part;
-  own.t_low = own.error = own.largest_motion = 0.0;
-  const int status = NAME(advance)(&own, 1, 1, step->parameters, step->options, &t, q, p, &iterations, &report,
-      step->workspace);
-  if (status == OK && own.error > run->error) {
-    run->error = own.error;
+  if (!(NAME(step_error)(run) >= 0.0)) /* the method has no estimate */
+    return OK;
+  TRY(step_from_left(step, left, 0.5 * part, &middle));
+  TRY(step_from_left(step, &middle, 0.5 * part, &end));
+  TRY(NAME(velocity)(at->t, at->q, at->p, step->parameters, v_at, step->workspace));
+  TRY(NAME(velocity)(at->t, end.q, end.p, step->parameters, v, step->workspace));
+  for (int i = 0; i < M; i++) {
+    far = fmax(far, fabs(at->q[i]));
+    fast = fmax(fast, fmax(fabs(v[i]), fabs(v_at[i])));
+  }
+  const real rounding = CHANGE_SAFETY * DBL_EPSILON * far * (1.0 + duration / fabs(part));
+  for (int i = 0; i < M; i++) {
+    const real apart = fabs(end.q[i] - at->q[i]) + duration * fabs(v[i] - v_at[i]);
+    error = fmax(error, (apart - rounding) / (duration * (fmax(fabs(v[i]), fabs(v_at[i])) + fast)));
+  }
+  own.error = 2.0;
+  if (error > NAME(step_error)(run)) {
+    run->error = pow(error, 1.0 / log2(NAME(step_error)(&own))); /* of which step_error is a power */
     run->error_t = left->t;
   }
-  return status;
+  return OK;
 }
-#endif
 
 /* Sets the state of a run after a change: of an adaptive step, or of the last part of a fixed one. */
 static void end_at_change(event_run *run, const event_run *before, const event_sample *at, int ends, int adaptive)
@@ -474,6 +491,20 @@ static int search_crossings(const event_step *step, const event_sample *left, co
 #endif
   return OK;
 }
+
+#ifdef EVENT_KINKS
+/* Twice the time to the first of the crossings from `first` on that changes the state, if it is before the first inner
+ * node of the search: behind kinks, in stiff walls, others before it may have been missed. INFINITY otherwise. */
+static real resolved_part(const event_step *step, long long first)
+{
+  real fraction = INFINITY;
+  for (long long i = first; i < *step->filled; i++)
+    if (step->watch->acts[step->found[i].function])
+      fraction = fmin(fraction, step->found[i].fraction);
+  const real part = fabs(step->h) * fraction;
+  return fraction < EVENT_NODES[1] && part > EVENT_TIE * fabs(step->whole) ? 2.0 * part : INFINITY;
+}
+#endif
 
 /* Changes a state at the crossings from `first` on: by impacts, then sides of kinks and modes of contacts. */
 static int change_at(const event_step *step, long long first, event_sample *at)
@@ -536,26 +567,21 @@ static int settle_part(const event_step *step, long long first, const event_samp
   return settle_crossings(step, first);
 }
 
-/* Fails if errors of a part up to `at` are too large; notes those of parts of a fixed step. */
+/* Fails if errors of a part up to `at` are too large; notes those of parts of a fixed step that changes bound. */
 static int judge_end(const event_step *step, event_run *run, const event_sample *left, const event_sample *at,
-    real part, const step_control *control, int changes)
+    real part, const step_control *control, int is_bounded)
 {
 #if defined(CONTACTS_VARY) && EVENTS_CONTROLLED
   if (control)
     TRY(judge_slips(step, left, at, part, control->tolerance));
 #endif
-#ifdef EVENT_KINKS
-  if (!control && changes)
-    TRY(observe_part(run, step, left, part));
-#endif
-  (void)step, (void)run, (void)left, (void)at, (void)part, (void)control, (void)changes;
-  return OK;
+  return !control && is_bounded ? judge_part(run, step, left, at, part) : OK;
 }
 
-/* Changes the state at the start of a run, of which a step of some length ends at `right`; *starts: whether there are
- * changes, *ends: whether the step ends with them. */
-static int change_start(const event_run *before, event_run *run, event_step *step, int adaptive, real length,
-    const stored_states *to, event_sample *left, event_sample *right, int *starts, int *ends)
+/* Changes the state at the start of a run; *starts: whether there are changes, *ends: whether the step ends with
+ * them. */
+static int change_start(const event_run *before, event_run *run, event_step *step, int adaptive,
+    const stored_states *to, event_sample *left, int *starts, int *ends)
 {
   *starts = *ends = 0;
   if (before->step == 0 && ANY_IMPACTS)
@@ -564,12 +590,9 @@ static int change_start(const event_run *before, event_run *run, event_step *ste
     return OK;
   TRY(store_state(to, left, 0.0, 0, adaptive ? before->step + 1 : -1, step->report));
   *ends = adaptive || step->watch->ended;
-  if (*ends) {
+  if (*ends)
     end_at_change(run, before, left, 0, adaptive);
-    return OK;
-  }
-  TRY(evaluate_functions(step, left, values_at(step, 0)));
-  return step_from_left(step, left, length, right);
+  return OK;
 }
 
 /* Stores the state after a part of a step of which a length is left; *ends: whether the step ends there. */
@@ -596,9 +619,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
   real *const states = step->memory + 9 * M;
   event_sample left = {.t = before->t, .q = states, .p = states + M};
   event_sample right = {.fraction = 1.0, .t = run->t, .q = states + 2 * M, .p = states + 3 * M};
-#ifdef EVENT_CONTACTS
   real longest = INFINITY;
-#endif
   step->whole = step->h = length;
 #ifdef CONTACTS_IN_SPACE
   step->whole = adaptive ? fmax(length, step->watch->pace) : length;
@@ -606,16 +627,14 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
   copy_state(left.q, left.p, before->q, before->p);
   copy_state(right.q, right.p, run->q, run->p);
   TRY(evaluate_functions(step, &left, values_at(step, 0)));
-  TRY(change_start(before, run, step, adaptive, length, to, &left, &right, &starts, &ends));
+  TRY(change_start(before, run, step, adaptive, to, &left, &starts, &ends));
   for (int changes = starts; !ends; changes++) {
     event_sample at = {.q = states + 4 * M, .p = states + 5 * M};
     real part = length;
-    int acts = 0, cut = 0, status = OK;
-#ifdef EVENT_CONTACTS
+    int acts = 0, cut, status = OK;
     if (!adaptive)
       status = shorten_part(step, &left, &right, run, changes, longest, &part);
     cut = part != length;
-#endif
     const long long first = *step->filled;
     long long group = first;
     step->t = left.t;
@@ -624,8 +643,15 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     step->p = left.p;
     if (status == OK)
       status = search_crossings(step, &left, &right);
-#ifdef EVENT_CONTACTS
     longest = INFINITY;
+#ifdef EVENT_KINKS
+    longest = status == OK && !adaptive ? resolved_part(step, first) : INFINITY;
+    if (longest < INFINITY) {
+      *step->filled = first;
+      continue;
+    }
+#endif
+#ifdef EVENT_CONTACTS
     if (!adaptive && may_be_halved(step, status, part, 0.0)) {
       int again;
       *step->filled = first;
@@ -651,7 +677,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       part *= step->found[group].fraction;
       TRY(refine_crossing(step, group, &right, &at, &part));
     }
-    TRY(judge_end(step, run, &left, stops ? &at : &right, part, control, changes > 0 || acts));
+    TRY(judge_end(step, run, &left, stops ? &at : &right, part, control, acts || (changes > 0 && !cut)));
     step->watch->time += part;
     cut &= !stops;
     if (cut) {
@@ -681,10 +707,6 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     }
     left.t = at.t;
     copy_state(left.q, left.p, at.q, at.p);
-#ifndef EVENT_CONTACTS /* which shorten the next part first */
-    TRY(evaluate_functions(step, &left, values_at(step, 0)));
-    TRY(step_from_left(step, &left, length, &right));
-#endif
   }
   return OK;
 }
