@@ -217,6 +217,10 @@ def test_metropolis_with_a_magnetic_field_has_a_direction_variable():
         return np.stack([q[..., 0], q[..., 0] ** 2, q[..., 1] ** 2], axis=-1)
 
     assert agrees(*averages(charge, [0, 0], 0.8, 6000, observe, metropolis=True), exact, 0.02)
+    start = {"q": [[0.0, 0.0]], "velocity": [[0.0, 0.0]], "h": 0.1, "steps": 3, "observe": "extremes"}
+    with pytest.raises(sc.MethodError, match="observe='extremes' is not available with metropolis=True"):
+        charge.integrate_ensemble(**start, metropolis=True)
+    assert np.isfinite(charge.integrate_ensemble(**start).q).all()
 
 
 @pytest.mark.tiers(0, 1)

@@ -20,7 +20,15 @@ from scvi_codegen.codegen.native.arguments import empty_array
 from scvi_codegen.codegen.native.binding import Binding
 from scvi_codegen.codegen.native.capacity import TOO_MANY_STATES, room_for_states, too_many_states
 from scvi_codegen.codegen.native.options import FAILURES
-from scvi_codegen.common.errors import AccuracyWarning, EventError, StateError, StepFailedError, of_trajectory, warn
+from scvi_codegen.common.errors import (
+    AccuracyWarning,
+    EventError,
+    MethodError,
+    StateError,
+    StepFailedError,
+    of_trajectory,
+    warn,
+)
 from scvi_codegen.common.thread_pool import StopCheck, run_jobs
 from scvi_codegen.common.validation import LARGEST_COUNT
 from scvi_codegen.runs.accuracy.global_error import GlobalError
@@ -385,13 +393,19 @@ def _binding_of_lanes(ensemble: Ensemble, observation: EnsembleObservation | Non
     constraints whose actions are summed, of inputs in two words, and where a rule of Metropolis has no lanes.
     """
     stepper, interface, inputs = ensemble.stepper, ensemble.stepper.interface, ensemble.inputs
-    if observation is not None:
-        return observation.binding
-    if (inputs and (interface.constraints or interface.words > 1)) or (interface.constraints and stepper.sums_action):
+    has_inputs = bool(inputs and (interface.constraints or interface.words > 1))
+    if observation is None and (has_inputs or (interface.constraints and stepper.sums_action)):
         return None
     binding: Binding | None = (
-        stepper._binding_in_single if ensemble.settings.precision == "single" else stepper._ensemble_binding
+        observation.binding
+        if observation is not None
+        else (stepper._binding_in_single if ensemble.settings.precision == "single" else stepper._ensemble_binding)
     )
-    if binding is not None and ensemble.noise.metropolis and not binding.constant("HAS_METROPOLIS"):
+    if binding is None or not ensemble.noise.metropolis or binding.constant("HAS_METROPOLIS"):
+        return binding
+    if observation is None:
         return None
-    return binding
+    raise MethodError(
+        f"observe={observation.name!r} is not available with metropolis=True in ensembles of '{stepper.title}', whose "
+        "rule of Metropolis has no SIMD lanes: observe each trajectory by integrate"
+    )

@@ -217,8 +217,7 @@ static int linearise_step(contact_step *in, real *x)
   for (int i = 0; i < M; i++) {
     x[i] = in->p[i] + 0.5 * (in->h * in->first.force[i] - in->first.momentum[i] - in->last.momentum[i]);
     for (int j = 0; j < M; j++)
-      A[i][j] = 0.5 * ((in->first.by_state[i][M + j] + in->last.by_state[i][M + j]) / in->h +
-          in->last.by_state[i][j] - in->first.by_state[M + i][M + j]);
+      A[i][j] = 0.5 * ((in->first.by_state[i][M + j] + in->last.by_state[i][M + j]) / in->h + in->last.by_state[i][j] - in->first.by_state[M + i][M + j]);
   }
   for (int c = 0; c < STEP_FIXED; c++)
     x[M + c] = -in->end.value[c];
@@ -232,8 +231,7 @@ static int find_near(contact_step *in, const contact_memory *from, const real *x
 {
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
-    if (in->exists[k] && !in->is_near[k] && (normal < 0 || from->pushes[k] ||
-        in->end.value[row] + times_row(in->end.G[row], x) < reach))
+    if (in->exists[k] && !in->is_near[k] && (normal < 0 || from->pushes[k] || in->end.value[row] + times_row(in->end.G[row], x) < reach))
       TRY(join(in, k, &in->start, from->sticks[k]));
   }
   return OK;
@@ -540,8 +538,7 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   clear_problem(in);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
-    if (in->exists[k] && (normal < 0 || in->pushes[k] ||
-        in->end.value[row] <= CONTACT_LOWEST * DBL_EPSILON * size_by_position(in->end.G[row], in->q1)))
+    if (in->exists[k] && (normal < 0 || in->pushes[k] || in->end.value[row] <= CONTACT_LOWEST * DBL_EPSILON * size_by_position(in->end.G[row], in->q1)))
       TRY(join(in, k, &in->end, from.sticks[k] && !in->has_begun[k]));
   }
   respond(in, &in->moving, &in->end, &in->response);
@@ -627,8 +624,7 @@ static int find_existing(contact_step *in, const contact_memory *from, real *wor
     if (TRANSITION[i][1] != CONTACT_CLOSES || !IS_CONDITIONAL[event])
       continue;
     TRY(conditions(EVENT_FIRST[event], in->t, in->q, in->p, in->idle, &exists, workspace));
-    in->exists[k] = exists && (from->exists[k] ||
-        in->start.value[row] >= -CONTACT_PENETRATION * size_by_position(in->start.G[row], in->q));
+    in->exists[k] = exists && (from->exists[k] || in->start.value[row] >= -CONTACT_PENETRATION * size_by_position(in->start.G[row], in->q));
   }
   return OK;
 }

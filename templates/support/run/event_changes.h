@@ -399,7 +399,9 @@ static int judge_slips(const event_step *step, const event_sample *left, const e
     const int starts = j == 0, ends = j == CONTACT_KNOTS - 1;
     if (!starts && !ends)
       TRY(step_from_left(step, left, CONTACT_KNOT[j] * part, &knot));
-    TRY(terms_at(step, starts ? left : ends ? at : &knot, &of));
+    TRY(terms_at(step, starts ? left : ends ? at
+                                            : &knot,
+        &of));
     modes_at(&of, step->watch->mode, mode);
     exact &= solve_contacts(&of, mode, of.second, force, second, NULL) <= CONTACT_OUTSIDE;
     for (int k = 0; k < EVENT_CONTACTS; k++) {
