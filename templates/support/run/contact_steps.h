@@ -217,7 +217,9 @@ static int linearise_step(contact_step *in, real *x)
   for (int i = 0; i < M; i++) {
     x[i] = in->p[i] + 0.5 * (in->h * in->first.force[i] - in->first.momentum[i] - in->last.momentum[i]);
     for (int j = 0; j < M; j++)
-      A[i][j] = 0.5 * ((in->first.by_state[i][M + j] + in->last.by_state[i][M + j]) / in->h + in->last.by_state[i][j] - in->first.by_state[M + i][M + j]);
+      A[i][j] = 0.5 *
+          ((in->first.by_state[i][M + j] + in->last.by_state[i][M + j]) / in->h + in->last.by_state[i][j] -
+              in->first.by_state[M + i][M + j]);
   }
   for (int c = 0; c < STEP_FIXED; c++)
     x[M + c] = -in->end.value[c];
@@ -231,10 +233,29 @@ static int find_near(contact_step *in, const contact_memory *from, const real *x
 {
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
-    if (in->exists[k] && !in->is_near[k] && (normal < 0 || from->pushes[k] || in->end.value[row] + times_row(in->end.G[row], x) < reach))
+    if (in->exists[k] && !in->is_near[k] &&
+        (normal < 0 || from->pushes[k] || in->end.value[row] + times_row(in->end.G[row], x) < reach))
       TRY(join(in, k, &in->start, from->sticks[k]));
   }
   return OK;
+}
+
+/* Constants of the rows of a problem of positions: gaps at the end over the step, and slips along it. */
+static void pose_positions(contact_step *in, const real *x)
+{
+  cone_problem *const of = &in->problem;
+  for (int k = 0; k < of->contacts; k++) {
+    int row[3];
+    for (int i = rows_of(in->place + k, row) - 1; i >= 0; i--) {
+      const int r = row[i], all = in->row[r], is_gap = r == in->place[k].normal;
+      real b = is_gap ? in->end.value[all] : 0.0;
+      for (int m = 0; m < M; m++)
+        b += in->end.G[all][m] * x[m] +
+            (is_gap ? 0.0 : 0.5 * (in->start.G[all][m] + in->end.G[all][m]) * (in->q1[m] - in->q[m]));
+      of->b[r] = b / in->h + (is_gap ? 0.0 : 0.5 * (in->start.drift[all] + in->end.drift[all]));
+      of->terms[r] = fabs(of->b[r]);
+    }
+  }
 }
 
 /* Rates b + W f of the first problem at a change x, at first static friction where slips rest; *slow: whether a row
@@ -258,18 +279,7 @@ static int solve_positions(contact_step *in, const contact_memory *from, const r
       yields += in->start.G[in->row[r]][i] * at->x[i][r];
     *slow |= in->W[r * (CONTACT_ROWS + 1)] < STEP_YIELDS * yields;
   }
-  for (int k = 0; k < of->contacts; k++) {
-    int row[3];
-    for (int i = rows_of(in->place + k, row) - 1; i >= 0; i--) {
-      const int r = row[i], all = in->row[r], is_gap = r == in->place[k].normal;
-      real b = is_gap ? in->end.value[all] : 0.0;
-      for (int m = 0; m < M; m++)
-        b += in->end.G[all][m] * x[m] +
-            (is_gap ? 0.0 : 0.5 * (in->start.G[all][m] + in->end.G[all][m]) * (in->q1[m] - in->q[m]));
-      of->b[r] = b / in->h + (is_gap ? 0.0 : 0.5 * (in->start.drift[all] + in->end.drift[all]));
-      of->terms[r] = fabs(of->b[r]);
-    }
-  }
+  pose_positions(in, x);
   if (*slow) { /* b + W f of the present forces stays */
     for (int r = 0; r < of->rows; r++)
       of->b[r] = cone_rate(of, r);
@@ -538,7 +548,9 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   clear_problem(in);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
-    if (in->exists[k] && (normal < 0 || in->pushes[k] || in->end.value[row] <= CONTACT_LOWEST * DBL_EPSILON * size_by_position(in->end.G[row], in->q1)))
+    if (in->exists[k] &&
+        (normal < 0 || in->pushes[k] ||
+            in->end.value[row] <= CONTACT_LOWEST * DBL_EPSILON * size_by_position(in->end.G[row], in->q1)))
       TRY(join(in, k, &in->end, from.sticks[k] && !in->has_begun[k]));
   }
   respond(in, &in->moving, &in->end, &in->response);
@@ -624,7 +636,9 @@ static int find_existing(contact_step *in, const contact_memory *from, real *wor
     if (TRANSITION[i][1] != CONTACT_CLOSES || !IS_CONDITIONAL[event])
       continue;
     TRY(conditions(EVENT_FIRST[event], in->t, in->q, in->p, in->idle, &exists, workspace));
-    in->exists[k] = exists && (from->exists[k] || in->start.value[row] >= -CONTACT_PENETRATION * size_by_position(in->start.G[row], in->q));
+    in->exists[k] = exists &&
+        (from->exists[k] ||
+            in->start.value[row] >= -CONTACT_PENETRATION * size_by_position(in->start.G[row], in->q));
   }
   return OK;
 }

@@ -545,19 +545,31 @@ static long long last_state(const event_step *step, long long first)
   return first;
 }
 
-#ifdef EVENT_CONTACTS
-/* Whether an unsolved part of a fixed step is taken again: a half of it, or whole without a contact that others nearly
- * hold. */
-static int takes_again(const event_step *step, event_sample *left, real part, real *longest, int *again)
+/* Whether a part of a fixed step is taken again, of which crossings from `first` on were found: up to `longest`, where
+ * others before them may have been missed or its stage equations were not solved; or whole without a contact that
+ * others nearly hold. */
+static int takes_again(const event_step *step, event_sample *left, int status, real part, long long first,
+    real *longest, int *again)
 {
-  *longest = 0.5 * fabs(part);
-  *again = *longest > CONTACT_UNSOLVED * fabs(step->whole);
-  if (*again)
-    return OK;
   *longest = INFINITY;
-  return open_nearly_held(step, left, again);
-}
+#ifdef EVENT_KINKS
+  *longest = status == OK ? resolved_part(step, first) : INFINITY;
 #endif
+  *again = *longest < INFINITY;
+#ifdef EVENT_CONTACTS
+  if (!*again && may_be_halved(step, status, part, 0.0)) {
+    *step->filled = first;
+    *again = 0.5 * fabs(part) > CONTACT_UNSOLVED * fabs(step->whole);
+    if (!*again)
+      return open_nearly_held(step, left, again);
+    *longest = 0.5 * fabs(part);
+  }
+#endif
+  if (*again)
+    *step->filled = first;
+  (void)left, (void)part;
+  return OK;
+}
 
 /* Finds the crossings of a part of a step, those from `first` on, up to its end `right`. */
 static int settle_part(const event_step *step, long long first, const event_sample *right)
@@ -633,7 +645,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
   for (int changes = starts; !ends; changes++) {
     event_sample at = {.q = states + 4 * M, .p = states + 5 * M};
     real part = length;
-    int acts = 0, cut, status = OK;
+    int acts = 0, again = 0, cut, status = OK;
     if (!adaptive)
       status = shorten_part(step, &left, &right, run, changes, longest, &part);
     cut = part != length;
@@ -645,23 +657,10 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     step->p = left.p;
     if (status == OK)
       status = search_crossings(step, &left, &right);
-    longest = INFINITY;
-#ifdef EVENT_KINKS
-    longest = status == OK && !adaptive ? resolved_part(step, first) : INFINITY;
-    if (longest < INFINITY) {
-      *step->filled = first;
+    if (!adaptive)
+      TRY(takes_again(step, &left, status, part, first, &longest, &again));
+    if (again)
       continue;
-    }
-#endif
-#ifdef EVENT_CONTACTS
-    if (!adaptive && may_be_halved(step, status, part, 0.0)) {
-      int again;
-      *step->filled = first;
-      TRY(takes_again(step, &left, part, &longest, &again));
-      if (again)
-        continue;
-    }
-#endif
     step->rounding_known |= !step->watch->started;
     if (status == OK)
       status = settle_part(step, first, &right);
