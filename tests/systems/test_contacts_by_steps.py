@@ -229,7 +229,7 @@ def test_what_runs_by_steps_lack_is_refused_by_name(name: str) -> None:
 @pytest.mark.second
 def test_quantities_of_located_runs_are_refused_after_steps() -> None:
     run = box().integrate([0.0, 1.0, 0.0], velocity=[0, 0, 0], h=0.01, t_end=1.0, **BY_STEPS)
-    for ask in (run.sensitivity, run.work, run.energy_error, lambda: run.error, lambda: run.crossings("a")):
+    for ask in (run.work, run.energy_error, lambda: run.error, lambda: run.crossings("a")):
         with pytest.raises((sc.MethodError, sc.StateError)):
             ask()
     with pytest.raises(sc.MethodError, match="stepper by steps"):

@@ -494,17 +494,30 @@ static int search_crossings(const event_step *step, const event_sample *left, co
   return OK;
 }
 
+/* Searches of a part of a fixed step: the first one, a second one up to twice the first change behind kinks, and that
+ * whose first change stands, since the second found none: it is of the size of rounding. */
+enum { FIRST_SEARCH,
+  SECOND_SEARCH,
+  FOUND_ALONE };
+
 #ifdef EVENT_KINKS
 /* Twice the time to the first of the crossings from `first` on that changes the state, if it is before the first inner
  * node of the search: behind kinks, in stiff walls, others before it may have been missed. INFINITY otherwise. */
-static real resolved_part(const event_step *step, long long first)
+static real resolved_part(const event_step *step, long long first, int *search)
 {
   real fraction = INFINITY;
   for (long long i = first; i < *step->filled; i++)
     if (step->watch->acts[step->found[i].function])
       fraction = fmin(fraction, step->found[i].fraction);
   const real part = fabs(step->h) * fraction;
-  return fraction < EVENT_NODES[1] && part > EVENT_TIE * fabs(step->whole) ? 2.0 * part : INFINITY;
+  if (*search == SECOND_SEARCH && fraction == INFINITY) {
+    *search = FOUND_ALONE;
+    return fabs(step->whole);
+  }
+  if (*search == FOUND_ALONE || !(fraction < EVENT_NODES[1] && part > EVENT_TIE * fabs(step->whole)))
+    return INFINITY;
+  *search = SECOND_SEARCH;
+  return 2.0 * part;
 }
 #endif
 
@@ -548,12 +561,12 @@ static long long last_state(const event_step *step, long long first)
 /* Whether a part of a fixed step is taken again, of which crossings from `first` on were found: up to `longest`, where
  * others before them may have been missed or its stage equations were not solved; or whole without a contact that
  * others nearly hold. */
-static int takes_again(const event_step *step, event_sample *left, int status, real part, long long first,
+static int takes_again(const event_step *step, event_sample *left, int status, real part, long long first, int *search,
     real *longest, int *again)
 {
   *longest = INFINITY;
 #ifdef EVENT_KINKS
-  *longest = status == OK ? resolved_part(step, first) : INFINITY;
+  *longest = status == OK ? resolved_part(step, first, search) : INFINITY;
 #endif
   *again = *longest < INFINITY;
 #ifdef EVENT_CONTACTS
@@ -567,7 +580,7 @@ static int takes_again(const event_step *step, event_sample *left, int status, r
 #endif
   if (*again)
     *step->filled = first;
-  (void)left, (void)part;
+  (void)left, (void)part, (void)search;
   return OK;
 }
 
@@ -629,7 +642,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     real length, int iterations, const stored_states *to)
 {
   const int adaptive = control != NULL;
-  int starts, ends;
+  int starts, ends, search = FIRST_SEARCH;
   real *const states = step->memory + 9 * M;
   event_sample left = {.t = before->t, .q = states, .p = states + M};
   event_sample right = {.fraction = 1.0, .t = run->t, .q = states + 2 * M, .p = states + 3 * M};
@@ -658,9 +671,10 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     if (status == OK)
       status = search_crossings(step, &left, &right);
     if (!adaptive)
-      TRY(takes_again(step, &left, status, part, first, &longest, &again));
+      TRY(takes_again(step, &left, status, part, first, &search, &longest, &again));
     if (again)
       continue;
+    search = FIRST_SEARCH;
     step->rounding_known |= !step->watch->started;
     if (status == OK)
       status = settle_part(step, first, &right);
