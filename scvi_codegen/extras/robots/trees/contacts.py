@@ -24,7 +24,7 @@ from scvi_codegen.extras.robots.trees.document import Element
 from scvi_codegen.extras.robots.trees.energies import exact_number
 from scvi_codegen.extras.robots.trees.shapes import shape_of, size_of
 from scvi_codegen.extras.robots.trees.tendons import rate_of
-from scvi_codegen.extras.robots.trees.tree import Link, Pose, Vector
+from scvi_codegen.extras.robots.trees.tree import Link, Pose, Vector, times
 from scvi_codegen.systems.contact import Contact, Friction, contact
 
 PARTS = {"capsule": "end", "box": "corner"}
@@ -118,7 +118,7 @@ class Pair(NamedTuple):
         friction = self.friction if self.dimensions > 1 else None
         spheres = body.spheres() if plane.shape == "plane" else []
         for number, (center, radius) in enumerate(spheres, start=1):
-            at = body.pose.position + body.pose.rotation @ center
+            at = body.pose.position + times(body.pose.rotation, center)
             world = at_reference(links, plane.link) @ plane.pose
             part = f"{PARTS[body.shape]} {number} of " if len(spheres) > 1 else ""
             yield Touch(f"{part}{body.title} on {plane.title}", body.link, at, radius, world, friction)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import re
 import stat
 from collections import defaultdict
@@ -140,7 +141,7 @@ class Element:
     def unit(self, key: str, default: Sequence[float] | None = None) -> Vector:
         """Return an attribute as a vector of length 1."""
         vector = self.vector(key, default)
-        length = float(np.linalg.norm(vector))
+        length = math.hypot(*vector)
         if length == 0:
             self.refuse(f"has {key}='{self.text(key)}', which must not be zero")
         return vector / length

@@ -50,7 +50,7 @@ from scvi_codegen.extras.robots.trees.shapes import (
 )
 from scvi_codegen.extras.robots.trees.sources import document_of, merged
 from scvi_codegen.extras.robots.trees.tendons import Tendon, length_of, mean_inverses, reference_length
-from scvi_codegen.extras.robots.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, named
+from scvi_codegen.extras.robots.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, named, times
 
 PARTS = {"limits": "limits", "friction": "dry friction"}
 SLIDING = 3
@@ -180,7 +180,7 @@ class _MujocoModel:
         above, anchor = self.carriers[parent], np.zeros(3)
         for count, (joint, frame) in enumerate(joints):
             free = joint.tag == "freejoint" or joint.text("type", "hinge") == "free"  # has no place in the body
-            at = np.zeros(3) if free else frame.position + frame.rotation @ joint.vector("pos", (0, 0, 0))
+            at = np.zeros(3) if free else frame.position + times(frame.rotation, joint.vector("pos", (0, 0, 0)))
             moved = pose @ Pose(at - anchor)
             label = joint.node.get("name") or (name if count == 0 else f"{name}_{count + 1}")
             self.put(joint, len(self.links), Pose())
@@ -465,7 +465,7 @@ class _MujocoModel:
             name=name,
             kind=kind,
             pose=pose,
-            axis=frame.rotation @ joint.unit("axis", (0, 0, 1)) if kind in SINGLE else np.zeros(3),
+            axis=times(frame.rotation, joint.unit("axis", (0, 0, 1))) if kind in SINGLE else np.zeros(3),
             damping=damping,
             stiffness=stiffness,
             rest=rest * turn,

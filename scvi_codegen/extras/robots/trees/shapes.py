@@ -3,6 +3,7 @@
 https://mujoco.readthedocs.io/en/stable/modeling.html#frame-orientations
 """
 
+import math
 import re
 from collections.abc import Callable
 from xml.etree.ElementTree import Element as Node
@@ -12,7 +13,7 @@ import numpy as np
 from scvi_codegen.extras.robots.trees.document import Element
 from scvi_codegen.extras.robots.trees.meshes import inertia_of
 from scvi_codegen.extras.robots.trees.schema import TURN
-from scvi_codegen.extras.robots.trees.tree import Inertia, Pose, Vector, about, rotation_by
+from scvi_codegen.extras.robots.trees.tree import Inertia, Pose, Vector, about, rotation_by, times
 
 ORIENTATIONS = TURN.split()
 AXES = dict(zip("xyz", np.eye(3), strict=True))
@@ -26,7 +27,7 @@ def pose_of(element: Element) -> Pose:
         element.refuse("has pos and fromto: one is needed")
     ends = element.vector("fromto", sizes=(6,))
     line = ends[:3] - ends[3:]
-    length = float(np.linalg.norm(line))
+    length = math.hypot(*line)
     if length == 0:
         element.refuse("has fromto, which needs two different points")
     return Pose((ends[:3] + ends[3:]) / 2, _shortest_turn(line / length))
@@ -42,7 +43,7 @@ def rotation_of(element: Element) -> Vector:
         return of_quaternion(element, element.vector("quat", sizes=(4,)))
     if kind == "axisangle":
         *axis, angle = element.vector("axisangle", sizes=(4,))
-        length = float(np.linalg.norm(axis))
+        length = math.hypot(*axis)
         if length == 0:
             element.refuse("has an axis of length 0")
         return about(np.array(axis) / length, angle * unit_of_angles(element))
@@ -53,14 +54,14 @@ def rotation_of(element: Element) -> Vector:
             element.refuse(f"has euler, and eulerseq='{sequence}' is not three of the letters xyzXYZ")
         for letter, angle in zip(sequence, element.vector("euler"), strict=True):
             turned = about(AXES[letter.lower()], angle * unit_of_angles(element))
-            rotation = rotation @ turned if letter.islower() else turned @ rotation
+            rotation = times(rotation, turned) if letter.islower() else times(turned, rotation)
         return rotation
     if kind == "xyaxes":
         axes = element.vector("xyaxes", sizes=(6,))
         z = np.cross(axes[:3], axes[3:])
         if not z.any():
             element.refuse(f"has xyaxes='{element.text('xyaxes')}', which must be two different directions")
-        x, z = axes[:3] / np.linalg.norm(axes[:3]), z / np.linalg.norm(z)
+        x, z = axes[:3] / math.hypot(*axes[:3]), z / math.hypot(*z)
         return np.column_stack([x, np.cross(z, x), z])
     return _shortest_turn(element.unit("zaxis")) if kind else np.eye(3)
 
@@ -80,7 +81,7 @@ def of_quaternion(element: Element, q: Vector) -> Vector:
 def _shortest_turn(axis: Vector) -> Vector:
     """Return the shortest rotation that turns the z axis into a unit vector."""
     across = np.cross([0.0, 0.0, 1.0], axis)
-    length = float(np.linalg.norm(across))
+    length = math.hypot(*across)
     if length < 1e-12:
         return np.diag([1.0, np.sign(axis[2]), np.sign(axis[2])])
     return about(across / length, float(np.arctan2(length, axis[2])))
@@ -152,7 +153,7 @@ def size_of(geom: Element, shape: str) -> Vector:
         ends = geom.vector("fromto", sizes=(6,))
         if shape == "sphere":
             geom.refuse("has fromto, which needs a shape with an axis")
-        size = np.array([size[0]] * (count - 1) + [float(np.linalg.norm(ends[3:] - ends[:3])) / 2])
+        size = np.array([size[0]] * (count - 1) + [math.hypot(*(ends[3:] - ends[:3])) / 2])
     if len(size) < count or (size[:count] <= 0).any():
         geom.refuse(f"is a {shape} and has size='{geom.text('size')}': {count} numbers > 0 are needed")
     return size[:count]

@@ -20,6 +20,7 @@ from scvi_codegen.extras.robots.trees.actuators import as_general, inherited_by
 from scvi_codegen.extras.robots.trees.document import Element, root_of
 from scvi_codegen.extras.robots.trees.schema import MJCF
 from scvi_codegen.extras.robots.trees.shapes import ORIENTATIONS, pose_of
+from scvi_codegen.extras.robots.trees.tree import times
 
 Defaults = dict[str, dict[str, str]]
 """Attributes by kind of element."""
@@ -183,7 +184,7 @@ class Macros:
         for i in range(int(count)):
             affix = "", f"{macro.text('sep', '')}{i:0{len(str(int(count)))}}"
             frames.append(self.copies(macro, macro.children(), affix, inside, referring, pos=position, euler=i * euler))
-            position = position + pose_of(frames[-1]).rotation @ macro.vector("offset", (0, 0, 0))
+            position = position + times(pose_of(frames[-1]).rotation, macro.vector("offset", (0, 0, 0)))
         for section in self.root.children(*SECTIONS):
             for element in section.children():
                 if not inside.isdisjoint(_references(element)):

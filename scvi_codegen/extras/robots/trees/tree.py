@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import unicodedata
 import warnings
@@ -38,12 +39,12 @@ class Pose:
     rotation: Vector = field(default_factory=lambda: np.eye(3))
 
     def __matmul__(self, inner: Pose) -> Pose:
-        return Pose(self.position + self.rotation @ inner.position, self.rotation @ inner.rotation)
+        return Pose(self.position + times(self.rotation, inner.position), times(self.rotation, inner.rotation))
 
     @property
     def inverse(self) -> Pose:
         """Pose of the outer frame in the inner one."""
-        return Pose(-self.rotation.T @ self.position, self.rotation.T)
+        return Pose(-times(self.rotation.T, self.position), self.rotation.T)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,10 +65,10 @@ class Inertia:
 
     def seen_from(self, pose: Pose) -> Inertia:
         """Return the inertia in the frame in which its own frame has the given pose."""
-        turned = pose.rotation @ self.matrix @ pose.rotation.T
-        lift = self.lift[0], self.lift[0] * pose.position + pose.rotation @ self.lift[1]
+        turned = times(times(pose.rotation, self.matrix), pose.rotation.T)
+        lift = self.lift[0], self.lift[0] * pose.position + times(pose.rotation, self.lift[1])
         drag = tuple((pose @ at, law) for at, law in self.drag)
-        return Inertia(self.mass, pose.position + pose.rotation @ self.center, turned, lift, drag)
+        return Inertia(self.mass, pose.position + times(pose.rotation, self.center), turned, lift, drag)
 
     def scaled(self, factor: float) -> Inertia:
         """Return the inertia of a body of another density."""
@@ -83,7 +84,7 @@ class Inertia:
     def about(self, point: Vector) -> Vector:
         """Return the inertia matrix about a point (parallel axis theorem)."""
         arm = self.center - point
-        return self.matrix + self.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        return self.matrix + self.mass * (times(arm, arm) * np.eye(3) - np.outer(arm, arm))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -215,13 +216,13 @@ def aligned(links: Sequence[Link]) -> list[Link]:
         outer = turns[link.parent] if link.parent >= 0 else np.eye(3)
         joint = link.joint
         turn = np.eye(3) if joint.kind not in SINGLE else axes_of(joint.axis)
-        constant = outer.T @ joint.pose.rotation @ turn
+        constant = times(times(outer.T, joint.pose.rotation), turn)
         if joint.kind in SINGLE:
             along, across = constant[2, 1], constant[2, 0]
-            if np.hypot(along, across) > ROUNDED:
-                by = about(np.array([0.0, 0.0, 1.0]), float(np.arctan2(across, along)))
-                turn, constant = turn @ by, constant @ by
-        pose = Pose(without_rounding(outer.T @ joint.pose.position), rounded(constant))
+            if math.hypot(along, across) > ROUNDED:
+                by = about(np.array([0.0, 0.0, 1.0]), math.atan2(across, along))
+                turn, constant = times(turn, by), times(constant, by)
+        pose = Pose(without_rounding(times(outer.T, joint.pose.position)), rounded(constant))
         turns.append(turn)
         inertia = link.inertia.seen_from(Pose(rotation=turn.T))
         center, matrix = without_rounding(inertia.center), without_rounding(inertia.matrix)
@@ -245,15 +246,27 @@ def without_rounding(values: Vector) -> Vector:
 def about(axis: Vector, angle: float) -> Vector:
     """Return the rotation matrix about a unit vector (Rodrigues)."""
     across = hat(axis)
-    rotation: Vector = np.eye(3) + np.sin(angle) * across + (1 - np.cos(angle)) * across @ across
+    rotation: Vector = np.eye(3) + math.sin(angle) * across + (1 - math.cos(angle)) * times(across, across)
     return rotation
 
 
 def rotation_by(q: Vector) -> Vector:
     """Return the rotation matrix of a quaternion of any length but 0."""
-    w, *vector = q / np.linalg.norm(q)
+    w, *vector = q / math.hypot(*q)
     v = np.array(vector)
-    return np.asarray((w * w - v @ v) * np.eye(3) + 2.0 * (np.outer(v, v) + w * hat(v)))
+    return np.asarray((w * w - times(v, v)) * np.eye(3) + 2.0 * (np.outer(v, v) + w * hat(v)))
+
+
+def times(a: Vector, b: Vector) -> Any:
+    """Return the product of matrices and vectors, whose sums are rounded once: the same on every processor.
+
+    BLAS and vectors of sines round otherwise from one processor to the next, so that files would have other programs.
+    """
+    if a.ndim > 1:
+        return np.array([times(row, b) for row in a])
+    if b.ndim > 1:
+        return np.array([times(a, column) for column in b.T])
+    return math.fsum(x * y for x, y in zip(a.tolist(), b.tolist(), strict=True))
 
 
 def hat(v: Vector) -> Vector:
@@ -266,7 +279,7 @@ def axes_of(axis: Vector) -> Vector:
     if abs(axis[2]) > 1 - ROUNDED:
         return np.diag([1.0, np.sign(axis[2]), np.sign(axis[2])])
     x = np.cross([0.0, 0.0, 1.0], axis)
-    x /= np.linalg.norm(x)
+    x /= math.hypot(*x)
     return np.column_stack([x, np.cross(axis, x), axis])
 
 

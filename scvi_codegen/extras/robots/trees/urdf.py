@@ -17,7 +17,18 @@ import numpy as np
 from scvi_codegen.common.errors import closest
 from scvi_codegen.extras.robots.trees.document import Element, Unread, checked_limits, root_of
 from scvi_codegen.extras.robots.trees.schema import URDF
-from scvi_codegen.extras.robots.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about, axes_of, named
+from scvi_codegen.extras.robots.trees.tree import (
+    SINGLE,
+    Inertia,
+    Joint,
+    Link,
+    Pose,
+    Vector,
+    about,
+    axes_of,
+    named,
+    times,
+)
 
 LIMITED = ("revolute", "prismatic")
 KINDS = {"fixed": "fixed", "revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free"}
@@ -232,4 +243,4 @@ def rotation_of_rpy(angles: Vector) -> Vector:
     nearest = np.round(angles / RIGHT_ANGLE) * RIGHT_ANGLE
     roll, pitch, yaw = np.where(np.abs(angles - nearest) < PRINTED, nearest, angles)
     x, y, z = np.eye(3)
-    return about(z, yaw) @ about(y, pitch) @ about(x, roll)
+    return times(times(about(z, yaw), about(y, pitch)), about(x, roll))
