@@ -53,3 +53,5 @@ class Execution(NamedTuple):
 
 
 ALL_STATES, PLAIN = Save(), Execution()
+PLAIN_BUT_GROWTH = PLAIN[1:]
+"""What else acts along a plain run, whether or not the growth of errors is checked."""

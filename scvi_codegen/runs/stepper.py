@@ -24,9 +24,9 @@ from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.common.once import constantly
-from scvi_codegen.common.validation import ArgumentType, checked_count, checks_arguments, of
+from scvi_codegen.common.validation import LARGEST_COUNT, ArgumentType, checked_count, checks_arguments, of
 from scvi_codegen.runs.forwarding import OfSteppers
-from scvi_codegen.runs.nouns import PLAIN, Execution, Save
+from scvi_codegen.runs.nouns import PLAIN, PLAIN_BUT_GROWTH, Execution, Save
 from scvi_codegen.runs.states.layout import Initial
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import Array, Parameters, States, check_step_given
@@ -241,9 +241,9 @@ class Stepper(OfSteppers, Integrator):
     def _integrate(self, initial: Initial, size: Steps, span: Span, save: Save, way: Execution = PLAIN) -> Trajectory:
         """Return a run of :meth:`integrate`: the door of all runs that are asked for by nouns."""
         stepper, inputs, noise, t = self, way.inputs or None, DEFAULT_NOISE, initial.t
-        if type(save.save_every) is not int or save.save_every != 1:
-            save = save._replace(save_every=checked_count(save.save_every, "save_every", least=1))
-        if way[1:] != PLAIN[1:]:
+        if type(every := save.save_every) is not int or every < 1 or every > LARGEST_COUNT:
+            save = save._replace(save_every=(every := checked_count(every, "save_every", least=1)))
+        if way[1:] != PLAIN_BUT_GROWTH:
             self._check_not_of_run(way.tables, way.threads)
             stepper = self._for_run(way)
             noise = way.noise.checked(stepper, inputs)
@@ -258,9 +258,9 @@ class Stepper(OfSteppers, Integrator):
             initial = initial._replace(t=(t := self._states.time(t)))
         begin = 0.0 if span.t_end is None or (size.h is size.max_step is None) else hashed(t)  # one plan for all times
         try:
-            stepper, plan, count = stepper._planned(size, span, save.save_every, begin)
+            stepper, plan, count = stepper._planned(*size, *span, every, begin)
         except TypeError:  # of an argument that is not hashable, as an array
-            stepper, plan, count = stepper._planned.__wrapped__(size, span, save.save_every, begin)
+            stepper, plan, count = stepper._planned.__wrapped__(*size, *span, every, begin)
         segments = None
         if inputs is not None:
             from scvi_codegen.runs.driver.segments import InputSegments, final_time
@@ -444,12 +444,13 @@ class Stepper(OfSteppers, Integrator):
 
     @cached_property
     def _planned(self) -> Any:
-        """Function :meth:`_with_plan`, with what it returned before."""
+        """Function :meth:`_with_plan`, with what it returned before for arguments of the same types."""
         return lru_cache(maxsize=64, typed=True)(self._with_plan)
 
-    def _with_plan(self, *schedule: Any) -> tuple[Self, StepPlan, int | None]:
-        """Return the stepper, the plan and the number of steps of the arguments of :func:`planned_steps`."""
-        plan, count = planned_steps(self.interface, *schedule)
+    def _with_plan(self, *numbers: Any) -> tuple[Self, StepPlan, int | None]:
+        """Return the stepper, the plan and the number of steps of :func:`planned_steps`, whose nouns are spread."""
+        size, (steps, t_end, *rest) = Steps(*numbers[: len(Steps._fields)]), numbers[len(Steps._fields) :]
+        plan, count = planned_steps(self.interface, size, Span(steps, t_end), *rest)
         return (self._at_tolerance(plan.tolerance) if isinstance(plan, Adaptive) else self), plan, count
 
     def _output_times(self, t_eval: ArrayLike, t: float, plan: StepPlan, steps: int | None) -> Array:

@@ -201,7 +201,7 @@ class EnsembleSettings:
         if ends is not None and not ends.size:
             raise StateError("t_end has no final time: give one number, or one for each trajectory")
         first = None if ends is None else float(ends.flat[0])
-        schedule = self.size, Span(self.steps, first), 1, 0.0 if first is None else hashed(t)
+        schedule = *self.size, *Span(self.steps, first), 1, 0.0 if first is None else hashed(t)
         try:
             stepper._planned(*schedule)
         except TypeError:  # of an argument that is not hashable, as an array
