@@ -26,7 +26,7 @@ from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.common.once import constantly
 from scvi_codegen.common.validation import LARGEST_COUNT, ArgumentType, checked_count, checks_arguments, of
 from scvi_codegen.runs.forwarding import OfSteppers
-from scvi_codegen.runs.nouns import PLAIN, PLAIN_BUT_GROWTH, Execution, Save
+from scvi_codegen.runs.nouns import ALL_STATES, PLAIN, PLAIN_BUT_GROWTH, Execution, Save
 from scvi_codegen.runs.states.layout import Initial
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import Array, Parameters, States, check_step_given
@@ -228,14 +228,18 @@ class Stepper(OfSteppers, Integrator):
             StepFailedError: if a step fails; its ``trajectory`` contains the states before.
         """
         noise = Noise(seed, 0, metropolis) if seed != 0 or metropolis else DEFAULT_NOISE
-        others = check_growth, inputs, events, tables, threads, action, transitions, strict_energy, noise
+        others = inputs, events, tables, threads, action, transitions, strict_energy, noise
         new = tuple.__new__  # nouns without calls of Python
+        is_plain = check_growth is None and others == PLAIN_BUT_GROWTH
+        saves_all = (
+            t_eval is None and observe is None and progress is None and type(save_every) is int and save_every == 1
+        )
         return self._integrate(
             new(Initial, (q, p, velocity, t, parameters, options)),
             new(Steps, (tolerance, absolute_tolerance, max_step, first_step, h, error)),
             new(Span, (steps, t_end)),
-            new(Save, (save_every, t_eval, observe, progress)),
-            new(Execution, others),
+            ALL_STATES if saves_all else new(Save, (save_every, t_eval, observe, progress)),
+            PLAIN if is_plain else new(Execution, (check_growth, *others)),
         )
 
     def _integrate(self, initial: Initial, size: Steps, span: Span, save: Save, way: Execution = PLAIN) -> Trajectory:
@@ -243,7 +247,7 @@ class Stepper(OfSteppers, Integrator):
         stepper, inputs, noise, t = self, way.inputs or None, DEFAULT_NOISE, initial.t
         if type(every := save.save_every) is not int or every < 1 or every > LARGEST_COUNT:
             save = save._replace(save_every=(every := checked_count(every, "save_every", least=1)))
-        if way[1:] != PLAIN_BUT_GROWTH:
+        if way is not PLAIN and way[1:] != PLAIN_BUT_GROWTH:
             self._check_not_of_run(way.tables, way.threads)
             stepper = self._for_run(way)
             noise = way.noise.checked(stepper, inputs)

@@ -125,8 +125,8 @@ def test_adaptive_steps_from_rest_do_not_resolve_rounding(tolerance):
 def test_adaptive_steps_hang_at_rest_and_nearly_so(method, constraint, request):
     """Reactions cancel the weight: what rounding leaves is no force that sets in, and no error of a step."""
     if constraint == "x**2 + y**2 = 2*y" and str(method) in ("svi:6", "svi:8"):
-        reason = "steps of a swing of 1e-9 shrink without an end where the constraint cancels at the origin"
-        request.node.add_marker(pytest.mark.xfail(raises=sc.StepFailedError, strict=True, reason=reason))
+        reason = "on some processors steps of a swing of 1e-9 shrink without an end: the constraint cancels there"
+        request.node.add_marker(pytest.mark.xfail(raises=sc.StepFailedError, strict=False, reason=reason))
     rod = lagrange("rod", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - 9.81*y", constraints=[constraint])
     stepper, bottom = sc.compile_stepper(rod, method), -2.0 if "+ 1" in constraint else 0.0
     hanging = stepper.integrate([0.0, bottom], velocity=[0.0, 0.0], t_end=3.0)

@@ -743,3 +743,13 @@ def test_walls_that_a_start_touches_have_derivatives(steps: dict[str, float]) ->
     run = stepper.integrate([0.0], velocity=[-1.0], t_end=1.0, **steps)
     assert run.q[-1, 0] == pytest.approx(0.5, rel=1e-14)
     assert run.tangent(np.eye(2))[-1] == pytest.approx(np.array([[-0.5, -0.5], [0.0, -0.5]]), abs=1e-9)
+
+
+@pytest.mark.parametrize("length", [1e-3, 1.0, 1e3])
+def test_errors_of_rebounds_to_rest_are_rounding(length):
+    """Flights are parabolas, which each degree has exactly; what is left of a velocity is no size."""
+    ball = sc.LagrangianSystem.from_text("ball", ["z"], "z_dot**2/2 - g*z", parameters={"g": 9.81 * length})
+    stepper = sc.compile_stepper(ball, "svi:2", contacts=[sc.contact("z", restitution=0.5)])
+    run = stepper.integrate([length], velocity=[0.0], h=0.013, t_end=3.0)
+    assert run.step_error < 1e-14
+    assert abs(run.q[-1, 0]) < 1e-15 * length

@@ -351,8 +351,8 @@ def terms_of_steps(system: LagrangianSystem) -> tuple[Kernel, tuple[tuple[int, i
         *rates,
         *(value.xreplace(imposed) for value in coefficients(system)),
     ]
-    given = [parameter for parameter in system.parameters if parameter not in modes]
-    partials = jacobian(values, (*system.coordinates, *system.velocities, *given, system.time))
+    parameters = [parameter for parameter in system.parameters if parameter not in modes]
+    partials = jacobian(values, (*system.coordinates, *system.velocities, *parameters, system.time))
     purpose = "Terms of contacts by steps at u = (q, v, f), and their nonzero derivatives by q, v, parameters and time."
     u = (*system.coordinates, *system.velocities, *impulses)
     return system_kernel(system, "step_terms", values, u=u, partials=partials.values(), purpose=purpose), (*partials,)

@@ -48,10 +48,10 @@ def propagate_by_steps(
     q, p = (np.array(x) for x in (starts.q, starts.p))
     ends, impulses = np.empty((2, count, method.dimension)), np.empty(count)
     for first, last, traces in _traces(method, starts, q, p, parameters):
-        one = np.array([*_maps_of(method, traces, starts.h[first:last][traces.number], parameters)])
+        of_parts = np.array([*_maps_of(method, traces, starts.h[first:last][traces.number], parameters)])
         bounds = np.searchsorted(traces.number, np.arange(last - first + 1))
         for k, (begin, end) in enumerate(pairwise(bounds)):
-            maps[first + k] = reduce(np.matmul, one[begin:end][::-1])
+            maps[first + k] = reduce(np.matmul, of_parts[begin:end][::-1])
             impulses[first + k] = abs(traces.positions.force[begin:end]).max()
         ends[:, first:last] = traces.q1[bounds[1:] - 1], traces.p1[bounds[1:] - 1]
     if starts.chained:
@@ -69,8 +69,8 @@ def propagate_by_steps(
 
 def _varied(method: LinearisedMethod) -> list[int]:
     """Return the indices of the inputs of a step but modes, which the steps choose."""
-    size, given = method._input_size, 2 * method.dimension + len(method.parameters)
-    return [*range(given), size - 2, size - 1]
+    size, states_and_parameters = method._input_size, 2 * method.dimension + len(method.parameters)
+    return [*range(states_and_parameters), size - 2, size - 1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,8 +224,8 @@ class _Linearised:
         """(n, inputs, inputs) derivatives."""
         m, h, start, end, result = self.m, self.h, self.start, self.end, self.inputs.copy()
         q0 = self.inputs[:, :m]
-        given = -(q0 + self.speed * self.by_h) / h  # change of the speed at constant q1
-        at_start, at_end = self.changed(q0, given, ends=False), self.changed(0.0, given, ends=True)
+        by_start = -(q0 + self.speed * self.by_h) / h  # change of the speed at constant q1
+        at_start, at_end = self.changed(q0, by_start, ends=False), self.changed(0.0, by_start, ends=True)
         # p0 + G0^T f1 + h F(q0, v)/2 - L_v(q0, v)/2 - L_v(q1, v)/2 = 0
         forces = start.values["force"][..., np.newaxis] * self.by_h / 2 + h / 2 * start.along("force", at_start)
         momenta = (start.along("momentum", at_start) + end.along("momentum", at_end)) / 2

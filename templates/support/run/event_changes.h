@@ -430,7 +430,8 @@ static int judge_slips(const event_step *step, const event_sample *left, const e
 
 /* Lets the error of a run contain that of a part of a fixed step which a change bounds, up to `at`: the difference from
  * its two halves, without rounding, of positions and of velocities in the length of the step, relative to the motion in
- * it. A short part in a stiff wall may change the velocity of all that follows. */
+ * it and the largest one in a step so far: rebounds may leave none. A short part in a stiff wall may change the
+ * velocity of all that follows. */
 static int judge_part(event_run *run, const event_step *step, const event_sample *left, const event_sample *at,
     real part)
 {
@@ -450,9 +451,10 @@ static int judge_part(event_run *run, const event_step *step, const event_sample
     fast = fmax(fast, fmax(fabs(v[i]), fabs(v_at[i])));
   }
   const real rounding = CHANGE_SAFETY * DBL_EPSILON * far * (1.0 + duration / fabs(part));
+  const real largest = fmax(duration * fast, run->largest_motion);
   for (int i = 0; i < M; i++) {
     const real apart = fabs(end.q[i] - at->q[i]) + duration * fabs(v[i] - v_at[i]);
-    error = fmax(error, (apart - rounding) / (duration * (fmax(fabs(v[i]), fabs(v_at[i])) + fast)));
+    error = fmax(error, (apart - rounding) / (duration * fmax(fabs(v[i]), fabs(v_at[i])) + largest));
   }
   own.error = 2.0;
   if (error > NAME(step_error)(run)) {

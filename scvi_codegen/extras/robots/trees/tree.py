@@ -84,7 +84,7 @@ class Inertia:
     def about(self, point: Vector) -> Vector:
         """Return the inertia matrix about a point (parallel axis theorem)."""
         arm = self.center - point
-        return self.matrix + self.mass * (times(arm, arm) * np.eye(3) - np.outer(arm, arm))
+        return np.asarray(self.matrix + self.mass * (times(arm, arm) * np.eye(3) - np.outer(arm, arm)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

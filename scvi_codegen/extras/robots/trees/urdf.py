@@ -243,4 +243,4 @@ def rotation_of_rpy(angles: Vector) -> Vector:
     nearest = np.round(angles / RIGHT_ANGLE) * RIGHT_ANGLE
     roll, pitch, yaw = np.where(np.abs(angles - nearest) < PRINTED, nearest, angles)
     x, y, z = np.eye(3)
-    return times(times(about(z, yaw), about(y, pitch)), about(x, roll))
+    return np.asarray(times(times(about(z, yaw), about(y, pitch)), about(x, roll)))
