@@ -497,16 +497,17 @@ class ErrorGrowth:
         product: at u = (x, these) their product with x = dq, or (dq, dq'), on lanes.
         of_velocities: true if accelerations depend on velocities.
         part_of_tolerance: error of an adaptive step in units of its tolerance.
-        tables: by the number of knots, times at which the tangent vector is evaluated; the last for vectors of eight
-            lanes. With eight columns, from values at the points to those at the knots, from accelerations there to
-            tangent vectors, and to Taylor's coefficients at the end of a step.
+        knots: number of times in a step at which the tangent vector is evaluated.
+        tables: from values at the points to those at the knots, from accelerations there to tangent vectors, and to
+            Taylor's coefficients at the end of a step, with columns that fill vectors of any length.
     """
 
     partials: Kernel
     product: Kernel
     of_velocities: bool
     part_of_tolerance: float
-    tables: Mapping[int, tuple[IterationTable, ...]]
+    knots: int
+    tables: tuple[IterationTable, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

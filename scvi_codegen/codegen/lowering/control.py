@@ -204,31 +204,31 @@ def error_growth_of(system: MechanicalSystem, program: Program) -> ErrorGrowth |
     if twin is None or len(set(points)) < len(points) or sum(c > 0 for c in points) < 2:
         return None
     partials, product = make(twin)
-    of_velocities, least = make is _coupled_growth, FEW_KNOTS if len(points) <= FEW_POINTS else COLUMNS
-    knots = [gauss_legendre(count).abscissae for count in sorted({min(len(points), n) for n in (least, COLUMNS)})]
+    of_velocities = make is _coupled_growth
     return ErrorGrowth(
         partials=_with_common_roots(partials),
         product=product,
         of_velocities=of_velocities,
         part_of_tolerance=part_of_tolerance(len(points)),
-        tables={len(of): _growth_tables(points, of, of_velocities=of_velocities) for of in knots},
+        knots=len(points),
+        tables=_growth_tables(points, gauss_legendre(len(points)).abscissae, of_velocities=of_velocities),
     )
 
 
 DIFFERENT = mp.mpf("1e-40")
 """Smallest distance of a knot from a point that is not one of both in working precision."""
-COLUMNS, FEW_KNOTS, FEW_POINTS = 8, 4, 8
-"""Columns of the tables of tangent vectors, one for each knot; numbers of knots and of points in short steps.
+COLUMNS = 8
+"""Columns of the tables of tangent vectors, one for each knot, are a multiple of this number: whole vectors.
 
-In vectors of eight lanes eight knots cost as much as four, in shorter ones twice as much.
-They are Gauss points: other ones, as every second point of the step, and kicks at the points by Stoermer's method cost
-less, but regular orbits of thousands of steps then show exponential growth.
+The knots are as many Gauss points as the step has points. Then the map of tangent vectors is the derivative of a step
+of the method, and symplectic: along regular orbits products of such maps grow as powers. With half as many knots, with
+every second point of the step, or with kicks at its points by Stoermer's method, they grow exponentially.
 """
 
 
 def _growth_tables(points: Vector, knots: Vector, *, of_velocities: bool) -> tuple[IterationTable, ...]:
-    """Return the tables from points to knots of a step and its halves, between knots, and to Taylor's coefficients."""
-    end, rates, half = (mp.one,), differentiation_matrix(knots), mp.one / 2
+    """Return the tables from points to knots of a step, between knots, and to Taylor's coefficients."""
+    end, rates = (mp.one,), differentiation_matrix(knots)
     at_end = cardinal_values(knots, end)[0]
     slope = tuple(mp.fdot(at_end, column) for column in transpose(rates))
     bend = tuple(mp.fdot(slope, column) for column in transpose(rates))
@@ -237,24 +237,23 @@ def _growth_tables(points: Vector, knots: Vector, *, of_velocities: bool) -> tup
         cardinal_integrals(knots, end, mp.zero)[0],
         *(tuple(x / k for x in row) for k, row in ((2, at_end), (6, slope), (24, bend))),
     )
-    halves = ((0, half), (half, half)) if len(knots) <= FEW_KNOTS else ()
-    parts = [tuple(start + size * c for c in knots) for start, size in ((0, 1), *halves)]
+    stored = COLUMNS * -(-len(knots) // COLUMNS)
 
-    def columns(*tables: Matrix, repeat: bool = True) -> NumberTable:
-        return tuple(pad_vector(column, COLUMNS, repeat=repeat) for table in tables for column in transpose(table))
+    def columns(table: Matrix, *, repeat: bool = True) -> NumberTable:
+        return tuple(pad_vector(column, stored, repeat=repeat) for column in transpose(table))
 
     tables = {
-        "KNOT_ABSCISSA": columns(*(transpose((part,)) for part in parts)),
+        "KNOT_ABSCISSA": columns(transpose((knots,))),
         "TANGENT_INTEGRALS_TWICE": columns(_twice_integrated(knots, knots)),
         "TANGENT_END": columns(taylor, repeat=False),
     }
-    are_points = COLUMNS == len(knots) == len(points)
-    if not are_points or max(map(abs, map(operator.sub, knots, points))) > DIFFERENT:
-        tables["KNOT_VALUES"] = columns(*(cardinal_values(points, part) for part in parts))
+    fills_vectors = len(points) in (2, 4) or len(points) == stored
+    if not fills_vectors or max(map(abs, map(operator.sub, knots, points))) > DIFFERENT:
+        tables["KNOT_VALUES"] = columns(cardinal_values(points, knots))
     if of_velocities:
         tables["TANGENT_INTEGRALS"] = columns(cardinal_integrals(knots, knots, mp.zero))
-        tables["KNOT_INTEGRALS"] = columns(*(cardinal_integrals(points, part, mp.zero) for part in parts))
-        tables["KNOT_RATES"] = columns(*(cardinal_derivatives(points, part) for part in parts))
+        tables["KNOT_INTEGRALS"] = columns(cardinal_integrals(points, knots, mp.zero))
+        tables["KNOT_RATES"] = columns(cardinal_derivatives(points, knots))
     return tuple(IterationTable(name, table) for name, table in tables.items())
 
 

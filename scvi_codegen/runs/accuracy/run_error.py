@@ -386,15 +386,12 @@ class _Replay:
             results = self.results[:, :, row : row + len(part.h)]
             steps, curves = self.finer._errors(part, parameters, self.size, limits, self.now, results[0])
             if steps:
-                part, row, before = part.part(0, steps), row + steps, self.now
+                part, row = part.part(0, steps), row + steps
+                errors = np.vstack([self.now, results[0, :, :steps].T])
                 self.now = results[0, :, steps - 1].copy()
-                if self.along_finer:
-                    errors = np.vstack([before, results[0, :, :steps].T])
-                    x, y = (
-                        np.ascontiguousarray(of) for of in np.split(np.hstack([part.q, part.p]) - errors, 2, axis=1)
-                    )
-                    part = Starts(part.t, part.h, x, y)
-                self._transport(part, curves, results[1], parameters)
+                exact = np.split(np.hstack([part.q, part.p]) - errors, 2, axis=1)
+                along = Starts(part.t, part.h, *map(np.ascontiguousarray, exact))
+                self._transport(along, along if self.along_finer else part, curves, results[1], parameters)
             k += steps
             if steps < len(results[0, 0]):
                 self._by_run(piece, float(t[k]), q[k], p[k], begin + k + 1, steps=1.0)
@@ -402,24 +399,35 @@ class _Replay:
                 k += 1
 
     def _transport(
-        self, starts: Starts, curves: Curves | None, deviations: Array, parameters: Array, steps: float = 1.0
+        self,
+        along: Starts,
+        starts: Starts,
+        curves: Curves | None,
+        deviations: Array,
+        parameters: Array,
+        steps: float = 1.0,
     ) -> None:
-        """Transport rounding errors over n steps along (curves), or of the finer method, into (2m, n) deviations.
+        """Transport rounding errors over n steps, into (2m, n) deviations.
+
+        Iterations find the derivatives along the finer method, whose curves begin at its own states: along points that
+        combine a state of the run with forces of another one, the products of derivatives grow.
 
         Args:
-            starts: steps of the run, or of the finer method if there are no ``curves``.
+            along: steps of the finer method.
+            starts: those of the run, where iterations fail; of the finer method if there are no ``curves``.
+            curves: of the finer method.
             steps: number of steps of the run for each.
         """
         rounding, first, length = math.sqrt(steps) * self.u, 0, len(starts.h) if self.linear is None else 1
-        along = Curves(np.empty((len(starts.h), self.m, 0)), np.empty(0)) if curves is None else curves
+        kept = Curves(np.empty((len(starts.h), self.m, 0)), np.empty(0)) if curves is None else curves
         own = self.finer if curves is None or self.along_finer else self.run.stepper
         while first < len(starts.h):
             if self.linear is not None:
                 self.calls += 1
                 into = self.samples, deviations[:, first:], parameters
-                values, rest = along.values[first:], starts.part(first, len(starts.h))
+                values, rest = kept.values[first:], along.part(first, len(starts.h))
                 first += self.linear._transport_roundings(
-                    rest, Curves(values, along.abscissae), *into, self.left / steps, rounding, self.calls
+                    rest, Curves(values, kept.abscissae), *into, self.left / steps, rounding, self.calls
                 )
             if first < len(starts.h):
                 self.calls += 1
@@ -452,7 +460,8 @@ class _Replay:
             return
         h, sides = steps_after(fine, 0, len(fine) - 1), fine.parameters_on_sides(t)
         times, h, x, y = (np.ascontiguousarray(of) for of in (fine.t, h, fine.q, fine.p))
-        self._transport(Starts(times, h, x, y), None, np.empty((2 * self.m, len(h))), sides, steps / len(h))
+        steps_taken = Starts(times, h, x, y)
+        self._transport(steps_taken, steps_taken, None, np.empty((2 * self.m, len(h))), sides, steps / len(h))
         self.now = after - self._state(fine, -1)
 
     def _round(self, state: Array, steps: float) -> None:

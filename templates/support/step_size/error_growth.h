@@ -9,13 +9,12 @@
  *
  * D phi is that of the variational equations along each accepted step,
  *   dq'' = F_q dq / m,      or      L_vv dq'' = -E_q dq - E_v dv   (VARIABLE_ACCELERATIONS),
- * with E(q, v, a) the Euler-Lagrange residual at knots c_n h, which are Gauss points, as many as those of the step in
- * vectors of eight lanes, or half as many; derivatives there are evaluated in SIMD lanes. The collocation equations
+ * with E(q, v, a) the Euler-Lagrange residual at knots c_n h, which are as many Gauss points as those of the step, so
+ * that the map is symplectic; derivatives there are evaluated in SIMD lanes. The collocation equations
  *   dq_n = dq + c_n h dv + h^2 sum_j P_nj dq''_j,      dv_n = dv + h sum_j Q_nj dq''_j
  * are solved by Picard iterations (Hairer, Norsett & Wanner, Solving ODEs I, sec. I.8) from Taylor's polynomial at the
- * end of the step before; with four knots in two halves of a large step. Requires: the iteration, tables, the numbers
- * GROWTH_DERIVATIVES of distinct derivatives at a point and PART_OF_TOLERANCE, c, the kernels point_derivatives and
- * derivative_product. */
+ * end of the step before. Requires: the iteration, tables, the numbers GROWTH_DERIVATIVES of distinct derivatives at a
+ * point and PART_OF_TOLERANCE, c, the kernels point_derivatives and derivative_product. */
 
 #define LARGEST_SQUARE 1e140 /* of sizes: the products of two are numbers */
 #define MOST_ITERATIONS 30
@@ -42,7 +41,8 @@ enum { TANGENT = M };
 
 /* Taylor's coefficients h^k dq^(k) / k!, k < 5, or the knots are columns of the tables: whole vectors of any length. */
 enum { TAYLOR = 5,
-  COLUMNS = 8,
+  COEFFICIENTS = 8,
+  COLUMNS = (KNOTS + 7) / 8 * 8,
   KNOT_GROUPS = (KNOTS + LANES - 1) / LANES,
   KNOTS_STORED = KNOT_GROUPS * LANES };
 
@@ -75,12 +75,11 @@ static inline lanes add_rows(
 }
 
 /* Values at the knots of a group from those at the points, of which LANES are contiguous and then `apart` apart. */
-static inline lanes at_knots(int part, int group, const double *value, int apart)
+static inline lanes at_knots(int group, const double *value, int apart)
 {
 #ifndef KNOTS_ARE_POINTS
-  return add_rows(lanes_of(0.0), KNOT_VALUES + part * KEPT, KEPT, group, value, apart);
+  return add_rows(lanes_of(0.0), KNOT_VALUES, KEPT, group, value, apart);
 #else
-  (void)part;
   return columns_of(value + group * (apart - LANES), group);
 #endif
 }
@@ -92,24 +91,24 @@ typedef struct {
   double square, inverse; /* h^2, 1 / h */
 } tangent_knots;
 
-/* Computes the derivatives of the accelerations at the knots of a part of a step, with the velocities of the run. */
+/* Computes the derivatives of the accelerations at the knots of a step, with the velocities of the run. */
 static APART void linearise_accelerations(const run_memory *run, const step_data *step, const iteration_data *data,
-    coordinates *X, int part, double h, tangent_knots *at)
+    coordinates *X, tangent_knots *at)
 {
   const double inverse = 1.0 / step->h;
   lanes u[3 * M];
   (void)X, (void)data;
-  at->square = h * h;
-  at->inverse = 1.0 / h;
+  at->square = step->h * step->h;
+  at->inverse = inverse;
   for (int n = 0; n < KNOT_GROUPS; n++) {
     for (int i = 0; i < M; i++) {
       const double *V = run->memory + i * POINTS;
-      u[i] = step->q0[i] + step->h * add_rows(lanes_of(0.0), KNOT_INTEGRALS + part * KEPT, KEPT, n, V, LANES);
-      u[M + i] = at_knots(part, n, V, LANES);
-      u[2 * M + i] = inverse * add_rows(lanes_of(0.0), KNOT_RATES + part * KEPT, KEPT, n, V, LANES);
+      u[i] = step->q0[i] + step->h * add_rows(lanes_of(0.0), KNOT_INTEGRALS, KEPT, n, V, LANES);
+      u[M + i] = at_knots(n, V, LANES);
+      u[2 * M + i] = inverse * add_rows(lanes_of(0.0), KNOT_RATES, KEPT, n, V, LANES);
     }
     memset(at->mass[n], 0, sizeof at->mass[n]);
-    point_derivatives(u, step->t + step->h * columns_of(KNOT_ABSCISSA[part], n), step->parameters, at->u[n] + TANGENT,
+    point_derivatives(u, step->t + step->h * columns_of(KNOT_ABSCISSA[0], n), step->parameters, at->u[n] + TANGENT,
         at->mass[n]);
     factor_mass(at->mass[n]);
   }
@@ -130,19 +129,19 @@ typedef struct {
 } tangent_knots;
 
 static APART void linearise_accelerations(const run_memory *run, const step_data *step, const iteration_data *data,
-    coordinates *X, int part, double h, tangent_knots *at)
+    coordinates *X, tangent_knots *at)
 {
   lanes u[M];
   const double *x = (const double *)X;
   (void)run;
   for (int n = 0; n < KNOT_GROUPS; n++) {
     for (int i = 0; i < M; i++)
-      u[i] = at_knots(part, n, x + i * LANES, M * LANES);
+      u[i] = at_knots(n, x + i * LANES, M * LANES);
     point_derivatives(
-        u, step->t + step->h * columns_of(KNOT_ABSCISSA[part], n), step->parameters, at->u[n] + TANGENT);
+        u, step->t + step->h * columns_of(KNOT_ABSCISSA[0], n), step->parameters, at->u[n] + TANGENT);
   }
   for (int i = 0; i < M; i++)
-    at->unit[i] = h * h * data->inverse_mass[i];
+    at->unit[i] = step->h * step->h * data->inverse_mass[i];
 }
 
 static APART void tangent_accelerations(const step_data *step, const tangent_knots *at, int n, lanes *a)
@@ -184,10 +183,10 @@ static inline void place_tangents(double (*s)[8], double (*a)[KNOTS_STORED], tan
 /* Coefficients at the end of the step from accelerations; loads of several stores at once would wait for them. */
 static inline void end_tangents(double (*s)[8], double (*a)[KNOTS_STORED])
 {
-  static const double q[COLUMNS] = {1.0}, v[COLUMNS] = {1.0, 1.0};
+  static const double q[COEFFICIENTS] = {1.0}, v[COEFFICIENTS] = {1.0, 1.0};
   for (int i = 0; i < M; i++) {
     const double of_q = s[i][0], of_v = s[i][1];
-    for (int n = 0; n < COLUMNS / LANES; n++) {
+    for (int n = 0; n < COEFFICIENTS / LANES; n++) {
       const lanes linear = of_q * columns_of(q, n) + of_v * columns_of(v, n);
       const lanes end = add_rows(linear, TANGENT_END, KNOTS, n, a[i], LANES);
       memcpy(s[i] + n * LANES, &end, sizeof end);
@@ -217,21 +216,20 @@ static inline void end_measurement(run_memory *run)
   run->measures_growth = 0;
 }
 
-/* Advances the tangent vector by a step, of size h, or by one of its halves (part 1 or 2); ends the measurement if the
- * iterations diverge. */
+/* Advances the tangent vector by a step; ends the measurement if the iterations diverge. */
 static inline void advance_tangent(
-    run_memory *run, const step_data *step, const iteration_data *data, coordinates *X, int part, double h)
+    run_memory *run, const step_data *step, const iteration_data *data, coordinates *X)
 {
   double size = 0.0, change, stored[M][KNOTS_STORED];
   int k = 0, is_resolved = 0;
   tangent_knots at;
   lanes a[KNOT_GROUPS][M], before[KNOT_GROUPS][M];
-  rescale_tangent(run, h);
+  rescale_tangent(run, step->h);
   for (int i = 0; i < M; i++) {
     const double *of = run->tangent[i];
     size += of[0] * of[0] + 0.25 * (of[1] * of[1]);
   }
-  linearise_accelerations(run, step, data, X, part, h, &at);
+  linearise_accelerations(run, step, data, X, &at);
   begin_tangents(run->tangent, a, &at);
   while (!is_resolved && k++ < MOST_ITERATIONS) {
     lanes sum = lanes_of(0.0);
@@ -325,11 +323,7 @@ static __attribute__((noinline)) void measure_growth(run_memory *run, const step
   }
   if (adds)
     add_rounding(run, step, walk, rounding);
-  if (tolerance > LARGE_TOLERANCE && KNOTS <= 4) {
-    advance_tangent(run, step, data, X, 1, 0.5 * step->h);
-    advance_tangent(run, step, data, X, 2, 0.5 * step->h);
-  } else
-    advance_tangent(run, step, data, X, 0, step->h);
+  advance_tangent(run, step, data, X);
   if (!run->measures_growth)
     return;
   if (adds) {
