@@ -26,7 +26,7 @@ static inline double correct_pairs(pair_equations *at, newton_data *data, const 
       at->z[i * B + b] = dd_add(at->z[i * B + b], dd_word(-update));
       if (!is_finite(update))
         return update;
-      if (i < M && MOVES[b])
+      if (i < M && MOVES[b] != 0)
         change = larger(change, fabs(at->h.high * update) * inverse_size[i]);
     }
   return change;
