@@ -125,6 +125,18 @@ static inline real estimate(const run_memory *run, const trial *now, real least)
   ((error) > error_at(shorter, (up) / 2) && (error) < error_at(shorter, (up) + (up) / 2 + 1))
 #define LEVELS_INSIDE 0 /* no predictor from a rejected step */
 
+/* Returns 1 if the rounding of positions by which rows of constraints and contacts are solved is an admitted part of
+ * the displacement in a trial: shorter ones show nothing, since that rounding, divided by h, is a velocity. */
+static int resolves_motion(const trial *now)
+{
+  real moved = 0, farthest = 0;
+  for (int i = 0; i < M; i++) {
+    moved = larger(moved, MATH(fabs)(now->dq[i]));
+    farthest = larger(farthest, MATH(fabs)(now->step.q0[i]));
+  }
+  return SITES == M || rounding_of_displacement(farthest) <= now->limits.most * moved;
+}
+
 /* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
  * failed. The predictor requires the step size of the previous step. */
 static real attempt(run_memory *run, trial *now, real least, const solver_options *options, solver_report *report)
@@ -153,6 +165,7 @@ static real attempt(run_memory *run, trial *now, real least, const solver_option
 #define LEVELS_INSIDE INSIDE
 #endif
 #define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */
+#define resolves_motion(now) 1 /* else they do not end the search */
 /* Errors rise, those of rounding do not, or from any to any size. */
 #define RISES(error, shorter, up) ((error) > (shorter) && (error) < error_at(shorter, (up) + (up) / 2 + 1))
 
@@ -459,7 +472,7 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
   while (!now->last && up > 0) {
     const int failed = !(now->error < INFINITY), small = now->error <= now->limits.most;
     const int rises = failed ? !SHORT_STEPS_FAIL : RISES(now->error, shorter, up);
-    found = found || small;
+    found = found || (small && resolves_motion(now));
     up = small ? levels_up(run, now) : 0;
     if (SHORT_STEPS_FAIL && up > 0 && up < LEVELS_PER_BINADE) /* a further trial takes as long as a step */
       return;
