@@ -3,6 +3,7 @@
 import math
 import numbers
 from collections.abc import Callable, Mapping
+from decimal import ROUND_CEILING, Decimal
 from typing import Any
 
 LONGEST = 100
@@ -41,23 +42,21 @@ def clipped(text: str, length: int = LONGEST) -> str:
 def with_uncertainty(value: float, error: float) -> str:
     """Return a value with the uncertain digits of its error in parentheses: ``0.512345(12)`` is 0.512345 +- 0.000012.
 
-    The error has two digits, rounded up; an error above the value is written in full, ``3(12)``.
+    The error has two digits, rounded up, also where it exceeds the value, as ``0.0(33)e+78``.
     """
     if not (math.isfinite(value) and math.isfinite(error)):
         return f"{value:.3g}(lost)"
     if error == 0.0:
         return repr(float(value))
-    decimals = 1 - math.floor(math.log10(error))
-    digits = math.ceil(error * 10.0**decimals - 1e-9) if abs(decimals) < 300 else 0
+    number, size = Decimal(float(value)), Decimal(max(float(error), math.ulp(value)))
+    last = size.adjusted() - 1  # power of ten of the last digit
+    digits = int((size.scaleb(-last) - Decimal("1e-9")).to_integral_value(ROUND_CEILING))
     if digits >= 100:
-        digits, decimals = 10, decimals - 1
-    exponent = math.floor(math.log10(abs(value))) if value else -decimals
-    if -5 < exponent < 16 and decimals >= 0:
-        return f"{value:.{decimals}f}({digits})"
-    shown = max(0, decimals + exponent)
-    if decimals + exponent < 0:
-        digits = math.ceil(error / 10.0**exponent)
-    return f"{value / 10.0**exponent:.{shown}f}({digits})e{exponent:+03d}"
+        digits, last = 10, last + 1
+    exponent = max(size.adjusted(), number.adjusted() if value else last)
+    if -5 < exponent < 16 and last <= 0:
+        return f"{number:.{-last}f}({digits})"
+    return f"{number.scaleb(-exponent):.{max(0, exponent - last)}f}({digits})e{exponent:+03d}"
 
 
 def _short(value: Any) -> str:

@@ -332,6 +332,9 @@ def test_uncertain_digits():
         (1234.5, 56.0): "1234(56)",
         (1.5e-9, 2.4e-12): "1.5000(24)e-09",
         (2.0, 0.0): "2.0",
+        (7e-6, 1.15e-5): "0.7(12)e-05",
+        (-2.0, 355.0): "-0.0(36)e+02",
+        (1.0, 3.3e78): "0.0(33)e+78",
         (0.1, math.inf): "0.1(lost)",
     }
     assert {key: with_uncertainty(*key) for key in cases} == cases
