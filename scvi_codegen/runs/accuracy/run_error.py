@@ -293,12 +293,12 @@ def sizes_of(run: Any, rows: int, errors: Array) -> Array:
     if isinstance(plan, Adaptive) and plan.absolute_tolerance != ():
         absolute = absolute_tolerances(interface, m, plan.absolute_tolerance)
     t, q, p = (np.asarray(column)[:rows] for column in (run.t, run.q, run.p))
+    of_q, of_p = np.ascontiguousarray(q.T), np.ascontiguousarray(p.T)
     kinetic, firsts = momenta_of_velocities(run.stepper, t, q, p, run.parameters), first_of_groups(interface, m)
     by_reactions = motion_by_reactions(run, t[:1], q[:1], p[:1])
-    if not (np.ptp(q, axis=0) > math.sqrt(roundoff(1)) * by_reactions[0]).all():  # the motion may be rounding of these
+    if not (np.ptp(of_q, axis=1) > math.sqrt(roundoff(1)) * by_reactions[0]).all():  # may be rounding of these
         by_reactions = motion_by_reactions(run, t, q, p)
-    q, p = (np.ascontiguousarray(column.T) for column in (q, p))
-    return sizes_of_motion(q, p, errors, kinetic, by_reactions, firsts, roundoff(interface.words), absolute)
+    return sizes_of_motion(of_q, of_p, errors, kinetic, by_reactions, firsts, roundoff(interface.words), absolute)
 
 
 class _Replay:
@@ -319,7 +319,7 @@ class _Replay:
         self.u, self.calls, self.left = roundoff(1), 0, LEFT / max(1, run.steps)
         self.steps = max(1.0, run.steps / max(1, len(run) - 1))  # mean number between two states
         self.now, self.samples = np.zeros(2 * self.m), np.zeros((SAMPLES, 2 * self.m))  # at the present state
-        self.size = np.ptp(np.concatenate([np.asarray(run.q), np.asarray(run.p)], axis=1), axis=0)
+        self.size = np.ptp(np.concatenate([np.asarray(run.q).T, np.asarray(run.p).T]), axis=1)
         self.results = np.full((2, 2 * self.m, len(run)), np.nan)  # errors and rounding errors
 
     def error(self) -> RunError:
@@ -387,10 +387,11 @@ class _Replay:
             steps, curves = self.finer._errors(part, parameters, self.size, limits, self.now, results[0])
             if steps:
                 part, row = part.part(0, steps), row + steps
-                errors = np.vstack([self.now, results[0, :, :steps].T])
-                self.now = results[0, :, steps - 1].copy()
-                exact = np.split(np.hstack([part.q, part.p]) - errors, 2, axis=1)
-                along = Starts(part.t, part.h, *map(np.ascontiguousarray, exact))
+                along, errors = Starts(part.t, part.h, part.q.copy(), part.p.copy()), results[0, :, :steps].T
+                for states, columns in ((along.q, slice(self.m)), (along.p, slice(self.m, None))):
+                    states[0] -= self.now[columns]
+                    states[1:] -= errors[:, columns]
+                self.now = errors[-1].copy()
                 self._transport(along, along if self.along_finer else part, curves, results[1], parameters)
             k += steps
             if steps < len(results[0, 0]):
