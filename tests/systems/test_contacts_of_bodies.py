@@ -183,6 +183,8 @@ def test_a_tippe_top_inverts_and_conserves_jellett_s_integral(k: float) -> None:
         assert np.allclose(run.rotation()[-1], TOP.frame(np.array([*[0] * 6, *ATTITUDE, *[0] * 3]))[0], atol=1e-10)
         slides = run[: np.searchsorted(run.t, 0.25)]  # by runs that begin where the gap is its rounding, no velocity
         assert slides.error.relative.max() < 1e-9
+        stops = run[np.searchsorted(run.t, 0.99 * STOP) :]  # where no neighbouring state may have a step
+        assert stops.error.relative.max() < 1e-7
 
 
 @pytest.mark.tiers(0, 1)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.codegen.ir.variants import Derivatives
-from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError
+from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError, StepFailedError
 from scvi_codegen.common.representation import with_uncertainty
 from scvi_codegen.runs.accuracy.size import (
     LOST,
@@ -375,7 +375,7 @@ class _Replay:
     def _by_steps(self, piece: SavedStates, begin: int, end: int, first: int) -> None:
         """Find errors over single steps between two rows of a part that begins at the row ``first``.
 
-        A step that no number of parts of the finer one resolves is one run of it.
+        A step that no number of parts of the finer one resolves, or no difference, is one run of it.
         """
         t, h = np.ascontiguousarray(piece.t[begin:end]), np.ascontiguousarray(steps_after(piece, begin, end))
         q, p = (np.ascontiguousarray(np.asarray(column)[begin : end + 1]) for column in (piece.q, piece.p))
@@ -386,17 +386,17 @@ class _Replay:
             results = self.results[:, :, row : row + len(part.h)]
             steps, curves = self.finer._errors(part, parameters, self.size, limits, self.now, results[0])
             if steps:
-                part, row = part.part(0, steps), row + steps
+                part = part.part(0, steps)
                 along, errors = Starts(part.t, part.h, part.q.copy(), part.p.copy()), results[0, :, :steps].T
                 for states, columns in ((along.q, slice(self.m)), (along.p, slice(self.m, None))):
                     states[0] -= self.now[columns]
                     states[1:] -= errors[:, columns]
-                self.now = errors[-1].copy()
-                self._transport(along, along if self.along_finer else part, curves, results[1], parameters)
+                steps = self._transport(along, along if self.along_finer else part, curves, results[1], parameters)
+                self.now = errors[steps - 1].copy() if steps else self.now
             k += steps
             if steps < len(results[0, 0]):
                 self._by_run(piece, float(t[k]), q[k], p[k], begin + k + 1, steps=1.0)
-                self._store(row)
+                self._store(row + steps)
                 k += 1
 
     def _transport(
@@ -407,8 +407,10 @@ class _Replay:
         deviations: Array,
         parameters: Array,
         steps: float = 1.0,
-    ) -> None:
-        """Transport rounding errors over n steps, into (2m, n) deviations.
+    ) -> int:
+        """Transport rounding errors over n steps, into (2m, n) deviations; return the number of steps.
+
+        These are fewer where a step from a neighbouring state is not solved, as where a slip is about to stop.
 
         Iterations find the derivatives along the finer method, whose curves begin at its own states: along points that
         combine a state of the run with forces of another one, the products of derivatives grow.
@@ -433,8 +435,15 @@ class _Replay:
             if first < len(starts.h):
                 self.calls += 1
                 part, into = starts.part(first, first + length), (self.samples, deviations[:, first:], parameters)
-                own._transport_by_differences(part, *into, self.size, rounding, self.calls)
+                try:
+                    own._transport_by_differences(part, *into, self.size, rounding, self.calls)
+                except StepFailedError:
+                    if length == 1:
+                        return first
+                    length = 1
+                    continue
                 first, length = first + length, 2 * length  # so that calls are few where iterations fail again
+        return len(starts.h)
 
     def _by_run(self, piece: Any, t: float, q: Array, p: Array, end: int, *, steps: float) -> None:
         """Find the errors of a row by a run of the finer method at round-off, over the events in between.
@@ -461,8 +470,9 @@ class _Replay:
             return
         h, sides = steps_after(fine, 0, len(fine) - 1), fine.parameters_on_sides(t)
         times, h, x, y = (np.ascontiguousarray(of) for of in (fine.t, h, fine.q, fine.p))
-        steps_taken = Starts(times, h, x, y)
-        self._transport(steps_taken, steps_taken, None, np.empty((2 * self.m, len(h))), sides, steps / len(h))
+        taken, deviations = Starts(times, h, x, y), np.empty((2 * self.m, len(h)))
+        if self._transport(taken, taken, None, deviations, sides, steps / len(h)) < len(h):
+            raise StateError("the steps of a finer method from neighbouring states were not solved")
         self.now = after - self._state(fine, -1)
 
     def _round(self, state: Array, steps: float) -> None:
