@@ -6,11 +6,11 @@ import numpy as np
 
 
 class Spring(NamedTuple):
-    """A body x'' = -w^2 x with dry friction of a size by mass, sliding or static, between walls with restitution."""
+    """A body x'' = -w^2 x with dry friction of a size by mass, sliding or sticking, between walls with restitution."""
 
     w: float
     sliding: float
-    static: float
+    held: float
     low: float
     high: float
     e: float
@@ -18,7 +18,7 @@ class Spring(NamedTuple):
     def after(self, x: float, v: float, t: float) -> tuple[float, float]:
         """Return place and velocity at a time."""
         while t > 0.0:
-            if v == 0.0 and abs(self.w**2 * x) <= self.static:
+            if v == 0.0 and abs(self.w**2 * x) <= self.held:
                 return x, 0.0
             way = np.sign(v or -x)
             centre = -way * self.sliding / self.w**2
