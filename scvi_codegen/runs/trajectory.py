@@ -90,8 +90,8 @@ class Trajectory(
         steps, rejected_steps: numbers of completed and of rejected steps since the start of the run.
         fallback_steps: number of completed steps that the iteration did not solve, but its fallback, Newton's method.
         step_error, worst_step_time: estimated relative error of the worst step of the run, and its start time. The
-            error is relative to the motion in the step, with a fixed step size to the largest one so far; NaN for
-            methods without an error estimate.
+            error is relative to the motion in the step, with a fixed step size to the largest one so far; infinite if
+            parts of a step, by which it is estimated, have no solution; NaN for methods without an error estimate.
         confirmation: the comparison with a second run if ``error=`` was passed, else ``None``.
         observed: (n, ..) values that ``observe`` returned, else ``None``; q and p are then those of both ends.
         conserved: (n, 3 + k) energies and momentum maps with ``observe``, else ``None``.

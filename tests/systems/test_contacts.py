@@ -144,6 +144,59 @@ def test_a_multiplier_is_an_event() -> None:
     assert abs(run.multipliers()[-1, 0]) < 1e-13
 
 
+def rope(*events: Any) -> Any:
+    """Return the stepper of a weight on a rope of length 1, whose tension is -lambda_1."""
+    text = "m*(x_dot**2 + y_dot**2)/2 - m*g*y"
+    weight = sc.LagrangianSystem.from_text(
+        "rope", ["x", "y"], text, constraints=["(x**2 + y**2 - 1)/2"], parameters={"m": 1.0, "g": 1.0, "c": 0.0}
+    )
+    return sc.compile_stepper(weight, "svi:4", events=events)
+
+
+TENSION = "m*(x_dot**2 + y_dot**2 - g*y)"
+"""The tension of a rope as a formula of the state."""
+
+
+@pytest.mark.second
+def test_events_of_multipliers_are_those_of_forces() -> None:
+    """16 random ropes: one slows by a part of its tension where that is c on the way up, then it is slack and ends."""
+    slack = sc.Event("lambda_1", where="y > 0", terminal=True)
+    slows = sc.Event("lambda_1 + c", direction=1, then={v: f"{v}*(1 + lambda_1/(100*m*g))" for v in ("x_dot", "y_dot")})
+    stepper = rope(slack, slows)
+    for number in range(16):
+        m, g, s = np.random.default_rng([97, number]).uniform([0.1, 0.1, 3.5], [10, 10, 4.5])
+        # tension T = m (v^2 - g y), v^2 = s g - 2 g (1 + y): T(y) = m g (s - 2 - 3 y)
+        lifted = np.random.default_rng([97, number]).uniform(-0.5, 0.2)
+        c = s - 2 - 3 * lifted
+        rest = (s - 2 - 2 * lifted) * (1 - c / 100) ** 2 + 2 * lifted  # (v^2 + 2 g y)/g afterwards
+        values = {"m": m, "g": g, "c": m * g * c}
+        for steps in ({"h": 0.02 / np.sqrt(g)}, {"tolerance": 1e-11}):
+            start = {"velocity": [np.sqrt(s * g), 0], "t_end": 9 / np.sqrt(g), "parameters": values}
+            run = stepper.integrate([0, -1], **start, **steps)
+            assert run.q[-1, 1] == pytest.approx(rest / 3, abs=1e-8), (number, steps)
+            assert abs(run.multipliers()[-1, 0]) < 1e-8 * m * g
+
+
+@pytest.mark.second
+def test_derivatives_through_events_have_the_remedy_of_their_message() -> None:
+    """The remedy of the message is followed: the tension as a formula of the state."""
+    changes = {v: f"0.9*{v}" for v in ("x_dot", "y_dot")}
+    start = {"velocity": [2.0, 0.0], "t_end": 1.2, "parameters": {"c": 1.0}}
+    refused = rope(sc.Event("lambda_1 + c", then=changes)).integrate([0, -1], **start)
+    with pytest.raises(sc.StateError, match="without multipliers: state the constraint force as a formula"):
+        refused.sensitivity()
+    stepper = rope(sc.Event(f"{TENSION} - c", then=changes))
+    run = stepper.integrate([0, -1], **start, tolerance=1e-12)
+    assert run.q[-1] == pytest.approx(refused.q[-1], abs=1e-7)
+    ends = [
+        stepper.integrate([0, -1], **start | {"parameters": {"c": 1.0, "g": g}}, tolerance=1e-12).q[-1]
+        for g in (1 - 1e-4, 1 + 1e-4)
+    ]
+    assert len(run.events[0].t) == 1
+    by_g = run.sensitivity().parameters[-1, :2, 1]
+    assert by_g == pytest.approx((ends[1] - ends[0]) / 2e-4, rel=1e-6)
+
+
 def of(text: str, coordinates: str, contacts: list[Any], method: str, **parameters: float) -> Any:
     """Return the stepper of a system with contacts."""
     system = sc.LagrangianSystem.from_text(
@@ -539,6 +592,10 @@ RESTS = sc.LagrangianSystem.from_text("rests", ["y"], "y_dot**2/2 - y", contacts
         (
             lambda: of(PLANE, "x y", [sc.friction("x_dot", limit="lambda_1")], "svi:2"),
             "lambda_1' in limit=.*contact.-g",
+        ),
+        (
+            lambda: sc.LagrangianSystem.from_text("f", ["x"], "x_dot**2", forces={"x": "-lambda_1*sign(x_dot)"}),
+            "contact.-g",
         ),
         (lambda: of(PLANE, "x y", [sc.contact("y")], "gauss:4"), "contacts|constraints"),
         (lambda: of("x_dot**2/2", "x", [sc.friction("x_dot", limit=1)], "composition:4"), "curves are not polynomials"),

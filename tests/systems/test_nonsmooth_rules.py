@@ -129,6 +129,20 @@ DRY: dict[str, tuple[str, dict[str, str], list[sc.Friction]]] = {
         {"x": "d*sign(y_dot - x_dot)", "y": "-d*sign(y_dot - x_dot) - d*sign(y_dot)/2"},
         [sc.friction("x_dot - y_dot", limit="d"), sc.friction("y_dot", limit="d/2")],
     ),
+    "on a side": ("x", {"x": "-d*sign(x_dot)*unit_step(x)"}, [sc.friction("x_dot", limit="d*unit_step(x)")]),
+    "by position": ("x", {"x": "-d*abs(x)*sign(x_dot)"}, [sc.friction("x_dot", limit="d*abs(x)")]),
+    "odd power": ("x", {"x": "-d*sign(x_dot**3)"}, [sc.friction("x_dot", limit="d")]),
+    "power of a sign": ("x", {"x": "-d*x_dot**3/abs(x_dot)**3"}, [sc.friction("x_dot", limit="d")]),
+    "normal force": ("x", {"x": "-d*abs(cos(t) - x)*sign(x_dot)"}, [sc.friction("x_dot", limit="d*abs(cos(t) - x)")]),
+    "quotient": ("x", {"x": "-d*x_dot/abs(x_dot)"}, [sc.friction("x_dot", limit="d")]),
+    "root": ("x", {"x": "-d*x_dot/sqrt(x_dot**2)"}, [sc.friction("x_dot", limit="d")]),
+    "pair": ("x", {"x": "d*unit_step(-x_dot) - d*unit_step(x_dot)"}, [sc.friction("x_dot", limit="d")]),
+    "parts": ("x", {"x": "-d*(positive_part(x_dot) + positive_part(-x_dot))/x_dot"}, [sc.friction("x_dot", limit="d")]),
+    "oblique": (
+        "x y",
+        {"x": "-d*cos(y)*sign(cos(y)*x_dot + x*y_dot)", "y": "-d*x*sign(cos(y)*x_dot + x*y_dot)"},
+        [sc.friction("cos(y)*x_dot + x*y_dot", limit="d")],
+    ),
     "in space": (
         "x y",
         {x: f"-d*({x}_dot - v)/sqrt((x_dot - v)**2 + (y_dot - v)**2) - {x}/9" for x in "xy"},
@@ -155,6 +169,26 @@ def test_forces_that_jump_along_a_slip_are_dry_friction(name: str, steps: dict[s
     assert [modes for _, modes in stated.contact_modes] == [modes for _, modes in expected.contact_modes]
     if name == "coulomb":
         assert stated.q[-1] == pytest.approx([-0.1], abs=1e-9)  # amplitudes 1, .7, .4, .1
+
+
+@STEPS
+@pytest.mark.second
+def test_sums_over_arrays_in_forces_are_dry_friction(steps: dict[str, float]) -> None:
+    """Of slips between elements, and of a size by the places of all."""
+    array = "x[2]", "sum(i in 2, x_dot[i]**2/2 - x[i]**2/2)"
+    for force, contacts in (
+        ("-d*sum(j in 2, sign(x_dot[i] + x_dot[j]))", [("x_dot[i] for i in 2", "d"), ("x_dot[0] + x_dot[1]", "d")]),
+        ("-d*sign(x_dot[i])*sum(j in 2, abs(x[j]))", [("x_dot[i] for i in 2", "d*abs(x[0]) + d*abs(x[1])")]),
+    ):
+        stated = lagrange("array", *array, forces={"x[i]": force}, d=0.15)
+        dry = [sc.friction(slip, limit=limit) for slip, limit in contacts]
+        friction = sc.compile_stepper(lagrange("array", *array, d=0.15), "svi:3", contacts=dry)
+        runs = [
+            stepper.integrate([1.0, 0.4], [0.0, 0.0], t_end=9.0, **steps)
+            for stepper in (sc.compile_stepper(stated, "svi:3"), friction)
+        ]
+        assert runs[0].q[-1] == pytest.approx(runs[1].q[-1], abs=1e-13)
+        assert len(runs[0].contact_modes) == len(runs[1].contact_modes) > 1
 
 
 @pytest.mark.tiers(0, 1)

@@ -67,7 +67,7 @@ from scvi_codegen.systems.formulas.table import functions_of
 
 DEGREE = 4
 JUDGES = 10
-"""Points of the quadrature that judges friction that varies along a slip: exact for the 2s knots of degrees up to 8."""
+"""Lobatto points that judge friction that varies along a slip, of order 18, above those 2s of degrees up to 8."""
 FUNCTIONS = {"controlled": "advance_to", "by_steps": "motion_terms"}
 """Functions of an integrator of adaptive steps, and of contacts by steps."""
 Formula: TypeAlias = "str | Expr | float"

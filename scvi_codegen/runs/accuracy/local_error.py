@@ -1,5 +1,6 @@
 """Warnings at the end of a run: steps too large for the motion, conserved energies that change, unresolved fields."""
 
+import math
 import sys
 from typing import Any, Final
 
@@ -59,9 +60,10 @@ def warn_of_large_steps(trajectory: SavedStates, *, before: float = 0.0, remedy:
         return
     if isinstance(trajectory.plan, Adaptive) or before > TOLERABLE_ERROR or not warnings_wanted():
         return
+    size = "unknown: parts of it have no solution" if math.isinf(error) else f"about {error:.1e} (estimated)"
     warn(
         f"the step size h = {trajectory.h:g} is too large: the relative error of the step from "
-        f"t = {trajectory.worst_step_time:g} is about {error:.1e} (estimated). Reduce h{remedy}",
+        f"t = {trajectory.worst_step_time:g} is {size}. Reduce h{remedy}",
         AccuracyWarning,
     )
 

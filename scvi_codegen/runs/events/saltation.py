@@ -415,7 +415,10 @@ def _derivatives(interface: Interface, event: Event) -> Callable[[Array, float, 
     new = dict(zip(indices, values, strict=True))
     symbols = set[Any]().union(*(formula.free_symbols for formula in (*formulas.functions, *values)))
     if symbols & {*formulas.multipliers}:
-        raise StateError(f"derivatives through the event {event.title} require formulas without multipliers")
+        raise StateError(
+            f"derivatives through the event {event.title} require formulas without multipliers: state the constraint "
+            "force as a formula of positions, velocities and time"
+        )
     if symbols & {*formulas.v} or any(index >= len(z) for index in indices):
         return None
     mapped = list(values) if event.is_wall else [new.get(k, unchanged) for k, unchanged in enumerate(z)]

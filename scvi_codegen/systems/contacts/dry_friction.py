@@ -33,8 +33,10 @@ if TYPE_CHECKING:
 
     from scvi_codegen.systems.lagrangian import LagrangianSystem
 
-STEPS = re.compile(r"\b(sign|sqrt|[aA]bs|where|unit_step|Heaviside|Piecewise|[mM]in|[mM]ax)\b")
-"""Functions of formulas that consist of steps, and the length of a slip."""
+STEPS = re.compile(
+    r"\b(sign|sqrt|[aA]bs|where|unit_step|positive_part|Heaviside|Piecewise|[mM]in|[mM]ax|acot)\b|\*\*\s*[-(.\d]*[.(/]"
+)
+"""Functions of formulas that consist of steps, and powers that may be the length of a slip, or its inverse."""
 STATES = 192
 """Random states at which a limit must not be negative: one that is so at 5 % of them is missed once in 20,000."""
 
@@ -98,7 +100,7 @@ def _divided_by_length(force: Expr, inverse: Expr) -> tuple[Expr, Expr]:
 
 def _divided(force: Expr, slip: Expr) -> tuple[Expr, Expr]:
     """Return the factor of sign(w) in a force, and its other terms; abs(w) = w sign(w) may be in both."""
-    from sympy import Add, Dummy, Mul, S
+    from sympy import Add, Dummy, Mul, Pow, S
 
     from scvi_codegen.systems.formulas.kinks import sign, switching_function, unit_step
 
@@ -107,7 +109,9 @@ def _divided(force: Expr, slip: Expr) -> tuple[Expr, Expr]:
     own = {part: (1 + orientation * side) / 2 for part, (u, orientation) in steps.items() if u == slip}
     if not own:
         return push, force
-    for term in Add.make_args(force.xreplace(own).xreplace({1 / side: side})):
+    sided = force.xreplace(own)
+    odd = {part: side ** (part.exp % 2) for part in sided.atoms(Pow) if part.base == side and part.exp.is_Integer}
+    for term in Add.make_args(sided.xreplace(odd)):
         slope = term.diff(side)
         if not slope.has(side):
             push, other = push + slope, other + term.xreplace({side: S.Zero})

@@ -181,12 +181,12 @@ class _Binding:
 
     def _check_multipliers(self, formula: Formula, role: str) -> Formula:
         """Raise for multipliers, which friction changes: they are unknowns of the contact problem, no numbers in it."""
+        from scvi_codegen.systems.formulas.grammar import declaration_of
+
         for name in re.findall(r"\blambda_\d+\b", str(formula)):
             if name not in self.names:
                 raise SystemDefinitionError(
-                    f"'{name}' in {role}='{formula}' of a contact of '{self.system.name}' is a multiplier, which "
-                    "contacts do not contain: in place of the constraint g give contact(g, slip=.., friction=..) and "
-                    "contact(-g, ..) with the same slip and friction: its limit is friction times the constraint force"
+                    f"'{name}' in {role}='{formula}' of a contact of '{self.system.name}': {declaration_of(name)}"
                 )
         return formula
 

@@ -171,7 +171,7 @@ def parse_force(
     forces = []
     for row in rows:
         targets, formula = (ArrayParser(part, symbols, arrays, tables) for part in (target, text))
-        targets.in_scope, formula.in_scope = dict(row), dict(row)
+        targets.in_scope, formula.in_scope, formula.has_loops = dict(row), dict(row), False
         slot, expression = parsed(targets), parsed(formula)
         loops = tuple(bound for bound in row.values() if isinstance(bound, Loop))
         term = term_of(loops, expression, formula.accesses)

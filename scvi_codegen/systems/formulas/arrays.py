@@ -191,7 +191,13 @@ def _shown(size: Size) -> str:
 
 
 class ArrayParser(_Indices):
-    """Parser for formulas with array entries and sums."""
+    """Parser for formulas with array entries and sums.
+
+    Attributes:
+        has_loops: whether a sum over whole axes may become a loop of its own, as in a Lagrangian but not in a force.
+    """
+
+    has_loops = True
 
     def __init__(
         self,
@@ -265,7 +271,8 @@ class ArrayParser(_Indices):
         inner = any(isinstance(bound, Loop) for bound in self.in_scope.values())
         if inner and len(loops) == 1 and loops[0].end.name:
             return self.convolution(loops[0], column)
-        if inner or (self.sizes and all(not loop.first.name and not loop.end.name for loop in loops)):
+        numbers = self.sizes and all(not loop.first.name and not loop.end.name for loop in loops)
+        if inner or numbers or not self.has_loops:
             return self.written_out(loops, column)
         self.in_scope |= {loop.index: loop for loop in loops}
         formula = self.sum() * self.inside(loops)

@@ -84,6 +84,19 @@ _VALUES_ELSEWHERE = {"EulerGamma": 0.5772156649015329, "Catalan": 0.915965594177
 """Constants of SymPy, C and NumPy that are written otherwise here, or are parameters."""
 
 
+def declaration_of(name: str) -> str:
+    """Return how to declare an unknown name; of a multiplier, which is no number, what to write in its place."""
+    if re.fullmatch(r"lambda_\d+", name):
+        return (
+            "multipliers are names of events alone, of systems with constraints. Friction by the force of a constraint "
+            "g = 0 is that of two contacts in its place, contact(g, slip=.., friction=..) and contact(-g, ..) with the "
+            "same slip and friction: its limit is friction times the constraint force"
+        )
+    constant = _VALUES_ELSEWHERE.get(name, 1.0)
+    in_file = f"in files [parameters] {name} = {constant}"
+    return f"declare a constant as a parameter: parameters={{'{name}': {constant}}}, {in_file}"
+
+
 class Token(NamedTuple):
     """Token of a formula: a number, a name, an operator or the end."""
 
@@ -371,14 +384,10 @@ class Parser:
             self.refuse(f"'{name}' is not a function of the grammar{names}", column)
         value = self.symbols.get(name, CONSTANTS.get(name, REWRITTEN_CONSTANTS.get(name)))
         if value is None:
-            names, constant = ", ".join([*self.symbols, *CONSTANTS]), _VALUES_ELSEWHERE.get(name, 1.0)
-            declared = (
-                f"declare a constant as a parameter: parameters={{'{name}': {constant}}}, in files [parameters] "
-                f"{name} = {constant}"
-            )
+            names = ", ".join([*self.symbols, *CONSTANTS])
             spelled = {other: symbol for symbol in self.symbols for other in _spellings(symbol)} | _CONSTANTS_ELSEWHERE
             hint = f"; did you mean '{spelled[name]}'?" if name in spelled else closest(name, self.symbols)
-            self.refuse(f"unknown name '{name}'{hint} Known here: {names}; {declared}", column)
+            self.refuse(f"unknown name '{name}'{hint} Known here: {names}; {declaration_of(name)}", column)
         return value
 
     def call(self, name: str, function: Callable[..., Expr], column: int) -> Expr:

@@ -428,20 +428,18 @@ static int judge_slips(const event_step *step, const event_sample *left, const e
 }
 #endif
 
-/* Lets the error of a run contain that of a part of a fixed step which a change bounds, up to `at`: the difference from
- * its two halves, without rounding, of positions and of velocities in the length of the step, relative to the motion in
- * it and the largest one in a step so far: rebounds may leave none. A short part in a stiff wall may change the
- * velocity of all that follows. */
-static int judge_part(event_run *run, const event_step *step, const event_sample *left, const event_sample *at,
-    real part)
+/* Error of a part of a fixed step up to `at`: the difference from its two halves, without rounding, of positions and of
+ * velocities in the length of the step, relative to the motion in it and to the largest one in a step so far, which it
+ * enlarges: rebounds may leave none. A short part in a stiff wall may change the velocity of all that follows. Fails if
+ * a half is not solved. */
+static int error_of_part(const event_step *step, const event_sample *left, const event_sample *at, real part,
+    real *largest_motion, real *error)
 {
   const real duration = fabs(step->whole);
-  real *const v = step->memory + 2 * M, *const v_at = v + M, far = 0.0, fast = DBL_MIN, error = 0.0;
+  real *const v = step->memory + 2 * M, *const v_at = v + M, far = 0.0, fast = DBL_MIN;
   event_sample middle = {.t = left->t + 0.5 * part, .q = v, .p = v_at};
   event_sample end = {.q = step->memory, .p = step->memory + M};
-  event_run own = *run;
-  if (!(NAME(step_error)(run) >= 0.0)) /* the method has no estimate */
-    return OK;
+  *error = 0.0;
   TRY(step_from_left(step, left, 0.5 * part, &middle));
   TRY(step_from_left(step, &middle, 0.5 * part, &end));
   TRY(NAME(velocity)(at->t, at->q, at->p, step->parameters, v_at, step->workspace));
@@ -451,17 +449,32 @@ static int judge_part(event_run *run, const event_step *step, const event_sample
     fast = fmax(fast, fmax(fabs(v[i]), fabs(v_at[i])));
   }
   const real rounding = CHANGE_SAFETY * DBL_EPSILON * far * (1.0 + duration / fabs(part));
-  const real largest = fmax(duration * fast, run->largest_motion);
+  const real largest = *largest_motion = fmax(duration * fast, *largest_motion);
   for (int i = 0; i < M; i++) {
     const real apart = fabs(end.q[i] - at->q[i]) + duration * fabs(v[i] - v_at[i]);
-    error = fmax(error, (apart - rounding) / (duration * fmax(fabs(v[i]), fabs(v_at[i])) + largest));
-  }
-  own.error = 2.0;
-  if (error > NAME(step_error)(run)) {
-    run->error = pow(error, 1.0 / log2(NAME(step_error)(&own))); /* of which step_error is a power */
-    run->error_t = left->t;
+    *error = fmax(*error, (apart - rounding) / (duration * fmax(fabs(v[i]), fabs(v_at[i])) + largest));
   }
   return OK;
+}
+
+/* Lets the error of a run contain that of a part of a fixed step which a change bounds, in units of the motion that it
+ * enlarges; NaN, an unknown error, if a half is not solved: it judges the part, which is. */
+static void judge_part(event_run *run, const event_step *step, const event_sample *left, const event_sample *at,
+    real part)
+{
+  const event_run unit = {.error = 2.0};
+  const real before = NAME(step_error)(run), motion = run->largest_motion;
+  real error;
+  if (!(before >= 0.0 && before < INFINITY)) /* the method has no estimate, or the error is unknown */
+    return;
+  if (error_of_part(step, left, at, part, &run->largest_motion, &error) != OK)
+    error = NAN;
+  if (motion > 0.0)
+    run->error *= motion / run->largest_motion;
+  if (!(error <= NAME(step_error)(run))) {
+    run->error = pow(error, 1.0 / log2(NAME(step_error)(&unit))); /* of which step_error is a power */
+    run->error_t = left->t;
+  }
 }
 
 /* Sets the state of a run after a change: of an adaptive step, or of the last part of a fixed one. */
@@ -604,7 +617,9 @@ static int judge_end(const event_step *step, event_run *run, const event_sample 
   if (control)
     TRY(judge_slips(step, left, at, part, control->tolerance));
 #endif
-  return !control && is_bounded ? judge_part(run, step, left, at, part) : OK;
+  if (!control && is_bounded)
+    judge_part(run, step, left, at, part);
+  return OK;
 }
 
 /* Changes the state at the start of a run; *starts: whether there are changes, *ends: whether the step ends with
