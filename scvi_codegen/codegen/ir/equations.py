@@ -158,8 +158,10 @@ class Constraints:
         masked: number of the last constraints, which are imposed in some modes only.
         coefficients: friction, static friction and restitution of each contact at u = (q, v), or ``None``.
         coefficient_rounding: bounds of their rounding errors, in units of the round-off.
-        motion_by_steps: L_v and L_q + f without contacts at u = (q, v), then their derivatives in ``motion_entries``,
-            columns (q, v); ``None`` if the method has no steps of contacts.
+        motion_by_steps: L_v and L_q + f without contacts at u = (q, v), then derivatives in ``motion_places``; ``None``
+            if the method has no steps of contacts.
+        masses_by_steps: the same without the derivatives after the first ``motion_masses``.
+        motion_places: of these derivatives in the matrices L_vv (lower half), L_vq and f_v by rows.
         drifts: rates of the constraints at rest, by time.
     """
 
@@ -174,7 +176,9 @@ class Constraints:
     coefficients: Kernel | None = None
     coefficient_rounding: Kernel | None = None
     motion_by_steps: Kernel | None = None
-    motion_entries: tuple[tuple[int, int], ...] = ()
+    masses_by_steps: Kernel | None = None
+    motion_places: tuple[int, ...] = ()
+    motion_masses: int = 0
     drifts: Kernel | None = None
 
     def __len__(self) -> int:
@@ -189,7 +193,8 @@ class Constraints:
     def kernels(self) -> tuple[Kernel | None, ...]:
         """Those that the constraints have, in the order of emission."""
         reactions = self.reactions, self.coefficients, self.coefficient_rounding
-        return self.kernel, self.rounding, self.motion, *reactions, self.motion_by_steps, self.drifts
+        by_steps = self.motion_by_steps, self.masses_by_steps, self.drifts
+        return self.kernel, self.rounding, self.motion, *reactions, *by_steps
 
 
 NO_CONSTRAINTS = Constraints()

@@ -364,22 +364,33 @@ def _steps_of_contacts(system: LagrangianSystem) -> dict[str, Any]:
     forms = forms_of(system)
     if not forms.has_quadratic_energy or system.damping != 0:
         return {}
+    m, u = system.dimension, (*system.coordinates, *system.velocities)
     values = [value.xreplace(idle) for value in (*forms.momentum, *forms.force)]
-    by_state = jacobian(values, (*system.coordinates, *system.velocities))
-    partials = {(i, j): entry for (i, j), entry in by_state.items() if i < system.dimension or j >= system.dimension}
+    by_state = jacobian(values[:m], u)  # one for L_vq and L_vv, whose entries share terms
+    masses = {i * m + j - m: entry for (i, j), entry in by_state.items() if m <= j <= i + m}
+    mixed = {(m + i) * m + j: entry for (i, j), entry in by_state.items() if j < m}
+    forces = [force.xreplace(idle) for force in system.forces]
+    damping = {(2 * m + i) * m + j: entry for (i, j), entry in jacobian(forces, system.velocities).items()}
+    partials = masses | mixed | damping
     still = {reaction.active: Integer(1) for reaction in system.reactions} | dict.fromkeys(
         system.velocities, Integer(0)
     )
+    kernel = partial(system_kernel, system, u=u)
     return {
-        "motion_by_steps": system_kernel(
-            system,
+        "motion_by_steps": kernel(
             "motion_by_steps",
             values,
-            u=(*system.coordinates, *system.velocities),
             partials=partials.values(),
-            purpose="L_v and L_q + f without contacts, and their derivatives but L_qq, at u = (q, v).",
+            purpose="L_v and L_q + f without contacts, the lower half of L_vv, then L_vq and f_v, at u = (q, v).",
         ),
-        "motion_entries": tuple(partials),
+        "masses_by_steps": kernel(
+            "masses_by_steps",
+            values,
+            partials=masses.values(),
+            purpose="L_v and L_q + f without contacts, and the lower half of L_vv, at u = (q, v).",
+        ),
+        "motion_places": tuple(partials),
+        "motion_masses": len(masses),
         "drifts": system_kernel(
             system,
             "drifts",

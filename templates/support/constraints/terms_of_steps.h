@@ -1,18 +1,25 @@
 #include "constraints.h"
 
-/* What contacts by steps (run/contact_steps.h) are made of. Requires: the kernels motion_by_steps, constraints, drifts
- * and contact_coefficients. */
+/* What contacts by steps (run/contact_steps.h) are made of. Requires: the kernels motion_by_steps, masses_by_steps,
+ * constraints, drifts and contact_coefficients. */
 
-int NAME(motion_terms)(real t, const real *q, const real *v, const real *parameters, real *terms)
+/* With `all` also L_vq and f_v; entries that are always 0 are not written. */
+int NAME(motion_terms)(real t, const real *q, const real *v, const real *parameters, int all, real *terms)
 {
-  real u[2 * M], derivative[MOTION_ENTRIES], *const by_state = terms + 2 * M;
+  real u[2 * M], derivative[MOTION_ENTRIES], *const mass = terms + 2 * M;
+  const int count = all ? MOTION_ENTRIES : MOTION_MASSES;
   memcpy(u, q, sizeof(real) * M);
   memcpy(u + M, v, sizeof(real) * M);
-  motion_by_steps(u, t, parameters, terms, derivative);
-  memset(by_state, 0, sizeof(real) * 4 * M * M);
-  for (int e = 0; e < MOTION_ENTRIES; e++)
-    by_state[MOTION_ENTRY[e][0] * 2 * M + MOTION_ENTRY[e][1]] = derivative[e];
-  return all_finite(terms, 2 * M) && all_finite(derivative, MOTION_ENTRIES) ? OK : NOT_FINITE;
+  if (all)
+    motion_by_steps(u, t, parameters, terms, derivative);
+  else
+    masses_by_steps(u, t, parameters, terms, derivative);
+  for (int e = 0; e < count; e++)
+    mass[MOTION_PLACE[e]] = derivative[e];
+  for (int i = 0; i < M; i++)
+    for (int j = 0; j < i; j++)
+      mass[j * M + i] = mass[i * M + j];
+  return all_finite(terms, 2 * M) && all_finite(derivative, count) ? OK : NOT_FINITE;
 }
 
 /* Friction, static friction and restitution of the contacts. */
@@ -25,6 +32,7 @@ int NAME(contact_laws)(real t, const real *q, const real *v, const real *paramet
   return OK;
 }
 
+/* Entries of G that are always 0 are not written. */
 int NAME(row_terms)(real t, const real *q, const real *v, const real *parameters, real *terms)
 {
   real u[2 * M], derivative[CONSTRAINT_ENTRIES], *const G = terms + 2 * CONSTRAINTS;
@@ -32,7 +40,6 @@ int NAME(row_terms)(real t, const real *q, const real *v, const real *parameters
   memcpy(u + M, v, sizeof(real) * M);
   constraints(u, t, parameters, terms, derivative);
   drifts(u, t, parameters, terms + CONSTRAINTS);
-  memset(G, 0, sizeof(real) * CONSTRAINTS * M);
   for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
     G[CONSTRAINT_ENTRY[e][0] * M + CONSTRAINT_ENTRY[e][1]] = derivative[e];
   contact_coefficients(u, t, parameters, G + CONSTRAINTS * M);

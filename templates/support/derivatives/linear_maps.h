@@ -238,7 +238,7 @@ static void swap_wide(wide *a, wide *b)
   *b = kept;
 }
 
-/* Subtracts multiples of row k in the forward substitution with the factors, or its transpose; see eliminate. */
+/* Subtracts multiples of row k in the forward substitution with the factors, or its transpose; see back_substitute. */
 static void lower_wide(const real *a, const band *shape, const real *pivot, int k, int back, wide *x)
 {
   const real *column = a + shape->first + k * shape->stride;

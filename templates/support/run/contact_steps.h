@@ -25,9 +25,9 @@ enum {
 
 typedef NAME(contact_memory) contact_memory;
 
-/* Momenta L_v, forces L_q + f, and their derivatives by rows, columns (q, v). */
+/* Momenta L_v, forces L_q + f, L_vv, L_vq and f_v by rows: (L_q + f)_v = L_vq^T + f_v. */
 typedef struct {
-  real momentum[M], force[M], by_state[2 * M][2 * M];
+  real momentum[M], force[M], mass[M][M], mixed[M][M], damping[M][M];
 } motion_terms;
 
 /* Values of all rows, rates at rest, and G; coefficients of the contacts. */
@@ -94,7 +94,7 @@ static int factorise_step(const real (*A)[M], const motion_terms *of, const row_
   memset(to->matrix, 0, sizeof to->matrix);
   for (int i = 0; i < M; i++)
     for (int j = 0; j < M; j++)
-      to->matrix[j * STEP_SIZE + i] = A ? A[i][j] : of->by_state[i][M + j];
+      to->matrix[j * STEP_SIZE + i] = A ? A[i][j] : of->mass[i][j];
   for (int c = 0; c < STEP_FIXED; c++)
     for (int i = 0; i < M; i++) {
       to->matrix[(M + c) * STEP_SIZE + i] = -forces->G[c][i];
@@ -149,26 +149,25 @@ static void keep_responses(const responses *from, responses *to)
     memcpy(to->x[i], from->x[i], BYTES(from->count));
 }
 
-/* W of a problem, a part of G times responses. */
+/* W of a problem, a part of G times responses; neighbouring sums are of different rows, which no sum waits for. */
 static void pose_matrix(contact_step *in, const row_terms *rows, const responses *of, real part)
 {
-  for (int r = 0; r < of->count; r++) {
-    real *const W = in->W + r * CONTACT_ROWS;
-    memset(W, 0, BYTES(of->count));
-    for (int i = 0; i < M; i++)
-      subtract(of->x[i], -part * rows->G[in->row[r]][i], 0, of->count, W);
-  }
+  for (int r = 0; r < of->count; r++)
+    memset(in->W + r * CONTACT_ROWS, 0, BYTES(of->count));
+  for (int i = 0; i < M; i++)
+    for (int r = 0; r < of->count; r++)
+      subtract(of->x[i], -part * rows->G[in->row[r]][i], 0, of->count, in->W + r * CONTACT_ROWS);
 }
 
-/* Terms at the end, and with `first` at the start, at the velocity of the step. */
+/* Terms at the end, and with `first` at the start and with further derivatives, at the velocity of the step. */
 static int terms_between(contact_step *in, int first)
 {
   real v[M];
   for (int i = 0; i < M; i++)
     v[i] = (in->q1[i] - in->q[i]) / in->h;
   if (first)
-    TRY(NAME(motion_terms)(in->t, in->q, v, in->idle, in->first.momentum));
-  TRY(NAME(motion_terms)(in->t + in->h, in->q1, v, in->idle, in->last.momentum));
+    TRY(NAME(motion_terms)(in->t, in->q, v, in->idle, 1, in->first.momentum));
+  TRY(NAME(motion_terms)(in->t + in->h, in->q1, v, in->idle, first, in->last.momentum));
   return NAME(row_terms)(in->t + in->h, in->q1, v, in->imposed, in->end.value);
 }
 
@@ -218,8 +217,8 @@ static int linearise_step(contact_step *in, real *x)
     x[i] = in->p[i] + 0.5 * (in->h * in->first.force[i] - in->first.momentum[i] - in->last.momentum[i]);
     for (int j = 0; j < M; j++)
       A[i][j] = 0.5 *
-          ((in->first.by_state[i][M + j] + in->last.by_state[i][M + j]) / in->h + in->last.by_state[i][j] -
-              in->first.by_state[M + i][M + j]);
+          ((in->first.mass[i][j] + in->last.mass[i][j]) / in->h + in->last.mixed[i][j] - in->first.mixed[j][i] -
+              in->first.damping[i][j]);
   }
   for (int c = 0; c < STEP_FIXED; c++)
     x[M + c] = -in->end.value[c];
@@ -307,7 +306,7 @@ static real norm_of(const contact_step *in, const real *x)
   real sum = 0.0;
   for (int i = 0; i < M; i++)
     for (int j = 0; j < M; j++)
-      sum += x[i] * in->first.by_state[i][M + j] * x[j];
+      sum += x[i] * in->first.mass[i][j] * x[j];
   return sqrt(fmax(sum, 0.0));
 }
 
@@ -414,7 +413,7 @@ static int find_positions(contact_step *in, const contact_memory *from)
             pushes_as_before(in, from)))
       continue;
     for (int i = 0; i < M; i++) /* L_v is linear in v */
-      in->first.momentum[i] += times_row(in->first.by_state[i] + M, x) / in->h;
+      in->first.momentum[i] += times_row(in->first.mass[i], x) / in->h;
     TRY(terms_between(in, 0));
     const int contacts = in->problem.contacts; /* those join whose gaps only the forces of others close */
     TRY(find_near(in, from, still, 0.0));
@@ -433,7 +432,7 @@ static real half_product(const contact_step *in, const real *v, const real *w)
   real sum = 0.0;
   for (int i = 0; i < M; i++)
     for (int j = 0; j < M; j++)
-      sum += 0.5 * v[i] * in->last.by_state[i][M + j] * w[j];
+      sum += 0.5 * v[i] * in->last.mass[i][j] * w[j];
   return sum;
 }
 
@@ -539,7 +538,7 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   for (int i = 0; i < M; i++) {
     before[i] = 0.5 * (in->h * in->last.force[i] + in->first.momentum[i] - in->last.momentum[i]);
     for (int j = 0; j < M; j++)
-      before[i] += in->last.by_state[i][M + j] * (in->q1[j] - in->q[j]) / in->h;
+      before[i] += in->last.mass[i][j] * (in->q1[j] - in->q[j]) / in->h;
   }
   for (int c = 0; c < STEP_FIXED; c++)
     before[M + c] = -in->end.drift[c];
@@ -672,7 +671,7 @@ static int step_by_steps(contact_step *in, contact_memory *memory, real t, real 
     for (int i = 0; i < M; i++) { /* L_v is linear in v */
       p[i] = in->last.momentum[i];
       for (int j = 0; j < M; j++)
-        p[i] += in->last.by_state[i][M + j] * (next.v[j] - (in->q1[j] - in->q[j]) / h);
+        p[i] += in->last.mass[i][j] * (next.v[j] - (in->q1[j] - in->q[j]) / h);
     }
     memcpy(q, in->q1, BYTES(M));
     *memory = next;
