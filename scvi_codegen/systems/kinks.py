@@ -70,6 +70,7 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
             mode=mode.name,
             power_sides=tuple(side for side in (-1, 1) if (u, side) in sides),
             held=_held(u, system),
+            lacks=_lacks(u, system),
         )
         for u, mode in modes.items()
     )
@@ -132,6 +133,15 @@ def _held(u: Expr, system: MechanicalSystem) -> str:
         rate = sum(terms, row.diff(system.time))
         held |= {str(reaction.active) for part in (row, rate) if switching_function(part)[0] == u}
     return " + ".join(sorted(held)) or "0"
+
+
+def _lacks(u: Expr, system: MechanicalSystem) -> str:
+    """Return why jumps of forces at u = 0 are no dry friction, empty without velocities in u."""
+    from scvi_codegen.systems.contacts.dry_friction import violated_condition
+
+    if u.free_symbols.isdisjoint(getattr(system, "velocities", ())):
+        return ""
+    return violated_condition(system, u) or "an svi: has no quadrature= with contacts, and at most 192 gaps and slips"
 
 
 def _flat(values: Iterable[Any]) -> Iterator[Expr]:
