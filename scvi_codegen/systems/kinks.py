@@ -103,11 +103,17 @@ def _parities(formulas: Iterable[Expr], system: MechanicalSystem) -> dict[Expr, 
     Images of particles in a periodic box, whose forces end before, have no such change.
     """
     wholes = [part for part in parts_of_type(rint, *formulas) if _moves(part, system)]
-    wholes = [part for part in wholes if not parts_of_type(rint, part.args[0]) and _is_written(part)]
+    wholes = [part for part in wholes if _is_written(part)]
     if system.lengths or len(wholes) > MOST_KINKS:
         return {}
     moving = {*system.coordinates, *system.velocities, *system.auxiliaries, system.time}
     changing = [n for n in wholes if any(changes_with(n, f, moving, system.constants) for f in formulas)]
+    for outer in changing:
+        if parts_of_type(rint, outer.args[0]):
+            raise MethodError(
+                f"'{system.text_of(outer)}' of '{system.name}' contains whole numbers in others, whose changes are not "
+                "located: write rint(u + n) with a whole n as rint(u) + n, and other steps with unit_step(..)"
+            )
     return {n: by_parity(n.args[0]) for n in changing}
 
 
