@@ -61,7 +61,7 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
     rules = steps_on_sides(located, modes)
     factors = {power: step for power, step in powers.items() if step in rules}
     rules |= {power: rules[step] * power for power, step in factors.items()}
-    jumps = set(_jumps(system))
+    jumps, lacks = set(_jumps(system)), _lacks(arguments, system)
     jumps = arguments if jumps and len(arguments) > MOST_SURFACES else jumps
     sides = {switching_function(step.args[0]) for step in factors.values()}
     kinks = tuple(
@@ -70,7 +70,7 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
             mode=mode.name,
             power_sides=tuple(side for side in (-1, 1) if (u, side) in sides),
             held=_held(u, system),
-            lacks=_lacks(u, system),
+            lacks=lacks.get(u, ""),
         )
         for u, mode in modes.items()
     )
@@ -141,13 +141,15 @@ def _held(u: Expr, system: MechanicalSystem) -> str:
     return " + ".join(sorted(held)) or "0"
 
 
-def _lacks(u: Expr, system: MechanicalSystem) -> str:
-    """Return why jumps of forces at u = 0 are no dry friction, empty without velocities in u."""
-    from scvi_codegen.systems.contacts.dry_friction import violated_condition
+def _lacks(arguments: Iterable[Expr], system: MechanicalSystem) -> dict[Expr, str]:
+    """Return why forces that jump at zeros of functions of velocities are no dry friction."""
+    from scvi_codegen.systems.contacts.dry_friction import violated_conditions
 
-    if u.free_symbols.isdisjoint(getattr(system, "velocities", ())):
-        return ""
-    return violated_condition(system, u) or "an svi: has no quadrature= with contacts, and at most 192 gaps and slips"
+    rates = {*getattr(system, "velocities", ())}
+    slips = [u for u in arguments if not rates.isdisjoint(u.free_symbols)]
+    violated = violated_conditions(system) if slips else {}
+    without = "an svi: has no quadrature= with contacts, and at most 192 gaps and slips"
+    return {u: violated.get(u, "contacts are not available with this system") or without for u in slips}
 
 
 def _flat(values: Iterable[Any]) -> Iterator[Expr]:

@@ -60,18 +60,17 @@ def with_dry_friction(system: Any) -> Any:
     return replace(system, forces=forces, contacts=whole)
 
 
-def violated_condition(system: Any, slip: Expr) -> str:
-    """Return why forces that jump where a slip vanishes are no dry friction; empty if their jumps are.
+def violated_conditions(system: Any) -> dict[Expr, str]:
+    """Return why forces that jump where a slip vanishes are no dry friction, by slip; empty if they are.
 
-    Those of systems without contacts, and of methods without constraints, stay forces although they are.
+    Those of methods without contacts, and of more than these may have, stay forces although they are.
     """
     from scvi_codegen.systems.lagrangian import LagrangianSystem
 
     if not isinstance(system, LagrangianSystem) or isinstance(system, OfRunTimeSizes) or _lacks_friction(system):
-        return "contacts are not available with this system"
-    found = [_friction_of(system, w, divided, system.forces) for w, divided in _slips(system) if w == (slip,)]
-    reasons = [reason for reason in found if isinstance(reason, str)]
-    return next(iter(reasons), "" if found else "it is not among the arguments of the forces")
+        return {}
+    found = {slip: _friction_of(system, slip, divided, system.forces) for slip, divided in _slips(system)}
+    return {slip[0]: of if isinstance(of, str) else "" for slip, of in found.items() if len(slip) == 1}
 
 
 def _lacks_friction(system: LagrangianSystem) -> bool:
