@@ -101,8 +101,9 @@ int two_point_pendulum_advance(two_point_pendulum_run *run, long long steps, lon
     two_point_pendulum_report *report, double *workspace);
 /* Returns an estimate of the relative error of the worst step of a run so far, which began at run->error_t: from the
  * last coefficients of the polynomials of each step, relative to its motion (with a fixed step size, to the largest
- * one of the run). Returns -1 if there is no estimate: for explicit methods, for methods with too few points, and in
- * code for microcontrollers (single or double precision) with fixed step size, which leaves it out to save memory. */
+ * one of the run); infinite if it is unknown, since parts of a step have no solution. Returns -1 if there is no
+ * estimate: for explicit methods, for methods with too few points, and in code for microcontrollers (single or double
+ * precision) with fixed step size, which leaves it out to save memory. */
 double two_point_pendulum_step_error(const two_point_pendulum_run *run);
 
 /* Discrete Lagrangian L_d(q0, q1) and its discrete Legendre transforms p0 = -D1 L_d (F-), p1 = D2 L_d (F+). */

@@ -643,7 +643,9 @@ def _friction_of(system: Any) -> tuple[tuple[str, str], ...]:
 
 def _modes_of(kinks: Iterable[Kink]) -> tuple[tuple[str, ...], ...]:
     """Return the modes of kinks in an interface."""
-    return tuple((u.mode, str(u.function), "jumps" * u.is_wall, u.held, *map(str, u.power_sides)) for u in kinks)
+    return tuple(
+        (u.mode, str(u.function), "jumps" * u.is_wall, u.held, u.lacks, *map(str, u.power_sides)) for u in kinks
+    )
 
 
 @checks_arguments(system=MechanicalSystem.KIND, symmetries=SYMMETRIES)

@@ -66,9 +66,8 @@ PASSED = (
 )
 SLIDING = (
     "the motion slides on {function} = 0 at t = {t:.17g}: the forces on both sides of this jump point to it (a relay). "
-    "It sticks there, by an svi: without quadrature=, if the jump is friction: -2*F*d(slip)/d(velocity) in the force "
-    "of each velocity, the reaction too, F >= 0 at all states. Write it so, as sc.friction(slip, limit=F), or as a "
-    "smooth force such as tanh(u/width), or end the run there"
+    "It is no dry friction, which sticks there: {lacks}. Write it as sc.friction(slip, limit=F) with F >= 0 at all "
+    "states and the reaction on other bodies, or as a smooth force such as tanh(u/width), or end the run there"
 )
 CORNER = (
     "the motion rests in the corner {function} = 0 at t = {t:.17g}: the forces on both sides point to it and balance "
@@ -210,11 +209,13 @@ class Kink(Event):
         mode: parameter that is added to u: 0, or a number beyond all values of u, whose sign then decides.
         power_sides: signs of u with powers of it that are not whole, so that motions there are not smooth at u = 0.
         held: sum of the masks of contacts that keep u at 0, where it has no zeros.
+        lacks: the condition of dry friction that a force which jumps at u = 0 violates, if u contains velocities.
     """
 
     mode: str = field(kw_only=True)
     power_sides: tuple[int, ...] = field(default=(), kw_only=True)
     held: str = field(default="0", kw_only=True)
+    lacks: str = field(default="", kw_only=True)
 
     @property
     def changes_state(self) -> bool:

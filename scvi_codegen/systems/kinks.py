@@ -61,7 +61,7 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
     rules = steps_on_sides(located, modes)
     factors = {power: step for power, step in powers.items() if step in rules}
     rules |= {power: rules[step] * power for power, step in factors.items()}
-    jumps = set(_jumps(system))
+    jumps, lacks = set(_jumps(system)), _lacks(arguments, system)
     jumps = arguments if jumps and len(arguments) > MOST_SURFACES else jumps
     sides = {switching_function(step.args[0]) for step in factors.values()}
     kinks = tuple(
@@ -70,6 +70,7 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
             mode=mode.name,
             power_sides=tuple(side for side in (-1, 1) if (u, side) in sides),
             held=_held(u, system),
+            lacks=lacks.get(u, ""),
         )
         for u, mode in modes.items()
     )
@@ -102,11 +103,17 @@ def _parities(formulas: Iterable[Expr], system: MechanicalSystem) -> dict[Expr, 
     Images of particles in a periodic box, whose forces end before, have no such change.
     """
     wholes = [part for part in parts_of_type(rint, *formulas) if _moves(part, system)]
-    wholes = [part for part in wholes if not parts_of_type(rint, part.args[0]) and _is_written(part)]
+    wholes = [part for part in wholes if _is_written(part)]
     if system.lengths or len(wholes) > MOST_KINKS:
         return {}
     moving = {*system.coordinates, *system.velocities, *system.auxiliaries, system.time}
     changing = [n for n in wholes if any(changes_with(n, f, moving, system.constants) for f in formulas)]
+    for outer in changing:
+        if parts_of_type(rint, outer.args[0]):
+            raise MethodError(
+                f"'{system.text_of(outer)}' of '{system.name}' contains whole numbers in others, whose changes are not "
+                "located: write rint(u + n) with a whole n as rint(u) + n, and other steps with unit_step(..)"
+            )
     return {n: by_parity(n.args[0]) for n in changing}
 
 
@@ -132,6 +139,17 @@ def _held(u: Expr, system: MechanicalSystem) -> str:
         rate = sum(terms, row.diff(system.time))
         held |= {str(reaction.active) for part in (row, rate) if switching_function(part)[0] == u}
     return " + ".join(sorted(held)) or "0"
+
+
+def _lacks(arguments: Iterable[Expr], system: MechanicalSystem) -> dict[Expr, str]:
+    """Return why forces that jump at zeros of functions of velocities are no dry friction."""
+    from scvi_codegen.systems.contacts.dry_friction import violated_conditions
+
+    rates = {*getattr(system, "velocities", ())}
+    slips = [u for u in arguments if not rates.isdisjoint(u.free_symbols)]
+    violated = violated_conditions(system) if slips else {}
+    without = "an svi: has no quadrature= with contacts, and at most 192 gaps and slips"
+    return {u: violated.get(u, "contacts are not available with this system") or without for u in slips}
 
 
 def _flat(values: Iterable[Any]) -> Iterator[Expr]:

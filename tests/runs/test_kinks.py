@@ -13,7 +13,7 @@ import pytest
 from kinks import KINDS, METHODS, stepper_of, wrong
 from nonsmooth import FAMILIES, Case, case_of
 from notation import lagrange
-from scipy.integrate import quad
+from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 
 import scvi_codegen as sc
@@ -292,3 +292,42 @@ def test_derivatives_of_rest_on_a_constraint(constraint):
             derive()
     with pytest.warns(sc.AccuracyWarning, match=re.escape("-x**2*unit_step(x) - x**2/4 + y")):
         stepper.integrate([1e-3, 0.0], [0.0, 0.0], h=0.1, steps=1)
+
+
+def between_whole_numbers(a, b, c, of, x, v, t_end):
+    """Return the state of x'' = -x + c n, n the whole number nearest to a of(x, v, t) + b, by DOP853 between jumps."""
+    t, y, n = 0.0, np.array([x, v]), np.rint(a * of(x, v, 0.0) + b)
+    while t < t_end:
+        ends = [lambda t, y, n=n, side=side: a * of(*y, t) + b - n - side / 2 for side in (-1, 1)]
+        for side, end in zip((-1, 1), ends, strict=True):
+            end.terminal, end.direction = True, side
+        rates = lambda t, y, n=n: [y[1], -y[0] + c * n]  # noqa: E731
+        run = solve_ivp(rates, (t, t_end), y, "DOP853", events=ends, rtol=1e-13, atol=1e-14, max_step=0.02)
+        t, y, n = run.t[-1], run.y[:, -1], n + len(run.t_events[1]) - len(run.t_events[0])
+    return y
+
+
+OF = {"x": lambda x, v, t: x, "x_dot": lambda x, v, t: v, "t": lambda x, v, t: t}
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("of", OF)
+def test_whole_numbers_in_forces_are_kinks(of):
+    """8 random forces each that jump with the whole number nearest to a place, a velocity or a time."""
+    force = {"x": f"-x + c*rint(a*{of} + b)"}
+    stepper = sc.compile_stepper(lagrange("whole", "x", "x_dot**2/2", forces=force, a=1.0, b=0.0, c=1.0), "svi:3")
+    for number in range(8):
+        a, b, x, v = np.random.default_rng([97, number]).uniform([0.5, -0.5, -1, 0.5], [2, 0.5, 1, 2])
+        c = {"x": 0.3, "x_dot": 0.2, "t": 0.1}[of] / a
+        exact = between_whole_numbers(a, b, c, OF[of], x, v, 4.0)
+        for steps in ({"h": 0.04}, {"tolerance": 1e-11}):
+            run = stepper.integrate([x], velocity=[v], t_end=4.0, parameters={"a": a, "b": b, "c": c}, **steps)
+            assert [run.q[-1, 0], run.velocity[-1, 0]] == pytest.approx(exact, abs=1e-7), (number, steps)
+
+
+def test_whole_numbers_in_whole_numbers_are_refused():
+    """The remedy is followed: rint(u + n) = rint(u) + n."""
+    with pytest.raises(sc.MethodError, match=r"rint\(u \+ n\) with a whole n as rint\(u\) \+ n"):
+        sc.compile_stepper(lagrange("whole", "x", "x_dot**2/2", forces={"x": "rint(x + rint(2*x))"}), "svi:3")
+    stepper = sc.compile_stepper(lagrange("whole", "x", "x_dot**2/2", forces={"x": "rint(x) + rint(2*x)"}), "svi:3")
+    assert len(stepper.modes) == 2

@@ -630,6 +630,30 @@ def test_what_is_refused_is_named(make: Any, message: str) -> None:
         make()
 
 
+REMEDIES = {
+    "friction": (sc.contact("y", slip="x_dot", friction="0.3 - x"), "friction must not be negative", "max(0, 0.3 - x)"),
+    "limit": (sc.friction("x_dot", limit="0.3 - x"), "friction must not be negative", "max(0, 0.3 - x)"),
+    "static_limit": (sc.friction("x_dot", limit=0.6, static_limit="0.7 - t"), "not be less than", "max(0.6, 0.7 - t)"),
+    "restitution": (sc.contact("y", restitution="1.4 - t"), "nor exceed 1", "max(0, min(1, 1.4 - t))"),
+    "jump": (sc.friction("x_dot", limit="where(x_dot > 0, 0.2, 0.1)"), "jumps .*static_limit= at rest", "0.1"),
+}
+"""Contacts that are refused, and what the message says in place of a formula."""
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("name", REMEDIES)
+def test_remedies_for_coefficients_of_contacts_are_followed(name: str) -> None:
+    """A body that falls, or is thrown along the ground."""
+    item, message, instead = REMEDIES[name]
+    falls = name == "restitution"
+    start = {"q": [0, 0.05 * falls], "velocity": [1.0 * (not falls), 0], "h": 0.05, "t_end": 4.0}
+    with pytest.raises(sc.ScviCodegenError, match=message):
+        of(f"{PLANE} - y", "x y", [item], "svi:3").integrate(**start)
+    followed = replace(item, **{"limit" if name == "jump" else name: instead})
+    run = of(f"{PLANE} - y", "x y", [followed], "svi:3").integrate(**start)
+    assert run.t[-1] == 4.0
+
+
 @pytest.mark.second
 def test_friction_of_a_constraint_by_its_force_is_that_of_two_contacts() -> None:
     """The remedy of the message: a bead on a ring in the plane, whose normal force changes its sign."""

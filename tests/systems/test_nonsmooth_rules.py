@@ -24,6 +24,7 @@
 | d x/d d = -8, d x/d mu, tippe top, shaken floors, balance | test_contact_derivatives, _of_bodies, _runs |
 """
 
+import re
 from typing import Any
 
 import numpy as np
@@ -203,6 +204,47 @@ def test_friction_is_part_of_steppers_of_either_precision(contacts: list[sc.Fric
 def test_other_jumps_are_no_friction(force: str) -> None:
     """Forces that supply energy, or may do so, that are continuous at rest, and of positions alone."""
     assert not made("x_dot**2/2 - x**2/2", forces={"x": force}, d=0.15).interface.contacts
+
+
+SPRINGS = "(x_dot**2 + y_dot**2 - x**2 - y**2)/2"
+NO_FRICTION: dict[str, tuple[dict[str, str], str, str]] = {
+    "reaction": (
+        {"x": "-d*sign(x_dot - y_dot)"},
+        "the force on y jumps otherwise than by -2*F*.*F = d",
+        "x_dot - y_dot",
+    ),
+    "negative": ({"x": "-d*sign(x_dot)*(1 + x_dot)"}, "F = .* is negative at some states", "x_dot"),
+    "not linear": ({"x": "-d*sign(sin(x_dot))"}, "it is not linear in the velocities", "x_dot"),
+    "across": ({"x": "-d*sign(x_dot)", "y": "-d*sign(x_dot)*x/9"}, "the force on y jumps otherwise", "x_dot"),
+    "quadrature": ({"x": "-d*sign(x_dot)"}, "an svi: has no quadrature= with contacts", "x_dot"),
+}
+"""Forces, the condition of dry friction that they violate, and the slip of what the remedy states."""
+
+
+@STEPS
+@pytest.mark.second
+@pytest.mark.parametrize("name", NO_FRICTION)
+def test_forces_that_are_no_friction_name_the_condition_and_have_remedies(name: str, steps: dict[str, float]) -> None:
+    """The message has the time of the stop, 1 + 3 pi or the second one behind it; each of its remedies is followed."""
+    forces, lacks, slip = NO_FRICTION[name]
+    method = {"method": "svi", "degree": 4, "quadrature": "gauss-legendre:4"} if name == "quadrature" else "svi:3"
+    start = {"q": [1.0, 0.0], "velocity": [0.0, 0.0], "t": 1.0, "t_end": 14.0, **steps}
+
+    def stepper(method: Any = "svi:3", contacts: Any = (), events: Any = (), **given: Any) -> Any:
+        system = lagrange("springs", "x y", SPRINGS, d=0.15, **given)
+        return sc.compile_stepper(system, method, contacts=contacts, events=events)
+
+    with pytest.raises(sc.EventError, match=lacks) as error:
+        stepper(method, forces=forces).integrate(**start)
+    t = float(re.search(r" = 0 at t = ([\d.]+):", str(error.value))[1])  # type: ignore[index]
+    assert t == pytest.approx(1 + 3 * np.pi if name != "negative" else 13.6018634, abs=1e-6)
+    assert "Write it as sc.friction(slip, limit=F)" in str(error.value)
+    dry = stepper(contacts=[sc.friction(slip, limit="d")]).integrate(**start)
+    assert dry.contact_modes[-1][1] == ("stick",) or name == "reaction"
+    smooth = {x: re.sub(r"sign\((?:sin)?\(?(.*?_dot)\)?\)", r"tanh(50*(\1))", force) for x, force in forces.items()}
+    assert stepper(forces=smooth).integrate(**start).t[-1] == 14.0
+    rests = sc.Event(slip, terminal=True, where=f"t > {t - 1}")
+    assert stepper(method, forces=forces, events=rests).integrate(**start).t[-1] == pytest.approx(t, abs=1e-6)
 
 
 @pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.MethodWarning")

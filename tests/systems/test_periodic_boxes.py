@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from fractions import Fraction
 
 import numpy as np
@@ -48,6 +49,28 @@ def test_values_in_60_digits_and_in_arrays(text: str) -> None:
     tape = Tape([expression], [X, L])
     assert [float(tape([mp.mpf(x), mp.mpf(3)])[0]) for x in points] == pytest.approx(expected)
     assert parse_expression(format_expression(expression), KNOWN) == expression
+
+
+WHOLE = {
+    "floor": lambda x, _: np.floor(x),
+    "ceil": lambda x, _: np.ceil(x),
+    "ceiling": lambda x, _: np.ceil(x),
+    "round": lambda x, _: np.rint(x),
+    "trunc": lambda x, _: np.trunc(x),
+    "mod": np.mod,
+    "Mod": np.mod,
+    "fmod": np.fmod,
+}
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_functions_of_whole_numbers_are_written_as_their_message_says(name: str) -> None:
+    with pytest.raises(sc.ExpressionError) as error:
+        parse_expression(f"{name}(x, L)", KNOWN)
+    written = re.search(r": write (.*?)(?:, the nearest.*)?\. Known", str(error.value))[1]  # type: ignore[index]
+    points = np.array([-7.3, -1.6, -0.2, 0.4, 1.7, 3.2, 12.1])
+    formula = parse_expression(re.sub(r"\by\b", "L", written), KNOWN)
+    assert array_value(formula, {X: points, L: 3.0}) == pytest.approx(WHOLE[name](points, 3.0))
 
 
 OF_SYMPY = {

@@ -514,8 +514,10 @@ class Interface:
             for kind, function, *where in contact.transitions
         )
         kinks = (
-            (Refraction if jumps else Kink)(function, mode=mode, held=held, power_sides=tuple(map(int, sides)))
-            for mode, function, jumps, held, *sides in self.modes
+            (Refraction if jumps else Kink)(
+                function, mode=mode, held=held, lacks=lacks, power_sides=tuple(map(int, sides))
+            )
+            for mode, function, jumps, held, lacks, *sides in self.modes
         )
         return *events, *transitions, *kinks
 

@@ -121,13 +121,13 @@ def warn_of_choices(stepper: Integrator, watch: Any) -> None:
             "(Painleve's paradox), and impulses, the limit of stiff contact, change the slip",
             EventWarning,
         )
-    if getattr(watch, "reduced", 0) & 1:
+    if getattr(watch, "restitutes_less", 0):
         warn(
             "the restitution of an impact would have created kinetic energy with friction: it was reduced, so that "
             "none is created",
             EventWarning,
         )
-    if getattr(watch, "reduced", 0) & 2:
+    if getattr(watch, "corner_ends", 0):
         warn("impacts in a corner do not end: the last ones were without restitution", EventWarning)
     if missed := getattr(watch, "missed", 0.0):
         warn(

@@ -191,7 +191,7 @@ class CrossingSearch:
                 changed = next((f"parameter '{mode}'" for mode, value in modes if not math.isfinite(value)), "state")
                 recent = self.watch.recent if name == "chatters" else [of is event for of in self.stepper.searched]
                 titles = [of.title for of, count in zip(self.stepper.searched, recent, strict=True) if count]
-                texts = {"function": " and ".join(titles[:3]), "changed": changed}
+                texts = {"function": " and ".join(titles[:3]), "changed": changed, "lacks": getattr(event, "lacks", "")}
                 t = self.watch.end if name == "chatters" else report.t
                 return EventError(message.format(**texts, t=t, g=behind))
         remark = modes_in_failure(self.stepper, self.watch)

@@ -47,22 +47,55 @@ def with_dry_friction(system: Any) -> Any:
 
     if not isinstance(system, LagrangianSystem) or isinstance(system, OfRunTimeSizes) or _is_smooth(system):
         return system
-    from scvi_codegen.systems.formulas.expressions import jacobian  # here: imports SymPy
-
-    if system.clock or system.gauge != 0 or system.rotations or system.bath is not None:
+    if _lacks_friction(system):
         return system
     forces, contacts = system.forces, []
     for slip, divided in _slips(system):
-        directions = [[part.diff(rate) for rate in system.velocities] for part in slip]
-        if all(map(any, directions)) and not jacobian([*chain(*directions)], system.velocities):  # linear slips
-            pushes, others = zip(*map(divided, forces), strict=True)
-            if limit := _limit(system, slip, directions, pushes):
-                forces = others
-                contacts.append(Friction(slip if len(slip) > 1 else slip[0], limit))
+        if isinstance(found := _friction_of(system, slip, divided, forces), tuple):
+            limit, forces = found
+            contacts.append(Friction(slip if len(slip) > 1 else slip[0], limit))
     whole = (*system.contacts, *contacts)
     if not contacts or sum(item.rows for item in whole) > MOST_ROWS:
         return system
     return replace(system, forces=forces, contacts=whole)
+
+
+def violated_conditions(system: Any) -> dict[Expr, str]:
+    """Return why forces that jump where a slip vanishes are no dry friction, by slip; empty if they are.
+
+    Those of methods without contacts, and of more than these may have, stay forces although they are.
+    """
+    from scvi_codegen.systems.lagrangian import LagrangianSystem
+
+    if not isinstance(system, LagrangianSystem) or isinstance(system, OfRunTimeSizes) or _lacks_friction(system):
+        return {}
+    found = {slip: _friction_of(system, slip, divided, system.forces) for slip, divided in _slips(system)}
+    return {slip[0]: of if isinstance(of, str) else "" for slip, of in found.items() if len(slip) == 1}
+
+
+def _lacks_friction(system: LagrangianSystem) -> bool:
+    """Return whether forces of a system never become contacts."""
+    return bool(system.clock or system.gauge != 0 or system.rotations or system.bath is not None)
+
+
+def _friction_of(
+    system: LagrangianSystem, slip: Sequence[Expr], divided: Callable[[Expr], tuple[Expr, Expr]], forces: Sequence[Expr]
+) -> tuple[Expr, tuple[Expr, ...]] | str:
+    """Return the limit F of the friction of a slip, and the other forces, or the condition that the forces violate."""
+    from sympy import S
+
+    moving, rates = [part.free_symbols for part in slip], {*system.velocities}
+    directions = [
+        [part.diff(rate) if rate in names else S.Zero for rate in system.velocities]
+        for part, names in zip(slip, moving, strict=True)
+    ]
+    if not all(map(any, directions)):
+        return "it contains no velocity"
+    if any(row.free_symbols & rates for row in chain(*directions)):
+        return "it is not linear in the velocities"
+    pushes, others = zip(*map(divided, forces), strict=True)
+    limit = _limit(system, slip, directions, pushes)
+    return limit if isinstance(limit, str) else (limit, others)
 
 
 def _is_smooth(system: LagrangianSystem) -> bool:
@@ -124,8 +157,8 @@ def _divided(force: Expr, slip: Expr) -> tuple[Expr, Expr]:
 
 def _limit(
     system: LagrangianSystem, slip: Sequence[Expr], directions: Sequence[Sequence[Expr]], pushes: Sequence[Expr]
-) -> Expr | None:
-    """Return F of forces -F T^T w/abs(w) if they are so, with one F >= 0 for the default parameters; else ``None``."""
+) -> Expr | str:
+    """Return F of forces -F T^T w/abs(w) if they are so, with one F >= 0 for the default parameters; else why not."""
     from sympy import Add, S
 
     from scvi_codegen.systems.formulas.kinks import switching_function, unit_step
@@ -133,17 +166,20 @@ def _limit(
     along = slip if len(slip) > 1 else (S.One,)
     rows = [Add(*(row * w for row, w in zip(column, along, strict=True))) for column in zip(*directions, strict=True)]
     limit = next(_quotient(-push, row) for push, row in zip(pushes, rows, strict=True) if row)
-    if not all(_vanishes(push + limit * row) for push, row in zip(pushes, rows, strict=True)):
-        return None
+    for coordinate, push, row in zip(system.coordinates, pushes, rows, strict=True):
+        if not _vanishes(push + limit * row):
+            return f"the force on {coordinate} jumps otherwise than by -2*F*d(slip)/d({coordinate}_dot), F = {limit}"
     at_rest: list[tuple[Expr, Expr]] = []
     for component in slip:  # linear: one rate of each, by the others
         part = component.subs(at_rest)
-        rates = [(rate, row) for rate in system.velocities if (row := part.diff(rate)) != 0]
+        rates = [(rate, row) for rate in system.velocities if rate in part.free_symbols and (row := part.diff(rate))]
         at_rest += [(rate, rate - part / row) for rate, row in rates[:1]]
     own = [part for part in limit.atoms(unit_step) if switching_function(part.args[0])[0] in slip]
     resting = dict.fromkeys(slip, S.Zero)
     above, below = (limit.xreplace(dict.fromkeys(own, side) | resting).subs(at_rest) for side in (S.One, S.Zero))
-    return limit if above != 0 and _is_nowhere_negative(limit, system.constants) and _vanishes(above - below) else None
+    if above == 0 or not _vanishes(above - below):
+        return f"F = {limit} is 0 at rest, or depends on the motion before"
+    return limit if _is_nowhere_negative(limit, system.constants) else f"F = {limit} is negative at some states"
 
 
 def _quotient(numerator: Expr, denominator: Expr) -> Expr:

@@ -133,8 +133,12 @@ WRITTEN_OTHERWISE = {
     "tg": "tan(x)",
     "ctg": "cot(x)",
     "sinc": "sin(x)/x",
-    **dict.fromkeys(("floor", "ceil", "ceiling", "round", "trunc"), "rint(x), the nearest whole number"),
-    **dict.fromkeys(("mod", "Mod", "fmod"), "wrap(x, length), which is between -length/2 and length/2"),
+    "round": "rint(x), the nearest whole number",
+    "floor": "rint(x - 1/2)",
+    **dict.fromkeys(("ceil", "ceiling"), "rint(x + 1/2)"),
+    "trunc": "where(x > 0, rint(x - 1/2), rint(x + 1/2))",
+    **dict.fromkeys(("mod", "Mod"), "x - y*rint(x/y - 1/2)"),
+    "fmod": "where(x > 0, x - y*rint(x/y - 1/2), x - y*rint(x/y + 1/2))",
     **dict.fromkeys(
         ("erf", "erfc", "gamma", "besselj", "lambertw", "LambertW", "zeta"), "a table: functions={'f': sc.Table(x, y)}"
     ),

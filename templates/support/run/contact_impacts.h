@@ -86,7 +86,7 @@ static int restitute(const event_step *step, const contact_terms *of, const int 
   const real part = restitution_part(of, rate, plastic, impulse);
   for (int r = 0; r < CONTACT_ROWS; r++)
     impulse[r] = plastic[r] + part * (impulse[r] - plastic[r]);
-  step->watch->reduced |= 1;
+  step->watch->restitutes_less = 1;
   return 1;
 }
 
@@ -110,7 +110,7 @@ static int find_impulses(const event_step *step, const contact_terms *of, const 
     }
     if (first < 0)
       return OK;
-    step->watch->reduced |= 2 * last;
+    step->watch->corner_ends |= last;
     for (int k = 0; k < EVENT_CONTACTS; k++) {
       const int normal = CONTACTS[k].normal, impacts = CONTACTS[k].impacts;
       const int together = impacts == CONTACT_SIMULTANEOUS && impacts == CONTACTS[first].impacts && approaches[k];

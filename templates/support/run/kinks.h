@@ -141,6 +141,16 @@ static int sides_after_start(const event_step *step, const event_sample *at, rea
   return OK;
 }
 
+/* Fails where the motion slides on the zero of a kink, unless the run ends there. */
+static int slides(const event_step *step, int event, const event_sample *at)
+{
+  if (step->watch->ended)
+    return OK;
+  step->watch->sliding = event + 1;
+  step->report->t = at->t;
+  return NOT_CONVERGED;
+}
+
 /* The same where no step by the formula exists, as of forces that point to a surface: side 1, or -1 if the motion of
  * side 1 leaves to it. If that of side -1 returns, it slides. */
 static int sides_at_jump(const event_step *step, const event_sample *at, real length)
@@ -157,9 +167,8 @@ static int sides_at_jump(const event_step *step, const event_sample *at, real le
       if (!starts[k] || sign[k] * SIDE_OF(step->watch, k) >= 0.0)
         continue;
       set_side(step, k, -1);
-      step->watch->sliding = pass ? FIRST_KINK + k + 1 : 0;
       if (pass)
-        return NOT_CONVERGED;
+        return slides(step, FIRST_KINK + k, at);
     }
   }
   return OK;
@@ -255,8 +264,7 @@ static int change_sides(const event_step *step, long long first, event_sample *a
   for (long long i = first; returns && i < *step->filled; i++) {
     const int kink = step->found[i].function - FIRST_KINK;
     if (kink >= 0 && step->found[i].direction == 0 && sign[kink] * SIDE_OF(step->watch, kink) < 0.0) {
-      step->watch->sliding = step->found[i].function + 1;
-      return NOT_CONVERGED;
+      return slides(step, step->found[i].function, at);
     }
   }
   return OK;
