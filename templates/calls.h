@@ -417,8 +417,10 @@ int NAME(call_differences)(NAME(call) *c, long long count, const double *t, cons
         v[M + i] = ((run->p[i] - p[M + i]) + run->carry_p[i]) / factor;
       }
     }
+    double x[2 * M];
+    memcpy(x, q + M, sizeof(double) * M), memcpy(x + M, p + M, sizeof(double) * M);
     if (!status)
-      receive_roundings(&all, k, q + M, p + M, now);
+      receive_roundings(&all, k, x, now);
   }
   return status;
 }

@@ -60,8 +60,8 @@ def sizes_of_motion(
     Positions: max(range, absolute); of a coordinate that is at rest, up to rounding, its largest value, at least
     ``by_reactions`` (2, m) (``motion_by_reactions``). Momenta: the range, at least ``kinetic`` (m,), those of
     velocities, times the ratio of the size to the range of their coordinate, or the least one; at rest at least those
-    of reactions. Of those that consist of rounding errors of others, by which ``errors`` (2, m) are as large, both are
-    the largest one.
+    of reactions, infinite where these are 0, so that errors are those of the positions. Of those that consist of
+    rounding errors of others, by which ``errors`` (2, m) are as large, both are the largest one.
 
     Args:
         q, p, errors, kinetic, by_reactions: as above.
@@ -94,7 +94,9 @@ def sizes_of_motion(
         least = np.fmin.reduce(ratio, initial=1.0 / epsilon)  # NaN: of 0 by 0
         noise_of_p = _is_noise(momenta, errors[1], NOISE_OF_MOMENTA * resolution * momenta.max(initial=0.0))
         of_p = np.where(noise_of_p, momenta.max(initial=0.0), momenta) * np.where(rest | noise, least, ratio)
-    return np.where(rest, np.maximum([sizes, of_p], [displacements, impulses]), [sizes, of_p])
+    found = np.where(rest, np.maximum([sizes, of_p], [displacements, impulses]), [sizes, of_p])
+    found[1, rest & (found[1] == 0.0)] = np.inf
+    return np.asarray(found)
 
 
 def _is_noise(sizes: Array, errors: Array, rounding: Array | float) -> NDArray[np.bool_]:

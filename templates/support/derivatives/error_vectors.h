@@ -16,16 +16,27 @@ static inline unsigned long long next_random(unsigned long long *x)
   return *x = 6364136223846793005ULL * *x + 1442695040888963407ULL;
 }
 
-/* Adds rounding errors of the state (q, p) after step k with random signs; stores root mean squares of the samples,
- * whose squares may overflow. */
-static inline void receive_roundings(rounding_vectors *of, long long k, const real *q, const real *p, real *vectors)
+#define EVALUATED 0.42 /* rounding of positions in units of u: u / sqrt(3) for 1, half of it below 2 */
+
+/* Adds, by sign 1, or takes away the rounding of the positions q at which the forces of a step are evaluated. */
+static inline void round_positions(const rounding_vectors *of, const real *q, int sign, real *vectors)
+{
+  const real rounding = (real)(sign * EVALUATED) * of->rounding;
+  unsigned long long random = of->random;
+  for (int j = 0; j < of->count; j++)
+    for (int i = 0; i < M; i++)
+      vectors[j * of->apart + i] += (next_random(&random) >> 63 ? rounding : -rounding) * q[i];
+}
+
+/* Adds rounding errors of the numbers x, (q, p) or their increments, after step k with random signs; stores root mean
+ * squares of the samples, whose squares may overflow. */
+static inline void receive_roundings(rounding_vectors *of, long long k, const real *x, real *vectors)
 {
   for (int i = 0; i < 2 * M; i++) {
-    const real x = i < M ? q[i] : p[i - M];
     real largest = 0, sum = 0;
     for (int j = 0; j < of->count; j++) {
       real *to = vectors + j * of->apart + i;
-      *to += (next_random(&of->random) >> 63 ? of->rounding : -of->rounding) * x;
+      *to += (next_random(&of->random) >> 63 ? of->rounding : -of->rounding) * x[i];
       const real size = *to < 0 ? -*to : *to;
       largest = size > largest ? size : largest;
     }

@@ -201,15 +201,24 @@ static int propagate_steps(propagation *over, long long first, long long end)
   iterated = store_steps(over, first, end);
   for (long long done = 0; status == OK && done < end - first; done++) {
     const long long k = over->back ? end - 1 - done : first + done;
-    if (over->errors)
+    if (over->errors) {
       memset(vectors_at(over, k + 1), 0, sizeof(real) * (size_t)(over->count * STEP_INPUTS));
+      round_positions(over->errors, over->q + k * M, 1, vectors_at(over, k));
+    }
     const int carried = iterated ? propagate_by_iteration(over, k, stored_of(over, k - first)) : 0;
     if (!iterated || carried < over->count)
       status = over->errors ? NOT_CONVERGED : vectors_by_newton(over, k, carried);
     else if (!all_finite(vectors_at(over, k + !over->back), over->count * STEP_INPUTS))
       status = NOT_FINITE;
-    if (status == OK && over->errors)
-      receive_roundings(over->errors, k, over->q + (k + 1) * M, over->p + (k + 1) * M, vectors_at(over, k + 1));
+    if (status == OK && over->errors) {
+      real increments[2 * M];
+      for (int i = 0; i < M; i++) {
+        increments[i] = over->q[(k + 1) * M + i] - over->q[k * M + i];
+        increments[M + i] = over->p[(k + 1) * M + i] - over->p[k * M + i];
+      }
+      round_positions(over->errors, over->q + k * M, -1, vectors_at(over, k + 1));
+      receive_roundings(over->errors, k, increments, vectors_at(over, k + 1));
+    }
     over->report->steps += status == OK;
   }
   return status;
