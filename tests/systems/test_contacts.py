@@ -1053,3 +1053,52 @@ def test_a_step_that_fails_names_the_modes_of_contacts(steps: dict[str, float]) 
     options = sc.SolverOptions(max_iterations=2)
     with pytest.raises(sc.StepFailedError, match=r"at t = 0 .*Modes of contacts: contact 1 \(sole\): slip"):
         stepper.integrate([0, 0, 0], velocity=[0.3, 1.5, 0.0], t_end=1.0, options=options, **steps)
+
+
+@pytest.mark.tiers(0, 1)
+@pytest.mark.filterwarnings("ignore:the contacts depend", "ignore:the restitution of an impact")
+def test_points_that_fall_between_two_rough_walls_come_to_rest() -> None:
+    """Random walls, restitutions, friction that holds on none of them, and units."""
+    rough: Any = {"friction": "mu", "restitution": "e"}
+    walls = [
+        sc.contact("y*cos(a) - x*sin(a)", slip="x_dot*cos(a) + y_dot*sin(a)", **rough),
+        sc.contact("y*cos(b) + x*sin(b)", slip="x_dot*cos(b) - y_dot*sin(b)", **rough),
+    ]
+    numbers = {"m": 1.0, "g": 1.0, "a": 0.0, "b": 0.0, "mu": 0.0, "e": 0.0}
+    stepper, random = of(f"m*{PLANE} - m*g*y", "x y", walls, "svi:2", **numbers), np.random.default_rng(0)
+    for k in range(12):
+        a, b, mu, e, g = random.uniform([0.1, 0.1, 0.1, 0.0, 0.1], [1.4, 1.4, 0.7, 0.6, 10.0])
+        mu *= np.tan(min(a, b))
+        unit, m = 10 ** random.uniform(-3, 3, 2)
+        time = np.sqrt(unit / g)
+        numbers = {"m": m, "g": g, "a": a, "b": b, "mu": mu, "e": e * (k % 3 > 0)}
+        by = {"h": time / 7} if k % 2 else {}
+        run = stepper.integrate([0.0, 0.3 * unit], velocity=[0.0, 0.0], t_end=40 * time, parameters=numbers, **by)
+        case = f"{numbers}, {unit}, {by}"
+        assert np.abs(run.q[-1]).max() <= 1e-6 * unit, case
+        assert np.abs(run.velocity[-1]).max() <= 1e-9 * unit / time, case
+        up = [np.cos(a), np.sin(a), np.cos(b), -np.sin(b)]
+        assert run.contact_forces()[-1].ravel() @ up == pytest.approx(m * g), case
+
+
+@pytest.mark.tiers(0, 1)
+@pytest.mark.filterwarnings("ignore:the contacts depend", "ignore:a transition has several motions")
+def test_tables_that_spin_and_slide_on_four_legs_stop_for_all_loads_of_the_legs() -> None:
+    """Slips in four directions: loads differ by a vector that no row determines, and friction with them."""
+    legs, numbers = [], {"m": 1.0, "g": 1.0, "mu": 0.1, "w": 1.0, "d": 1.0}
+    for i, j in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        along, across = f"({i}*w*cos(c) - {j}*d*sin(c))", f"({i}*w*sin(c) + {j}*d*cos(c))"
+        slip = (f"x_dot - {across}*c_dot", f"y_dot + {along}*c_dot")
+        legs.append(sc.contact(f"z + {i}*w*a + {j}*d*b", slip=slip, friction="mu"))
+    text = "m*(x_dot**2 + y_dot**2 + z_dot**2 + ((w**2 + d**2)*c_dot**2 + w**2*a_dot**2 + d**2*b_dot**2)/3)/2 - m*g*z"
+    stepper, random = of(text, "x y z a b c", legs, "svi:2", **numbers), np.random.default_rng(1)
+    for _ in range(4):
+        unit, g, m = 10 ** random.uniform([-3, -1, -2], [3, 1, 2])
+        mu, w, d, u, spin = random.uniform([0.1, 0.2, 0.2, 0.2, 0.5], [0.6, 0.8, 0.8, 1.0, 2.0])
+        time = np.sqrt(unit / g)
+        numbers = {"m": m, "g": g, "mu": mu, "w": w * unit, "d": d * unit}
+        start = {"q": np.zeros(6), "velocity": [u * unit / time, 0.0, 0.0, 0.0, 0.0, spin / time]}
+        run = stepper.integrate(**start, t_end=40 * time, h=time / 20, parameters=numbers)
+        assert np.abs(run.velocity[-1, :3]).max() <= 1e-9 * unit / time, f"{numbers}, {start}"
+        assert np.abs(run.q[-1, 2:5]).max() <= 1e-9, f"{numbers}, {start}"
+        assert run.contact_forces()[-1, :, 0].sum() == pytest.approx(m * g)
