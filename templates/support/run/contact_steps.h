@@ -384,7 +384,7 @@ static int find_positions(contact_step *in, const contact_memory *from)
     const real bend = (from->steady > 0 ? from->bend[i] : 0.0) + (from->steady > 1 ? from->turn[i] : 0.0);
     in->q1[i] = in->q[i] + in->h * (in->v[i] + in->h * bend);
   }
-  in->curvature = from->steady > 0 ? from->curvature : 0.0;
+  in->curvature = from->steady > 0 ? 2.0 * from->curvature : 0.0; /* as it may grow until it is measured again */
   for (int iteration = 0; iteration < STEP_ITERATIONS; iteration++) {
     real x[STEP_SIZE], rounding[M];
     int slow;
