@@ -13,7 +13,7 @@ equations, which the solution of least norm satisfies; q1 does not depend on the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -40,10 +40,15 @@ OPEN, STICKS, SLIPS = 0, 1, 2
 
 
 def propagate_by_steps(
-    method: LinearisedMethod, starts: Starts, vectors: Array, parameters: Array, *, transpose: bool
+    method: LinearisedMethod, starts: Starts, vectors: Array, parameters: Array, *, transpose: bool, whole: float | None
 ) -> tuple[Array, Array]:
-    """Propagate tangent vectors or cotangents along steps; see :meth:`LinearisedMethod._propagate`."""
-    count, varied = len(starts.h), _varied(method)
+    """Propagate tangent vectors or cotangents along steps; see :meth:`LinearisedMethod._propagate`.
+
+    Where an event ended the run the last state is that on the line between the ends of a step of size ``whole``.
+    """
+    count, varied, part = len(starts.h), _varied(method), 1.0
+    if whole is not None:
+        part, starts = starts.h[-1] / whole, replace(starts, h=np.append(starts.h[:-1], whole))
     maps = np.empty((count, len(varied), len(varied)))
     q, p = (np.array(x) for x in (starts.q, starts.p))
     ends, impulses = np.empty((2, count, method.dimension)), np.empty(count)
@@ -54,6 +59,8 @@ def propagate_by_steps(
             maps[first + k] = reduce(np.matmul, of_parts[begin:end][::-1])
             impulses[first + k] = abs(traces.positions.force[begin:end]).max()
         ends[:, first:last] = traces.q1[bounds[1:] - 1], traces.p1[bounds[1:] - 1]
+    maps[-1] += (1.0 - part) * (np.eye(len(varied)) - maps[-1])
+    ends[:, -1] += (1.0 - part) * (np.array([q[-2], p[-2]]) - ends[:, -1])
     if starts.chained:
         starts.q[1:], starts.p[1:] = ends
     else:  # at rest states are the rounding errors of impulses that cancel others

@@ -171,7 +171,9 @@ def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], ve
         if states.stepper.by_steps:
             from scvi_codegen.runs.derivatives.active_sets import propagate_by_steps  # here: few runs have contacts
 
-            ends = propagate_by_steps(states.stepper, *settings, transpose=back)
+            ended = numbers[-1] == len(states) - 1 and any(of.event.terminal and len(of.t) for of in states.events)
+            whole = states.h if ended else None
+            ends = propagate_by_steps(states.stepper, *settings, transpose=back, whole=whole)
         else:
             ends = states.stepper._propagate(*settings, states.options, transpose=back)
         saved = np.concatenate([part.q, part.p], axis=1)
