@@ -519,7 +519,7 @@ def rods() -> Any:
 def test_energy_has_no_trend_without_contact(steps: int, part: float) -> None:
     """Of steps h w = .05 and .1, w the larger frequency at rest; a line has less than a tenth of the band."""
     trends = []
-    for number in range(12):
+    for number in range(12 if steps > 100_000 else 4):
         random = np.random.default_rng(number)
         M, length = 10.0 ** random.uniform(-1, 1), random.uniform(0.5, 2)
         masses = np.array([[(1 + M) * length**2, M * length], [M * length, M]])

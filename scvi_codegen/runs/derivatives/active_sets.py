@@ -89,32 +89,25 @@ class _Solution:
 
 
 class _Traces:
-    """Solved parts of steps: structures step_trace of contact_steps.h, of arrays (n, numbers)."""
+    """Solved parts of steps: structures step_trace of traced_steps.h, of arrays (n, numbers)."""
 
     def __init__(self, method: LinearisedMethod, numbers: Array) -> None:
         m, interface = method.dimension, method.interface
-        sizes = [1, 1, 1, m, m, m, m, 1, 1, *(len(interface.constraints), len(interface.contacts)) * 3]
+        sizes = [1, 1, 1, m, m, m, m, 1, 1, *(len(interface.constraints), len(interface.contacts)) * 2]
         columns = np.split(numbers, np.cumsum(sizes)[:-1], axis=1)
         self.number = columns[0][:, 0].astype(int)
         self.t, self.h, self.part, self.factor = (columns[k][:, 0] for k in (1, 2, 7, 8))
         self.q, self.p, self.q1, self.p1 = columns[3:7]
-        self.positions, plastic, elastic = (_Solution(*columns[k : k + 2]) for k in (9, 11, 13))
-        bounces = self.part[:, np.newaxis] > 0.0
-        self.velocities = _Solution(
-            *(
-                np.where(bounces, *pair)
-                for pair in zip((elastic.force, elastic.mode), (plastic.force, plastic.mode), strict=True)
-            )
-        )
+        self.positions, self.velocities = (_Solution(*columns[k : k + 2]) for k in (9, 11))
 
 
 def _traces(method: LinearisedMethod, starts: Starts, q: Array, p: Array, parameters: Array) -> Any:
     """Yield the first step, the last one and the traces of blocks of steps, taken again from states of a run."""
     m, interface, binding = method.dimension, method.interface, method.binding
-    numbers = 5 + 4 * m + 3 * (len(interface.constraints) + len(interface.contacts))
+    numbers = 5 + 4 * m + 2 * (len(interface.constraints) + len(interface.contacts))
     rows = 3 * (m + len(interface.contacts)) + 2 * len(interface.constraints)
     room = PARTS + max(1, NUMBERS // (rows * len(_varied(method))))
-    traces, filled, report = np.zeros((room + 1, numbers)), binding.numbers("long long *"), binding.new("report *")
+    traces, filled, report = np.zeros((room, numbers)), binding.numbers("long long *"), binding.new("report *")
     values = np.array(parameters)  # with modes
     first = 0
     while first < len(starts.h):
