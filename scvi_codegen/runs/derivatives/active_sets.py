@@ -39,6 +39,12 @@ OF_IMPULSES = 1e-12
 OPEN, STICKS, SLIPS = 0, 1, 2
 
 
+def step_of_event(states: Any, number: int) -> float | None:
+    """Return the size of the step within which an event ended a run at its saved state ``number``, else ``None``."""
+    ended = any(of.event.terminal and len(of.t) for of in states.events)
+    return states.h if ended and number == len(states) - 1 else None
+
+
 def propagate_by_steps(
     method: LinearisedMethod, starts: Starts, vectors: Array, parameters: Array, *, transpose: bool, whole: float | None
 ) -> tuple[Array, Array]:
