@@ -185,12 +185,40 @@ def test_derivatives_through_pieces_of_inputs() -> None:
     assert runs[2].tangent()[-1, :2, 2] == pytest.approx(change, abs=1e-8)
 
 
-def test_derivatives_that_steps_lack_are_refused_by_name() -> None:
+def test_the_end_at_an_event_has_the_derivatives_of_its_time() -> None:
+    """The state there is on the line between the ends of a step, as that of a run without the event at that time."""
     of = stepper("puck on a table that swings")
     settings: dict[str, Any] = {"velocity": [0.5, 0.0], "h": 5e-3, "t_end": 0.8}
     ended = of.integrate([0.3, 0.3], events=sc.Event("x - 0.35", terminal=True), **settings)
-    with pytest.raises(sc.StateError, match="terminal event"):
-        ended.tangent()
+    near = [
+        of.integrate([0.3 + e, 0.3], ended.p[0], h=5e-3, t_end=0.8, t_eval=[ended.t[-1]])
+        for e in (STEP, -STEP, 2 * STEP, -2 * STEP)
+    ]
+    first, second, third, fourth = (np.concatenate([run.q[-1], run.p[-1]]) for run in near)
+    change = (8 * (first - second) - (third - fourth)) / (12 * STEP)
+    tangent = ended.tangent()[-1]
+    assert tangent[:, 0] == pytest.approx(change, abs=1e-8)
+    seeds = np.zeros((len(ended), 4))
+    seeds[-1] = [1.0, 2.0, 3.0, 4.0]
+    gradient = ended.pullback(seeds)
+    assert np.concatenate([gradient.q, gradient.p]) == pytest.approx(seeds[-1] @ tangent, rel=1e-12)
+
+
+@pytest.mark.parametrize("body", ["belt", "plank that sticks"])
+def test_derivatives_of_runs_that_go_on_are_factors_of_those_of_the_whole(body: str) -> None:
+    of, (q, v, h, duration, _) = stepper(body), CASES[body](np.random.default_rng(3))
+    count = round(duration / h)
+    whole = of.integrate(q, velocity=v, h=h, steps=count).tangent()
+    for k in (count // 3, count - 3):
+        run = of.start(q, velocity=v, h=h)
+        run.advance(k)
+        again = of.from_checkpoint(run.checkpoint())
+        for tail in (run.record(count - k), again.record(count - k)):
+            assert tail.tangent()[-1] @ whole[k] == pytest.approx(whole[-1], abs=1e-12)
+
+
+def test_derivatives_that_steps_lack_are_refused_by_name() -> None:
+    of = stepper("puck on a table that swings")
     with pytest.raises(sc.ContactError, match="single steps"):
         of.jacobian([0.3, 0.3], [0.0, 0.0], 0.01)
     for feature, is_there in (("tangent", True), ("pullback", True), ("sensitivity", True), ("fit", False)):

@@ -479,6 +479,89 @@ def test_what_is_thrown_rests_without_creep_and_penetration(throw: Callable[[int
     assert {name: (value, bound) for name, (value, bound) in values.items() if not value <= bound} == {}
 
 
+@cache
+def bead() -> Any:
+    """Return the stepper of a bead of mass m (1 + a sin^2 x) on a spring in a bowl."""
+    names = dict.fromkeys(["m", "a", "k", "b"], 1.0)
+    lagrangian = "m*(1 + a*sin(x)**2)*(x_dot**2 + y_dot**2)/2 - 9.81*m*y - k*x**2/2"
+    bowl = sc.contact("y - b*x**2/2")
+    return by_steps(sc.LagrangianSystem.from_text("bead", ["x", "y"], lagrangian, parameters=names, contacts=[bowl]))
+
+
+@pytest.mark.tiers(2, 12)
+@pytest.mark.parametrize("number", range(24))
+def test_rises_of_energy_in_kept_contact_are_of_third_order(number: int) -> None:
+    random = np.random.default_rng(number)
+    m, x, v = 10.0 ** random.uniform(-2, 2), *random.uniform(-1, 1, size=2)
+    b, values = random.uniform(0.2, 2), {"m": m, "a": random.uniform(0, 2), "k": m * random.uniform(0, 9)}
+    runs = [
+        bead().integrate([x, b * x * x / 2], velocity=[v, b * x * v], h=h, t_end=4.0, parameters=values | {"b": b})
+        for h in (4e-3, 2e-3)
+    ]
+    coarse, fine = (np.diff(run.energy()).max() for run in runs)
+    assert np.log2(coarse / fine) == pytest.approx(3.0, abs=0.01)
+    assert coarse < 1e-5 * np.ptp(runs[0].p ** 2 / m)
+
+
+@cache
+def rods() -> Any:
+    """Return the stepper of two rods on a hinge, far above a floor."""
+    swing = "(1 + M)*l**2*a_dot**2/2 + M*b_dot**2/2 + M*l*cos(a - b)*a_dot*b_dot"
+    lagrangian = f"{swing} + 9.81*((1 + M)*l*cos(a) + M*cos(b))"
+    settings: dict[str, Any] = {"parameters": {"M": 1.0, "l": 1.0}, "contacts": [sc.contact("9 - l*cos(a) - cos(b)")]}
+    return by_steps(sc.LagrangianSystem.from_text("rods", ["a", "b"], lagrangian, **settings))
+
+
+@pytest.mark.parametrize(
+    "steps", [pytest.param(100_000, marks=pytest.mark.second), pytest.param(1_000_000, marks=pytest.mark.full)]
+)
+@pytest.mark.parametrize("part", [0.05, 0.1])
+def test_energy_has_no_trend_without_contact(steps: int, part: float) -> None:
+    """Of steps h w = .05 and .1, w the larger frequency at rest; a line has less than a tenth of the band."""
+    trends = []
+    for number in range(12 if steps > 100_000 else 4):
+        random = np.random.default_rng(number)
+        M, length = 10.0 ** random.uniform(-1, 1), random.uniform(0.5, 2)
+        masses = np.array([[(1 + M) * length**2, M * length], [M * length, M]])
+        fastest = np.sqrt(np.linalg.eigvals(np.linalg.solve(masses, 9.81 * np.diag([(1 + M) * length, M]))).max())
+        q, v = random.uniform(-1, 1, size=2), random.normal(size=2)
+        way: dict[str, Any] = {"steps": steps, "save_every": 100, "parameters": {"M": M, "l": length}}
+        run = rods().integrate(q, velocity=v, h=part / fastest, **way)
+        energy, t = run.energy(), run.t
+        trends.append(np.polyfit(t, energy, 1)[0] * (t[-1] - t[0]) / np.ptp(energy))
+    assert np.abs(trends).max() < 0.1
+
+
+@pytest.mark.parametrize(
+    "runs", [pytest.param(10, marks=pytest.mark.second), pytest.param(340, marks=pytest.mark.full)]
+)
+def test_steps_from_random_states_are_solved(runs: int) -> None:
+    """Of 100 steps each of boxes and walkers in any pose, with steps over a decade and a half: in all 1.02e5."""
+    unsolved = 0
+    for number in range(runs):
+        of, v = Box(number), np.random.default_rng(number).normal(size=3)
+        random = of.random
+        q = np.array([0.0, 0.0, random.uniform(-np.pi, np.pi)])
+        q[1] -= of.unit * (of.gaps(q[np.newaxis]).min() - random.choice([0.0, 0.05]))
+        mu, e, s = random.uniform(0, [2, 1, 0.5])
+        laws = of.values | {"mu": mu, "mus": mu * random.uniform(1, 1.5), "e": e, "s": s}
+        speed = 10.0 ** random.uniform(-2, 0.7)
+        starts = [(by_steps(box_system()), q, v * speed * [of.unit, of.unit, 1.0] / of.time, of.time, laws)]
+        for pairs in (1, 2) if runs > 10 else (1,):  # those of two legs are compiled there for other tests
+            system, lowest = walker(pairs)
+            q = np.r_[0, 0, random.uniform(-np.pi, np.pi, size=system.dimension - 2)]
+            q[1] -= lowest(q)[0] - random.choice([0.0, 0.02])
+            starts.append((by_steps(system), q, speed * random.normal(size=len(q)), 0.3, {}))
+        for stepper, start, velocity, time, values in starts:
+            h = time * 10.0 ** random.uniform(-2.5, -1)
+            try:
+                run = stepper.integrate(start, velocity=velocity, h=h, steps=100, parameters=values)
+                assert run.contact_residual < 1e-11
+            except sc.StepFailedError:
+                unsolved += 1
+    assert unsolved <= 1
+
+
 @pytest.mark.rotated
 def test_spheres_roll_whose_attitude_is_a_rotation() -> None:
     """Rolling has the velocity (5 v + 2 r w)/7; quaternions keep their length."""

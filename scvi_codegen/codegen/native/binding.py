@@ -8,7 +8,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from struct import Struct
 from threading import local
 from typing import Any, Self
@@ -281,14 +281,7 @@ class Binding:
 
     def records(self, structs: Any, count: int | None = None) -> NDArray[np.void]:
         """Return an array of structs, by the names of their fields, in the same memory; a copy of the first few."""
-        item = self._ffi.typeof(structs).item
-        fields = [(name, field) for name, field in item.fields if field.type.kind != "struct"]
-        layout: Any = {
-            "names": [name for name, _ in fields],
-            "formats": [_format(field.type) for _, field in fields],
-            "offsets": [field.offset for _, field in fields],
-            "itemsize": self._ffi.sizeof(item),
-        }
+        layout = _layout(self._ffi, self._ffi.typeof(structs).item)
         records: NDArray[np.void] = np.frombuffer(self._ffi.buffer(structs), dtype=layout)
         return records if count is None else records[:count].copy()
 
@@ -328,6 +321,20 @@ class Binding:
         struct.tolerance, struct.max_iterations = options.tolerance, options.max_iterations
         struct.absolute = options.absolute
         return struct
+
+
+@lru_cache(maxsize=64)
+def _layout(ffi: Any, item: Any) -> np.dtype[np.void]:
+    """Return the NumPy type of a struct, without the structs in it; kept, as calls of single steps ask for it."""
+    fields = [(name, field) for name, field in item.fields if field.type.kind != "struct"]
+    return np.dtype(
+        {
+            "names": [name for name, _ in fields],
+            "formats": [_format(field.type) for _, field in fields],
+            "offsets": [field.offset for _, field in fields],
+            "itemsize": ffi.sizeof(item),
+        }
+    )
 
 
 def _format(kind: Any) -> tuple[Any, tuple[int, ...]]:

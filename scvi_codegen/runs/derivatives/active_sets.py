@@ -13,7 +13,7 @@ equations, which the solution of least norm satisfies; q1 does not depend on the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -39,11 +39,22 @@ OF_IMPULSES = 1e-12
 OPEN, STICKS, SLIPS = 0, 1, 2
 
 
+def step_of_event(states: Any, number: int) -> float | None:
+    """Return the size of the step within which an event ended a run at its saved state ``number``, else ``None``."""
+    ended = any(of.event.terminal and len(of.t) for of in states.events)
+    return states.h if ended and number == len(states) - 1 else None
+
+
 def propagate_by_steps(
-    method: LinearisedMethod, starts: Starts, vectors: Array, parameters: Array, *, transpose: bool
+    method: LinearisedMethod, starts: Starts, vectors: Array, parameters: Array, *, transpose: bool, whole: float | None
 ) -> tuple[Array, Array]:
-    """Propagate tangent vectors or cotangents along steps; see :meth:`LinearisedMethod._propagate`."""
-    count, varied = len(starts.h), _varied(method)
+    """Propagate tangent vectors or cotangents along steps; see :meth:`LinearisedMethod._propagate`.
+
+    Where an event ended the run the last state is that on the line between the ends of a step of size ``whole``.
+    """
+    count, varied, part = len(starts.h), _varied(method), 1.0
+    if whole is not None:
+        part, starts = starts.h[-1] / whole, replace(starts, h=np.append(starts.h[:-1], whole))
     maps = np.empty((count, len(varied), len(varied)))
     q, p = (np.array(x) for x in (starts.q, starts.p))
     ends, impulses = np.empty((2, count, method.dimension)), np.empty(count)
@@ -54,6 +65,8 @@ def propagate_by_steps(
             maps[first + k] = reduce(np.matmul, of_parts[begin:end][::-1])
             impulses[first + k] = abs(traces.positions.force[begin:end]).max()
         ends[:, first:last] = traces.q1[bounds[1:] - 1], traces.p1[bounds[1:] - 1]
+    maps[-1] += (1.0 - part) * (np.eye(len(varied)) - maps[-1])
+    ends[:, -1] += (1.0 - part) * (np.array([q[-2], p[-2]]) - ends[:, -1])
     if starts.chained:
         starts.q[1:], starts.p[1:] = ends
     else:  # at rest states are the rounding errors of impulses that cancel others
@@ -82,32 +95,25 @@ class _Solution:
 
 
 class _Traces:
-    """Solved parts of steps: structures step_trace of contact_steps.h, of arrays (n, numbers)."""
+    """Solved parts of steps: structures step_trace of traced_steps.h, of arrays (n, numbers)."""
 
     def __init__(self, method: LinearisedMethod, numbers: Array) -> None:
         m, interface = method.dimension, method.interface
-        sizes = [1, 1, 1, m, m, m, m, 1, 1, *(len(interface.constraints), len(interface.contacts)) * 3]
+        sizes = [1, 1, 1, m, m, m, m, 1, 1, *(len(interface.constraints), len(interface.contacts)) * 2]
         columns = np.split(numbers, np.cumsum(sizes)[:-1], axis=1)
         self.number = columns[0][:, 0].astype(int)
         self.t, self.h, self.part, self.factor = (columns[k][:, 0] for k in (1, 2, 7, 8))
         self.q, self.p, self.q1, self.p1 = columns[3:7]
-        self.positions, plastic, elastic = (_Solution(*columns[k : k + 2]) for k in (9, 11, 13))
-        bounces = self.part[:, np.newaxis] > 0.0
-        self.velocities = _Solution(
-            *(
-                np.where(bounces, *pair)
-                for pair in zip((elastic.force, elastic.mode), (plastic.force, plastic.mode), strict=True)
-            )
-        )
+        self.positions, self.velocities = (_Solution(*columns[k : k + 2]) for k in (9, 11))
 
 
 def _traces(method: LinearisedMethod, starts: Starts, q: Array, p: Array, parameters: Array) -> Any:
     """Yield the first step, the last one and the traces of blocks of steps, taken again from states of a run."""
     m, interface, binding = method.dimension, method.interface, method.binding
-    numbers = 5 + 4 * m + 3 * (len(interface.constraints) + len(interface.contacts))
+    numbers = 5 + 4 * m + 2 * (len(interface.constraints) + len(interface.contacts))
     rows = 3 * (m + len(interface.contacts)) + 2 * len(interface.constraints)
     room = PARTS + max(1, NUMBERS // (rows * len(_varied(method))))
-    traces, filled, report = np.zeros((room + 1, numbers)), binding.numbers("long long *"), binding.new("report *")
+    traces, filled, report = np.zeros((room, numbers)), binding.numbers("long long *"), binding.new("report *")
     values = np.array(parameters)  # with modes
     first = 0
     while first < len(starts.h):

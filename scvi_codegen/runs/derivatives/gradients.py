@@ -169,9 +169,10 @@ def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], ve
         part = starts.part(first, last) if jumps else starts
         settings = part, vectors[first : last + 1], states.parameters_on_sides(part.t[0])
         if states.stepper.by_steps:
-            from scvi_codegen.runs.derivatives.active_sets import propagate_by_steps  # here: few runs have contacts
+            from scvi_codegen.runs.derivatives import active_sets  # here: few runs have contacts
 
-            ends = propagate_by_steps(states.stepper, *settings, transpose=back)
+            whole = active_sets.step_of_event(states, numbers[-1])
+            ends = active_sets.propagate_by_steps(states.stepper, *settings, transpose=back, whole=whole)
         else:
             ends = states.stepper._propagate(*settings, states.options, transpose=back)
         saved = np.concatenate([part.q, part.p], axis=1)

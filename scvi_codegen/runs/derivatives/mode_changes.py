@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Any
 
-from scvi_codegen.common.errors import AccuracyWarning, StateError, warn
+from scvi_codegen.common.errors import AccuracyWarning, warn
 from scvi_codegen.runs.events.contacts import contact_modes
 
 SHOWN = 3
@@ -12,9 +12,7 @@ SHOWN = 3
 
 
 def check_modes(runs: Sequence[Any]) -> None:
-    """Warn of the changes of modes of runs by steps, and refuse those that an event ended within a step."""
-    if any(of.event.terminal and len(of.t) for run in runs for of in run.events):
-        raise StateError("a terminal event ended the run within a step by steps, which has no derivatives: omit it")
+    """Warn of the changes of modes of runs by steps."""
     changes = [change for run in runs for change in _changes(run)]
     if changes:
         more = f" and {len(changes) - SHOWN} more" if len(changes) > SHOWN else ""

@@ -12,7 +12,7 @@
  * energy. Requires: terms_of_steps.h. */
 enum {
   STEP_ITERATIONS = 30, /* of the first problem */
-  STEP_HALVINGS = 8,
+  STEP_PARTS = 256, /* the most into which halvings divide a step */
   STEP_POINTS = 30, /* proximal points of a contact problem, after which forces have a compliance */
   STEP_FIXED = CONTACT_FIRST_ROW, /* constraints, whose forces are free */
   STEP_ROWS = STEP_FIXED + ALL_CONTACT_ROWS,
@@ -51,14 +51,8 @@ typedef struct {
   real force[STEP_ROWS], mode[EVENT_CONTACTS];
 } step_solution;
 
-/* A solved step, or part of one, from (t, q, p) to (q1, p1): the problem of positions, that of velocities without and
- * with restitution, of whose difference it has a part, and the factor by which velocities shrank (strict energy). */
-typedef struct {
-  real number, t, h, q[M], p[M], q1[M], p1[M], part, factor;
-  step_solution positions, plastic, elastic;
-} step_trace;
-
-/* A step of length h from (t, q, p, v) to q1; contacts that exist, and of all rows the impulses f1. A problem has the
+/* A step, or part of one, of length h from (t, q, p, v) to q1, and the solutions of its problems; of velocities that
+ * with restitution if the step has a part of it, and the factor by which they shrank (strict energy). A problem has the
  * near contacts alone, in the order in which they join: `contact` and `row` are their numbers among all. */
 typedef struct {
   real t, h, q[M], p[M], v[M], q1[M], fastest, curvature;
@@ -68,14 +62,14 @@ typedef struct {
   step_matrix moving, resting;
   int solved, continues; /* whether `moving` has the masses at q1, and `resting` had at its start */
   int is_full; /* 1 + the contact that found no room, else 0 */
-  int exists[EVENT_CONTACTS], is_near[EVENT_CONTACTS], pushes[EVENT_CONTACTS], has_begun[EVENT_CONTACTS];
-  real impulse[ALL_CONTACT_ROWS];
+  int exists[EVENT_CONTACTS], is_near[EVENT_CONTACTS], has_begun[EVENT_CONTACTS];
+  step_solution positions, velocities;
+  real part, factor;
   int contact[EVENT_CONTACTS], row[CONTACT_ROWS], former[CONTACT_ROWS]; /* rows of the last solved step */
   contact_places place[EVENT_CONTACTS];
   responses response, at_start;
   real W[CONTACT_ROWS * CONTACT_ROWS];
   cone_problem problem;
-  step_trace *trace; /* of this step; NULL: none */
 } contact_step;
 
 static real times_row(const real *row, const real *x)
@@ -184,7 +178,7 @@ static int join(contact_step *in, int k, const row_terms *rows, int rests)
     return in->is_full = k + 1, NOT_CONVERGED;
   for (int i = 0; i < count; i++) {
     in->row[first + i] = STEP_FIXED + row[i];
-    to->f[first + i] = in->impulse[row[i]];
+    to->f[first + i] = in->positions.force[STEP_FIXED + row[i]];
   }
   in->contact[n] = k;
   in->is_near[k] = 1;
@@ -326,17 +320,6 @@ static void keep_limits(contact_step *in, const contact_memory *from)
   }
 }
 
-/* Notes the impulses f1 of all rows, and contacts that push. */
-static void note_impulses(contact_step *in)
-{
-  memset(in->impulse, 0, sizeof in->impulse);
-  memset(in->pushes, 0, sizeof in->pushes);
-  for (int r = 0; r < in->problem.rows; r++)
-    in->impulse[in->row[r] - STEP_FIXED] = in->problem.f[r];
-  for (int k = 0; k < in->problem.contacts; k++)
-    in->pushes[in->contact[k]] = in->place[k].normal >= 0 && in->problem.mode[k].pushes;
-}
-
 /* Whether the contacts that push are those of the last step, whose equations have the curvature of this one. */
 static int pushes_as_before(const contact_step *in, const contact_memory *from)
 {
@@ -379,12 +362,12 @@ static int find_positions(contact_step *in, const contact_memory *from)
   clear_problem(in);
   memset(in->has_begun, 0, sizeof in->has_begun);
   for (int r = 0; r < ALL_CONTACT_ROWS; r++)
-    in->impulse[r] = in->h * from->force[r];
+    in->positions.force[STEP_FIXED + r] = in->h * from->force[r];
   for (int i = 0; i < M; i++) {
     const real bend = (from->steady > 0 ? from->bend[i] : 0.0) + (from->steady > 1 ? from->turn[i] : 0.0);
     in->q1[i] = in->q[i] + in->h * (in->v[i] + in->h * bend);
   }
-  in->curvature = from->steady > 0 ? from->curvature : 0.0;
+  in->curvature = from->steady > 0 ? 2.0 * from->curvature : 0.0; /* as it may grow until it is measured again */
   for (int iteration = 0; iteration < STEP_ITERATIONS; iteration++) {
     real x[STEP_SIZE], rounding[M];
     int slow;
@@ -418,8 +401,7 @@ static int find_positions(contact_step *in, const contact_memory *from)
     const int contacts = in->problem.contacts; /* those join whose gaps only the forces of others close */
     TRY(find_near(in, from, still, 0.0));
     if (contacts == in->problem.contacts) {
-      if (in->trace)
-        note_solution(in, x, &in->trace->positions);
+      note_solution(in, x, &in->positions);
       return OK;
     }
   }
@@ -457,7 +439,7 @@ static int energy_before(const contact_step *in, const real *v, real *room, real
 }
 
 /* Velocities with at most the energy before the step: all of them shrink together. */
-static int limit_energy(const contact_step *in, real *v, real *workspace)
+static int limit_energy(contact_step *in, real *v, real *workspace)
 {
   const real kinetic = half_product(in, v, v);
   real room;
@@ -466,8 +448,7 @@ static int limit_energy(const contact_step *in, real *v, real *workspace)
   const real factor = kinetic > room ? sqrt(room / kinetic) : 1.0;
   for (int i = 0; i < M; i++)
     v[i] *= factor;
-  if (in->trace)
-    in->trace->factor = factor;
+  in->factor = factor;
   return OK;
 }
 
@@ -477,12 +458,12 @@ static int rebound(contact_step *in, const contact_memory *from, real by_surface
     real *workspace)
 {
   cone_problem *const of = &in->problem;
-  real f[CONTACT_ROWS], w[M], room, part = 1.0;
+  const real plastic = work_of_surfaces(in, &in->end, of->f);
+  real w[M], room;
   int bounces = 0;
-  memcpy(f, of->f, BYTES(of->rows));
   for (int i = 0; i < of->contacts; i++) {
     const int k = in->contact[i], r = in->place[i].normal;
-    if (!in->pushes[k] || from->is_closed[k])
+    if (r < 0 || in->positions.mode[k] == 0.0 || from->is_closed[k])
       continue;
     const real target = in->start.coefficient[k][2] * fmin(rate_of(&in->start, in->row[r], in->v), 0.0);
     of->b[r] += target;
@@ -494,24 +475,20 @@ static int rebound(contact_step *in, const contact_memory *from, real by_surface
   room += by_surfaces;
   if (!solve_cone_within(of, STEP_POINTS))
     return NOT_CONVERGED;
-  if (in->trace)
-    note_solution(in, before, &in->trace->elastic);
   memcpy(w, before, BYTES(M));
   add_responses(&in->response, 1.0, of->f, w);
   for (int i = 0; i < M; i++)
     w[i] -= v[i];
-  const real plastic = work_of_surfaces(in, &in->end, f);
   const real square = half_product(in, w, w);
   const real linear = 2.0 * half_product(in, v, w) - work_of_surfaces(in, &in->end, of->f) + plastic;
   const real rest = half_product(in, v, v) - plastic - room;
-  if (square + linear + rest > 0.0)
-    part = rest >= 0.0 ? 0.0 : fmin(1.0, (-linear + sqrt(linear * linear - 4.0 * square * rest)) / (2.0 * square));
-  if (in->trace)
-    in->trace->part = part;
+  in->part = square + linear + rest <= 0.0 ? 1.0
+      : rest >= 0.0                        ? 0.0
+                    : fmin(1.0, (-linear + sqrt(linear * linear - 4.0 * square * rest)) / (2.0 * square));
   for (int i = 0; i < M; i++)
-    v[i] += part * w[i];
-  for (int r = 0; r < of->rows; r++)
-    of->f[r] = f[r] + part * (of->f[r] - f[r]);
+    v[i] += in->part * w[i];
+  if (in->part > 0.0)
+    note_solution(in, before, &in->velocities);
   return OK;
 }
 
@@ -530,7 +507,6 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   real before[STEP_SIZE], v[M], work = 0.0, fastest = 0.0;
   const real by_surfaces = work_of_surfaces(in, &in->start, of->f);
   int changes = 0;
-  note_impulses(in);
   memcpy(v, in->v, sizeof v); /* the mean of those before and after f1 */
   add_responses(&in->at_start, 0.5, of->f, v);
   for (int r = 0; r < of->rows; r++)
@@ -548,7 +524,7 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, row = STEP_FIXED + normal;
     if (in->exists[k] &&
-        (normal < 0 || in->pushes[k] ||
+        (normal < 0 || in->positions.mode[k] > 0.0 ||
             in->end.value[row] <= CONTACT_LOWEST * DBL_EPSILON * size_by_position(in->end.G[row], in->q1)))
       TRY(join(in, k, &in->end, from.sticks[k] && !in->has_begun[k]));
   }
@@ -563,8 +539,7 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   to->compliance = fmax(to->compliance, of->compliance);
   if (!solve_cone_within(of, STEP_POINTS))
     return NOT_CONVERGED;
-  if (in->trace)
-    note_solution(in, before, &in->trace->plastic);
+  note_solution(in, before, &in->velocities);
   memcpy(v, before, sizeof v);
   add_responses(&in->response, 1.0, of->f, v);
   TRY(rebound(in, &from, by_surfaces, before, v, workspace));
@@ -575,9 +550,8 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
   to->lost_energy -= work + half_product(in, v, v) - half_product(in, before, before);
   memcpy(to->v, v, sizeof v);
   for (int r = 0; r < ALL_CONTACT_ROWS; r++)
-    to->force[r] = in->impulse[r] / in->h;
+    to->force[r] = in->positions.force[STEP_FIXED + r] / in->h;
   memcpy(to->exists, in->exists, sizeof to->exists);
-  memcpy(to->pushes, in->pushes, sizeof to->pushes);
   memset(to->is_closed, 0, sizeof to->is_closed);
   memset(to->sticks, 0, sizeof to->sticks);
   memset(to->direction, 0, sizeof to->direction);
@@ -587,8 +561,10 @@ static int find_velocities(contact_step *in, contact_memory *to, real *workspace
     to->sticks[k] = to->is_closed[k] && of->mode[i].sticks;
     memcpy(to->direction[k], of->mode[i].direction, sizeof *to->direction);
   }
-  for (int k = 0; k < EVENT_CONTACTS; k++)
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    to->pushes[k] = CONTACTS[k].normal >= 0 && in->positions.mode[k] > 0.0;
     changes |= from.pushes[k] != to->pushes[k] || has_changed(&from, to, k);
+  }
   for (int i = 0; i < M; i++) {
     to->bend[i] = ((in->q1[i] - in->q[i]) / in->h - in->v[i]) / in->h;
     to->turn[i] = to->bend[i] - from.bend[i];
@@ -604,10 +580,8 @@ static void take_state(contact_step *in, const contact_memory *memory, real t, r
   if (in->continues)
     in->resting = in->moving;
   in->solved = 0;
-  if (in->trace) {
-    in->trace->part = 0.0;
-    in->trace->factor = 1.0;
-  }
+  in->part = 0.0;
+  in->factor = 1.0;
   in->t = t;
   in->h = h;
   memcpy(in->q, q, BYTES(M));
@@ -642,49 +616,41 @@ static int find_existing(contact_step *in, const contact_memory *from, real *wor
   return OK;
 }
 
-/* Completes the trace of a part of a step. */
-static void end_trace(contact_step *in, const real *p1)
-{
-  step_trace *const of = in->trace;
-  of->t = in->t;
-  of->h = in->h;
-  memcpy(of->q, in->q, BYTES(M));
-  memcpy(of->p, in->p, BYTES(M));
-  memcpy(of->q1, in->q1, BYTES(M));
-  memcpy(of->p1, p1, BYTES(M));
-  of[1].number = of->number;
-  in->trace++;
-}
-
-/* One step of length h from (t, q, p), which become those at its end; where it does not converge, two halves. */
-static int step_by_steps(contact_step *in, contact_memory *memory, real t, real h, real *q, real *p, int depth,
-    real *workspace)
+/* One step, or part, of length h from (t, q, p), which become those at its end. */
+static int take_part(contact_step *in, contact_memory *memory, real t, real h, real *q, real *p, real *workspace)
 {
   contact_memory next = *memory;
-  int status;
   take_state(in, memory, t, h, q, p);
   TRY(find_existing(in, memory, workspace));
-  status = find_positions(in, memory);
-  if (status == OK)
-    status = find_velocities(in, &next, workspace);
-  if (status == OK) {
-    for (int i = 0; i < M; i++) { /* L_v is linear in v */
-      p[i] = in->last.momentum[i];
-      for (int j = 0; j < M; j++)
-        p[i] += in->last.mass[i][j] * (next.v[j] - (in->q1[j] - in->q[j]) / h);
-    }
-    memcpy(q, in->q1, BYTES(M));
-    *memory = next;
-    memcpy(in->former, in->row, sizeof in->former);
-    in->solved = 1;
-    if (in->trace)
-      end_trace(in, p);
-    return OK;
+  TRY(find_positions(in, memory));
+  TRY(find_velocities(in, &next, workspace));
+  for (int i = 0; i < M; i++) { /* L_v is linear in v */
+    p[i] = in->last.momentum[i];
+    for (int j = 0; j < M; j++)
+      p[i] += in->last.mass[i][j] * (next.v[j] - (in->q1[j] - in->q[j]) / h);
   }
-  if (depth == STEP_HALVINGS)
-    return status;
-  TRY(step_by_steps(in, memory, t, 0.5 * h, q, p, depth + 1, workspace));
-  return step_by_steps(in, memory, t + 0.5 * h, 0.5 * h, q, p, depth + 1, workspace);
+  memcpy(q, in->q1, BYTES(M));
+  *memory = next;
+  memcpy(in->former, in->row, sizeof in->former);
+  in->solved = 1;
+  return OK;
+}
+
+/* The part of a step of length h from t that begins after *done of STEP_PARTS: all that is left of its half, quarter,
+ * .., or where that does not converge half of it, and so on. */
+static int next_part(contact_step *in, contact_memory *memory, real t, real h, real *q, real *p, int *done,
+    real *workspace)
+{
+  const real unit = h / STEP_PARTS, begin = t + *done * unit;
+  int status = NOT_CONVERGED;
+  for (int length = *done ? *done & -*done : STEP_PARTS; length > 0; length /= 2) {
+    status = take_part(in, memory, begin, length * unit, q, p, workspace);
+    if (status == OK) {
+      *done += length;
+      break;
+    }
+  }
+  return status;
 }
 
 /* Modes of contacts as parameters of a run. */
@@ -827,8 +793,10 @@ int NAME(advance_by_steps)(event_run *run, event_watch *watch, real t_end, const
     report->t = left.t = run->t;
     copy_state(left.q, left.p, run->q, run->p);
     copy_state(right.q, right.p, run->q, run->p);
-    const int status = step_by_steps(&in, &watch->steps, run->t, h, right.q, right.p, 0, workspace);
-    if (status != OK) { /* the first of two halves may have been solved */
+    int status = OK;
+    for (int done = 0; done < STEP_PARTS && status == OK;)
+      status = next_part(&in, &watch->steps, run->t, h, right.q, right.p, &done, workspace);
+    if (status != OK) { /* its first parts may have been solved */
       watch->steps = before;
       watch->refusal = in.is_full ? CONTACT_CROWDS : watch->refusal;
       watch->refused = in.is_full;

@@ -2,6 +2,22 @@
 
 /* Steps of a run with contacts by steps that are taken again, with both contact problems of each. */
 
+/* A part of a step by number from (t, q, p) to (q1, p1), as in contact_step. */
+typedef struct {
+  real number, t, h, q[M], p[M], q1[M], p1[M], part, factor;
+  step_solution positions, velocities;
+} step_trace;
+
+static step_trace trace_of(const contact_step *in, long long number, const real *p1)
+{
+  step_trace to = {.number = (real)number, .t = in->t, .h = in->h, .part = in->part, .factor = in->factor};
+  copy_state(to.q, to.p, in->q, in->p);
+  copy_state(to.q1, to.p1, in->q1, p1);
+  to.positions = in->positions;
+  to.velocities = in->velocities;
+  return to;
+}
+
 int NAME(trace_by_steps)(long long steps, const real *t, const real *h, real *q, real *p, int chained,
     real *parameters, int is_strict, long long room, real *traces, long long *filled, solver_report *report,
     real *workspace)
@@ -20,7 +36,6 @@ int NAME(trace_by_steps)(long long steps, const real *t, const real *h, real *q,
   put_in_all(CONTACT_STICKS, imposed);
   in.idle = idle;
   in.imposed = imposed;
-  in.trace = (step_trace *)traces;
   *filled = 0;
   set_run(&run, t[0], &(event_sample){.q = q, .p = p});
   run.h = h[0];
@@ -32,15 +47,16 @@ int NAME(trace_by_steps)(long long steps, const real *t, const real *h, real *q,
     watch.steps.sticks[k] = at->slips > 0 && parameters[MODE_PLACE[at->sticks]] > 0.0;
   }
   watch.steps.is_strict = is_strict;
-  for (long long k = 0; k < steps && room - *filled >= 1 << STEP_HALVINGS; k++) {
+  for (long long k = 0; k < steps && room - *filled >= STEP_PARTS; k++) {
     real q1[M], p1[M];
     report->t = t[k];
-    in.trace->number = (real)k;
     copy_state(q1, p1, q + k * M, p + k * M);
-    TRY(step_by_steps(&in, &watch.steps, t[k], h[k], q1, p1, 0, workspace));
+    for (int done = 0; done < STEP_PARTS;) {
+      TRY(next_part(&in, &watch.steps, t[k], h[k], q1, p1, &done, workspace));
+      ((step_trace *)traces)[(*filled)++] = trace_of(&in, k, p1);
+    }
     if (chained)
       copy_state(q + (k + 1) * M, p + (k + 1) * M, q1, p1);
-    *filled = in.trace - (step_trace *)traces;
     report->steps++;
   }
   put_memory(&watch.steps, watch.mode);
