@@ -129,9 +129,11 @@ def program_of(
     program_part = partial(
         lower, method=method, prefix=name, solver=solver, symmetries=tracked, lanes=lanes, fallback=fallback
     )
-    parts = roll_terms(system)
-    rolled = with_sums(program_part(parts.rest), parts) if parts else None
-    return rolled or program_part(system)
+    for moving in (True, False):
+        parts = roll_terms(system, moving=moving)
+        if parts and (rolled := with_sums(program_part(parts.rest), parts)):
+            return rolled
+    return program_part(system)
 
 
 def lower_unrolled(

@@ -76,6 +76,9 @@ class Constant:
     value: Number
 
 
+ZERO = Constant(0)
+
+
 @dataclass(frozen=True, slots=True)
 class Load:
     """``u[index]``, ``parameters[index]``, ``t`` (index -1) or temporary ``w[index]``, by ``source``."""
@@ -176,7 +179,10 @@ class Kernel:
         return dict(sorted(counts.items()))
 
     def statements(self) -> Iterator[tuple[str, int, Expression]]:
-        """Yield ("w", "value" or "derivative", index, expression): each result right after its last temporary."""
+        """Yield ("w", "value" or "derivative", index, expression): each result right after its last temporary.
+
+        Derivatives that are 0 but for what loops add are not stored: they are 0 before.
+        """
         due: list[list[int]] = [[] for _ in range(len(self.temporaries) + 1)]
         for k, expression in enumerate(self.results):
             due[1 + max((load.index for load in loads(expression) if load.source == "w"), default=-1)].append(k)
@@ -185,6 +191,8 @@ class Kernel:
                 yield "w", k - 1, self.temporaries[k - 1]
             for number in ready:
                 derivative = number >= self.values
+                if derivative and self.sums and self.results[number] == ZERO:
+                    continue
                 yield "derivative" if derivative else "value", number - derivative * self.values, self.results[number]
 
 
@@ -233,17 +241,22 @@ class RolledKernel:
         table: tuple[tuple[int, ...], ...],
         constants: tuple[tuple[Constant | Load, ...], ...] = (),
         targets: tuple[tuple[int, ...], ...] = (),
+        derivatives: tuple[tuple[int, ...], ...] = (),
     ) -> RolledKernel:
         """Return the loop over constant rows e: value[targets[e][a]] += kernel_a(u[table[e][..]], constants[..][e]).
+
+        The last values of the kernel are added to derivative[derivatives[e][..]].
 
         Args:
             kernel: a function of as many arguments as indices and constants in a row.
             table: (rows, slots) indices of arguments of the kernel that contains the loop.
             constants: (constants, rows) numbers or parameters.
             targets: (rows, values) indices of its values; by default the table.
+            derivatives: (rows, derivatives) indices of its derivatives.
         """
         end = Size("", len(table))
-        written = "targets" if targets else "places"
+        written, count = "targets" if targets else "places", len(derivatives[0]) if derivatives else 0
+        tables = {"places": table, "targets": targets, "entries": derivatives}
 
         def entries(array: str, table: str, count: int) -> tuple[Access, ...]:
             places = (Place(index="e", table=table, column=k) for k in range(count))
@@ -254,9 +267,12 @@ class RolledKernel:
             kernel=kernel,
             loops=(Loop(index="e", first=Size(""), end=end),),
             reads=entries("u", "places", len(table[0])),
-            writes=entries("value", written, kernel.values),
+            writes=(
+                *entries("value", written, kernel.values - count),
+                *entries("derivative", "entries", count),
+            ),
             constants=tuple(Access(array=Array(name, (end,)), places=(Place(index="e"),)) for name in columns),
-            tables=(("places", table), *((("targets", targets),) if targets else ())),
+            tables=tuple((name, rows) for name, rows in tables.items() if rows),
             columns=tuple(columns.items()),
         )
 
