@@ -1,8 +1,8 @@
 """Groups of similar terms: terms that differ only in their coordinates, parameters and numbers.
 
 The potentials of lattices, nets and many bodies consist of such groups, and so do kinetic energies of chains and beams
-with full mass matrices, sums of c_ij cos(q_i - q_j) v_i v_j. A group is differentiated once, for one term, and evaluated
-in a loop. Terms are compared by their expression trees: arguments of sums and products are sorted by
+with full mass matrices, sums of c_ij cos(q_i - q_j) v_i v_j. A group is differentiated once, for one term, and
+evaluated in a loop. Terms are compared by their expression trees: arguments of sums and products are sorted by
 their structure without names and numbers, so that similar terms have equal keys.
 """
 

@@ -267,10 +267,7 @@ class RolledKernel:
             kernel=kernel,
             loops=(Loop(index="e", first=Size(""), end=end),),
             reads=entries("u", "places", len(table[0])),
-            writes=(
-                *entries("value", written, kernel.values - count),
-                *entries("derivative", "entries", count),
-            ),
+            writes=(*entries("value", written, kernel.values - count), *entries("derivative", "entries", count)),
             constants=tuple(Access(array=Array(name, (end,)), places=(Place(index="e"),)) for name in columns),
             tables=tuple((name, rows) for name, rows in tables.items() if rows),
             columns=tuple(columns.items()),
