@@ -169,6 +169,17 @@ class Kernel:
         expressions = (*self.temporaries, *self.results)
         return any(load.source == array for expression in expressions for load in loads(expression))
 
+    @property
+    def added(self) -> set[int]:
+        """Indices of the derivatives that loops add to."""
+        tables = (table for rolled in self.sums for table in rolled.tables)
+        return {k for name, rows in tables if name == "entries" for row in rows for k in row}
+
+    @property
+    def cleared(self) -> int:
+        """Number of derivatives to set to 0 first, as loops add to them; 0 if they are in a matrix of zeros."""
+        return self.partials if max(self.added, default=self.partials) < self.partials else 0
+
     def operation_counts(self) -> dict[str, int]:
         """Return the number of operations by name, in alphabetical order."""
         expressions = subexpressions(*self.temporaries, *self.results)
@@ -181,8 +192,9 @@ class Kernel:
     def statements(self) -> Iterator[tuple[str, int, Expression]]:
         """Yield ("w", "value" or "derivative", index, expression): each result right after its last temporary.
 
-        Derivatives that are 0 but for what loops add are not stored: they are 0 before.
+        Derivatives that are 0 but for what loops add are not stored: they are 0 before (:attr:`cleared`).
         """
+        by_loops = bool(self.added)
         due: list[list[int]] = [[] for _ in range(len(self.temporaries) + 1)]
         for k, expression in enumerate(self.results):
             due[1 + max((load.index for load in loads(expression) if load.source == "w"), default=-1)].append(k)
@@ -191,7 +203,7 @@ class Kernel:
                 yield "w", k - 1, self.temporaries[k - 1]
             for number in ready:
                 derivative = number >= self.values
-                if derivative and self.sums and self.results[number] == ZERO:
+                if derivative and by_loops and self.results[number] == ZERO:
                     continue
                 yield "derivative" if derivative else "value", number - derivative * self.values, self.results[number]
 
@@ -269,7 +281,7 @@ class RolledKernel:
             reads=entries("u", "places", len(table[0])),
             writes=(*entries("value", written, kernel.values - count), *entries("derivative", "entries", count)),
             constants=tuple(Access(array=Array(name, (end,)), places=(Place(index="e"),)) for name in columns),
-            tables=tuple((name, rows) for name, rows in tables.items() if rows),
+            tables=tuple((name, rows) for name, rows in tables.items() if rows and rows[0]),
             columns=tuple(columns.items()),
         )
 

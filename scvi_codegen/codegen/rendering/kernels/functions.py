@@ -14,7 +14,7 @@ from itertools import accumulate
 from typing import TypeAlias
 
 from scvi_codegen.codegen.ir.equations import FixedPointIteration, LoweredStageGroup
-from scvi_codegen.codegen.ir.kernel import ZERO, Constant, Kernel, Load, Number, Part, RolledKernel, parts
+from scvi_codegen.codegen.ir.kernel import Constant, Kernel, Load, Number, Part, RolledKernel, parts
 from scvi_codegen.codegen.ir.program import FEW_UNKNOWNS, Layout, Program
 from scvi_codegen.codegen.rendering.kernels.loop_nests import Nest
 from scvi_codegen.codegen.rendering.kernels.printer import (
@@ -291,8 +291,8 @@ def _text(kernel: Kernel, target: Target, lanes: Lanes | None, printed: Printed,
         arrays = [[declared[name] for name in filter(part.uses, ARRAYS)] for part in cut]
         texts = [_function(PART, *of, printed(of[0])) for of in zip(cut, arrays, strict=True)]
     statements = [*printed(kernel)]
-    if kernel.sums and not lanes and ZERO in kernel.results[kernel.values :]:
-        statements.insert(0, f"memset(derivative, 0, {kernel.partials} * sizeof *derivative);")
+    if kernel.cleared:
+        statements.insert(0, f"memset(derivative, 0, {kernel.cleared} * sizeof *derivative);")
     for loop in kernel.sums:
         texts += _text(loop.kernel, target, lanes, printed), *_tables(loop, target)
         statements += _Rows(loop, real, parameter).lines()
