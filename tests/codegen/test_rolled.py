@@ -9,6 +9,7 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen import as_method, symmetries
+from scvi_codegen.codegen import pipeline
 from scvi_codegen.codegen.pipeline import program_of
 from scvi_codegen.systems import term_groups as module
 
@@ -154,3 +155,47 @@ def test_few_terms_and_constraints_remain_unrolled():
     assert module.roll_terms(bodies("few", 5)) is None
     rods = [f"(x{i} - x{i + 1})**2 + (y{i} - y{i + 1})**2 + (z{i} - z{i + 1})**2 = 1" for i in range(46)]
     assert module.roll_terms(bodies("held", 47, constraints=rods)) is None
+
+
+@pytest.mark.rotated
+def test_long_kernels_warn_with_statements_of_the_same_motion_that_are_short(monkeypatch, tmp_path):
+    """A chain in angles from the vertical, as points of arrays with rods, and by the joints of a file."""
+    n, start = 6, np.linspace(0.5, 0.1, 6)
+    q = [f"q{i}" for i in range(n)]
+    rods = [f"{n - i}*({a}_dot**2/2 + cos({a})) + J*{a}_dot**2/2" for i, a in enumerate(q)]
+    pairs = [f"{n - j}*cos({q[i]} - {q[j]})*{q[i]}_dot*{q[j]}_dot" for i, j in combinations(range(n), 2)]
+    angles = lagrange("angles", q, " + ".join(rods + pairs), J=0.0)
+    sources = pipeline.Sources(angles, as_method("svi:8"), "auto", None, (), None, None)
+    monkeypatch.setattr(pipeline, "MOST_OPERATIONS", 500)
+    with pytest.warns(sc.MethodWarning, match=r"^the step of 'angles' .*: state .* joints in a file .*r\[N, 2\]"):
+        sources.program()
+    with pytest.warns(sc.MethodWarning, match=r"^Newton's iteration of .* operations; above 500 .*: shorten .*; or "):
+        sources.program(fallback=True)
+    monkeypatch.undo()
+
+    stepper, span = sc.compile_stepper(angles, "svi:8", **FLAGS), {"h": 1 / 64, "steps": 64}
+    end = stepper.integrate(start, velocity=0 * start, **span).q[-1]
+    points = sc.LagrangianSystem.from_text(
+        name="points",
+        coordinates=["r[N, 2]"],
+        lagrangian="sum(i in N, (r_dot[i,0]**2 + r_dot[i,1]**2)/2 - r[i,1])",
+        constraints=[
+            "r[0,0]**2 + r[0,1]**2 = 1",
+            "(r[i+1,0] - r[i,0])**2 + (r[i+1,1] - r[i,1])**2 = 1 for i in 0..N-2",
+        ],
+    )
+    places = [np.cumsum(np.column_stack([np.sin(a), -np.cos(a)]), axis=0) for a in (start, end)]
+    run = sc.compile_stepper(points, "composition:8", **FLAGS).integrate(places[0], **span)
+    np.testing.assert_allclose(run.q["r"][-1], places[1], atol=1e-9)
+
+    end = stepper.integrate(start, velocity=0 * start, parameters={"J": 0.1}, **span).q[-1]
+    bodies = "".join(
+        f'<body pos="0 0 {-float(k > 0)}"><joint name="q{k}" axis="0 1 0"/>'
+        '<inertial pos="0 0 -1" mass="1" diaginertia="0.1 0.1 0.1"/>'
+        for k in range(n)
+    )
+    file = tmp_path / "chain.xml"
+    file.write_text(f'<mujoco><option gravity="0 0 -1"/><worldbody>{bodies}{"</body>" * n}</worldbody></mujoco>')
+    joints = sc.compile_stepper(sc.LagrangianSystem.from_mjcf(file), "svi:8", **FLAGS)
+    run = joints.integrate(np.diff(start, prepend=0), velocity=0 * start, **span)
+    np.testing.assert_allclose(np.cumsum(run.q[-1]), end, atol=1e-9)
