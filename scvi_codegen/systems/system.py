@@ -199,8 +199,6 @@ class MechanicalSystem(Deferred, ABC):
 
     KIND: ClassVar[ArgumentType]
     """Kind of an argument that is a system of known sizes, for ``checks_arguments``."""
-    further_masses: ClassVar[tuple[tuple[int, int], ...]] = ()
-    """Entries of the mass matrix, in its lower triangle, to which term groups add."""
     OR_ARRAYS: ClassVar[ArgumentType]
     """The same for systems that may have arrays of run-time sizes."""
     name: str

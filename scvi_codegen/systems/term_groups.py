@@ -25,8 +25,8 @@ from scvi_codegen.systems.system import MechanicalSystem
 MIN_GROUP_SIZE = 300
 """Minimum number of terms of a group; smaller ones are unrolled, which is short enough and shares subexpressions.
 
-Chains of 16, 20, 30 and 40 angles take 1.16, 1.07, 1.13 and 1.23 times the time of a step in loops (AVX2), of 40 and 100
-angles .38 and .16 of the time to derive and compile.
+Chains of 16, 20, 30 and 40 angles take 1.16, 1.07, 1.13 and 1.23 times the time of a step in loops (AVX2), of 40 and
+100 angles .38 and .16 of the time to derive and compile.
 """
 RATE = "~"
 """Name of the array of velocities in the structure of a term, last in order: functions of positions number these."""

@@ -351,7 +351,7 @@ class Program:
     def has_full_masses(self) -> bool:
         """Whether steps are solved by iterations alone, with mass matrices that are not diagonal."""
         fixed_point = self.fixed_point
-        return bool(fixed_point and fixed_point.mass_entries) and not (self.newton or fixed_point.diagonal)
+        return not self.newton and bool(fixed_point and fixed_point.mass_entries and not fixed_point.diagonal)
 
     @property
     def operations(self) -> int:

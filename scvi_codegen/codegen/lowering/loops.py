@@ -293,7 +293,7 @@ def _of_groups(
     """
     m, loops = split.rest.dimension, []
     for number, group in enumerate(split.term_groups):
-        values, targets = list[Expr](), [() for _ in group.places]
+        values, targets = list[Expr](), [tuple[int, ...]()] * len(group.places)
         for first, of_slots in ((forces, group.partials), (momenta, group.momenta if group.rates else ())):
             if first is not None and of_slots:
                 values += of_slots
