@@ -161,6 +161,24 @@ def roll_terms(system: MechanicalSystem, *, moving: bool = False) -> SplitSystem
         return None
     if moving and not _has_dense_masses(system):
         return None
+    large = _large_kinds(system, terms, moving=moving)
+    groups = _groups(system, large)
+    gathered = {*chain(*(kind.terms for kind in large))}
+    rest = Add(*filterfalse(gathered.__contains__, terms))
+    if not groups:
+        return None
+    if not moving:
+        function = "hamiltonian" if system.auxiliaries else "lagrangian"
+        return SplitSystem(replace(system, **{function: rest}), _merged(groups))
+    kinetic = [group for group in groups if group.rates]
+    if not kinetic or any(entry.free_symbols & {*group.rates} for group in kinetic for entry in group.masses.values()):
+        return None
+    coupled = {pair for group in kinetic for row in group.mass_places for pair in row}
+    return SplitSystem(RestOfTerms.of(cast("LagrangianSystem", system), rest, coupled), _merged(groups))
+
+
+def _large_kinds(system: MechanicalSystem, terms: Iterable[Expr], *, moving: bool) -> list[SimilarTerms]:
+    """Return similar terms of positions, and of velocities if ``moving``, that are many."""
     positions = {*system.coordinates}
     others = {*system.auxiliaries} if moving else {*system.velocities, *system.auxiliaries}
     chosen = [term for term in terms if positions & term.free_symbols and not others & term.free_symbols]
@@ -168,29 +186,19 @@ def roll_terms(system: MechanicalSystem, *, moving: bool = False) -> SplitSystem
     if moving:
         indices |= {v: (RATE, k) for k, v in enumerate(system.velocities)}
     kinds = similar_terms(chosen, indices, system.parameters)
-    large = [kind for kind in kinds if len(kind) >= MIN_GROUP_SIZE]
-    if not large:
-        return None
+    return [kind for kind in kinds if len(kind) >= MIN_GROUP_SIZE]
+
+
+def _groups(system: MechanicalSystem, kinds: Iterable[SimilarTerms]) -> list[TermGroup]:
     slot, constant = (_stem(name, system.parameters) for name in ("slot", "given"))
-    groups = [
+    sign = -1 if system.auxiliaries else 1
+    return [
         similar.group(
-            lambda array, k: symbol(f"{slot}{'dot' if array else ''}{k}"),
-            lambda k: symbol(f"{constant}{k}"),
-            -1 if system.auxiliaries else 1,
+            lambda array, k: symbol(f"{slot}{'dot' if array else ''}{k}"), lambda k: symbol(f"{constant}{k}"), sign
         )
-        for kind in large
+        for kind in kinds
         for similar in kind.groups
     ]
-    gathered = {*chain(*(kind.terms for kind in large))}
-    rest = Add(*filterfalse(gathered.__contains__, terms))
-    if not moving:
-        function = "hamiltonian" if system.auxiliaries else "lagrangian"
-        return SplitSystem(replace(system, **{function: rest}), _merged(groups))
-    quadratic = all(not entry.free_symbols & {*group.rates} for group in groups for entry in group.masses.values())
-    if not quadratic or not any(group.rates for group in groups):
-        return None
-    coupled = {pair for group in groups if group.rates for row in group.mass_places for pair in row}
-    return SplitSystem(RestOfTerms.of(cast("LagrangianSystem", system), rest, coupled), _merged(groups))
 
 
 def _has_dense_masses(system: MechanicalSystem) -> bool:
