@@ -144,10 +144,18 @@ class Forms:
         """Return m forces plus those of the constraints."""
         return constraints.with_constraint_forces(self.system, forces)
 
+    @property
+    def masses_of_groups(self) -> tuple[tuple[int, int], ...]:
+        """Entries (i, j), i >= j, of the mass matrix to which term groups add that are not in the formula."""
+        return getattr(self.system, "further_masses", ())
+
     @cached_property
     def mass(self) -> Entries:
-        """Mass matrix L_vv."""
-        return jacobian(self.momentum, self.system.velocities, symmetric=True)
+        """Mass matrix L_vv; entries of term groups, whose values loops add, are 0."""
+        entries = jacobian(self.momentum, self.system.velocities, symmetric=True)
+        pairs = self.masses_of_groups
+        further = dict.fromkeys((*pairs, *((j, i) for i, j in pairs)), sympy.S.Zero)
+        return dict(sorted((further | entries).items())) if further else entries
 
     @cached_property
     def lower_mass(self) -> Entries:
@@ -316,7 +324,7 @@ class Forms:
 
         False with damping: velocities at the points are then not the sums of forces in the tables of a method.
         """
-        if self.system.auxiliaries or self.system.damping != 0 or self.inverse_mass:
+        if self.system.auxiliaries or self.system.damping != 0 or self.inverse_mass or self.masses_of_groups:
             return False
         constant = set(self.system.parameters)
         return all(entry.free_symbols <= constant for entry in self.mass.values())

@@ -76,6 +76,9 @@ class Constant:
     value: Number
 
 
+ZERO = Constant(0)
+
+
 @dataclass(frozen=True, slots=True)
 class Load:
     """``u[index]``, ``parameters[index]``, ``t`` (index -1) or temporary ``w[index]``, by ``source``."""
@@ -166,6 +169,17 @@ class Kernel:
         expressions = (*self.temporaries, *self.results)
         return any(load.source == array for expression in expressions for load in loads(expression))
 
+    @property
+    def added(self) -> set[int]:
+        """Indices of the derivatives that loops add to."""
+        tables = (table for rolled in self.sums for table in rolled.tables)
+        return {k for name, rows in tables if name == "entries" for row in rows for k in row}
+
+    @property
+    def cleared(self) -> int:
+        """Number of derivatives to set to 0 first, as loops add to them; 0 if they are in a matrix of zeros."""
+        return self.partials if max(self.added, default=self.partials) < self.partials else 0
+
     def operation_counts(self) -> dict[str, int]:
         """Return the number of operations by name, in alphabetical order."""
         expressions = subexpressions(*self.temporaries, *self.results)
@@ -176,7 +190,11 @@ class Kernel:
         return dict(sorted(counts.items()))
 
     def statements(self) -> Iterator[tuple[str, int, Expression]]:
-        """Yield ("w", "value" or "derivative", index, expression): each result right after its last temporary."""
+        """Yield ("w", "value" or "derivative", index, expression): each result right after its last temporary.
+
+        Derivatives that are 0 but for what loops add are not stored: they are 0 before (:attr:`cleared`).
+        """
+        by_loops = bool(self.added)
         due: list[list[int]] = [[] for _ in range(len(self.temporaries) + 1)]
         for k, expression in enumerate(self.results):
             due[1 + max((load.index for load in loads(expression) if load.source == "w"), default=-1)].append(k)
@@ -185,6 +203,8 @@ class Kernel:
                 yield "w", k - 1, self.temporaries[k - 1]
             for number in ready:
                 derivative = number >= self.values
+                if derivative and by_loops and self.results[number] == ZERO:
+                    continue
                 yield "derivative" if derivative else "value", number - derivative * self.values, self.results[number]
 
 
@@ -233,17 +253,22 @@ class RolledKernel:
         table: tuple[tuple[int, ...], ...],
         constants: tuple[tuple[Constant | Load, ...], ...] = (),
         targets: tuple[tuple[int, ...], ...] = (),
+        derivatives: tuple[tuple[int, ...], ...] = (),
     ) -> RolledKernel:
         """Return the loop over constant rows e: value[targets[e][a]] += kernel_a(u[table[e][..]], constants[..][e]).
+
+        The last values of the kernel are added to derivative[derivatives[e][..]].
 
         Args:
             kernel: a function of as many arguments as indices and constants in a row.
             table: (rows, slots) indices of arguments of the kernel that contains the loop.
             constants: (constants, rows) numbers or parameters.
             targets: (rows, values) indices of its values; by default the table.
+            derivatives: (rows, derivatives) indices of its derivatives.
         """
         end = Size("", len(table))
-        written = "targets" if targets else "places"
+        written, count = "targets" if targets else "places", len(derivatives[0]) if derivatives else 0
+        tables = {"places": table, "targets": targets, "entries": derivatives}
 
         def entries(array: str, table: str, count: int) -> tuple[Access, ...]:
             places = (Place(index="e", table=table, column=k) for k in range(count))
@@ -254,9 +279,9 @@ class RolledKernel:
             kernel=kernel,
             loops=(Loop(index="e", first=Size(""), end=end),),
             reads=entries("u", "places", len(table[0])),
-            writes=entries("value", written, kernel.values),
+            writes=(*entries("value", written, kernel.values - count), *entries("derivative", "entries", count)),
             constants=tuple(Access(array=Array(name, (end,)), places=(Place(index="e"),)) for name in columns),
-            tables=(("places", table), *((("targets", targets),) if targets else ())),
+            tables=tuple((name, rows) for name, rows in tables.items() if rows and rows[0]),
             columns=tuple(columns.items()),
         )
 

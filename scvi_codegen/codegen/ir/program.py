@@ -8,7 +8,7 @@ the same for every method and system, and is in the templates.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from scvi_codegen.codegen.ir.equations import (
     NO_CONSTRAINTS,
@@ -346,6 +346,27 @@ class Program:
             *self.rattle.kernels,
         )
         return tuple({kernel.name: kernel for kernel in kernels if kernel}.values())
+
+    @property
+    def has_full_masses(self) -> bool:
+        """Whether steps are solved by iterations alone, with mass matrices that are not diagonal."""
+        fixed_point = self.fixed_point
+        return not self.newton and bool(fixed_point and fixed_point.mass_entries and not fixed_point.diagonal)
+
+    @property
+    def operations(self) -> int:
+        """Number of operations of all kernels, of loops for each of their rows."""
+        return sum(sum(kernel.operation_counts().values()) for kernel in self._of_steps)
+
+    @property
+    def operations_in_text(self) -> int:
+        """Number of operations in the text of all kernels, of loops once."""
+        functions = (replace(part, sums=()) for kernel in self._of_steps for part in kernel.functions)
+        return sum(sum(part.operation_counts().values()) for part in functions)
+
+    @property
+    def _of_steps(self) -> tuple[Kernel, ...]:
+        return (*self.kernels, *(self.fixed_point.kernels if self.fixed_point else ()))
 
     @property
     def masses_of_points(self) -> tuple[int, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain, combinations, islice, product
@@ -226,9 +226,11 @@ def with_sums(program: Program, split: SplitSystem) -> Program | None:
     """Return the program of ``of.rest`` with the forces and the energy of the term groups.
 
     ``None`` if forces enter otherwise than as values of kernels, in Newton's method and shooting, or if steps without
-    the forces of ``of.rest`` have no kicks.
+    the forces of ``of.rest`` have no kicks; of groups with velocities also unless these are the unknowns.
     """
     rest, energy, sign = split.rest, program.quantities.energy, -1 if split.rest.auxiliaries else 1
+    if any(group.rates for group in split.term_groups):
+        return _with_masses(program, split)
     forces, terms = [], []
     for number, group in enumerate(split.term_groups):
         first = ((0,),) * len(group.places)
@@ -246,12 +248,81 @@ def with_sums(program: Program, split: SplitSystem) -> Program | None:
     )
 
 
+def _with_masses(program: Program, split: SplitSystem) -> Program | None:
+    """Return the program with forces, momenta, masses and the energy of term groups; ``None`` without kernels for them.
+
+    Kernels of the rest have all entries of the masses, 0 where only groups have some.
+    """
+    fixed_point, quantities, m = program.fixed_point, program.quantities, split.rest.dimension
+    legendre, energy = quantities.legendre, quantities.energy
+    if program.newton or not fixed_point or fixed_point.forces != ("point_lanes", "force_lanes"):
+        return None
+    if not (legendre and energy):
+        return None
+    numbers = {place: (k,) for k, place in enumerate(quantities.mass_entries)}
+    in_matrix = {(i, j): (i if fixed_point.diagonal else i * m + j,) for i, j in fixed_point.mass_entries}
+    in_both = {(i, j): numbers[i, j] + (numbers[j, i] if i != j else ()) for i, j in in_matrix}
+    loops = partial(_of_groups, split)
+    of_points = {"point_lanes": loops(forces=0, momenta=m, entries=in_matrix), "force_lanes": loops(forces=0)}
+    kernels = (kernel.with_sums(of_points.get(kernel.name, ())) for kernel in fixed_point.kernels)
+    return replace(
+        program,
+        quantities=replace(
+            quantities,
+            legendre=legendre.with_sums(loops(momenta=0, entries=in_both)),
+            energy=energy.with_sums(loops(energy=0)),
+        ),
+        fixed_point=replace(fixed_point, kernels=tuple(kernels)),
+    )
+
+
+def _of_groups(
+    split: SplitSystem,
+    *,
+    forces: int | None = None,
+    momenta: int | None = None,
+    energy: int | None = None,
+    entries: Mapping[tuple[int, int], tuple[int, ...]] | None = None,
+) -> tuple[RolledKernel, ...]:
+    """Return the loops over terms that add to values of a kernel of positions and velocities.
+
+    Args:
+        split: the term groups.
+        forces, momenta, energy: index of the first value of each kind, if the kernel has such values.
+        entries: indices of derivatives of the kernel by entry (i, j), i >= j, of the masses, if it has these.
+    """
+    m, loops = split.rest.dimension, []
+    for number, group in enumerate(split.term_groups):
+        values, targets = list[Expr](), [tuple[int, ...]()] * len(group.places)
+        for first, of_slots in ((forces, group.partials), (momenta, group.momenta if group.rates else ())):
+            if first is not None and of_slots:
+                values += of_slots
+                targets = [(*own, *(first + k for k in row)) for own, row in zip(targets, group.places, strict=True)]
+        if energy is not None:
+            values, targets = [group.formula], [(energy,) for _ in group.places]
+        derivatives = tuple[tuple[int, ...], ...]()
+        if entries is not None and group.rates:
+            derivatives = tuple(sum((entries[pair] for pair in row), ()) for row in group.mass_places)
+            counts = [len(entries[pair]) for pair in next(group.mass_places)]
+            values += [x for count, x in zip(counts, group.masses.values(), strict=True) for _ in range(count)]
+        if values:
+            reads = tuple((*row, *(m + k for k in row)) if group.rates else row for row in group.places)
+            loops.append(_over_terms(split.rest, f"terms_{number}", group, values, tuple(targets), derivatives, reads))
+    return tuple(loops)
+
+
 def _over_terms(
-    system: MechanicalSystem, name: str, group: TermGroup, values: Sequence[Expr], targets: tuple[tuple[int, ...], ...]
+    system: MechanicalSystem,
+    name: str,
+    group: TermGroup,
+    values: Sequence[Expr],
+    targets: tuple[tuple[int, ...], ...],
+    derivatives: tuple[tuple[int, ...], ...] = (),
+    reads: tuple[tuple[int, ...], ...] = (),
 ) -> RolledKernel:
     kernel = lower_kernel(
         name,
-        arguments=(*group.slots, *group.constants),
+        arguments=(*group.slots, *group.rates, *group.constants),
         time=system.time,
         parameters=system.parameters,
         values=values,
@@ -262,7 +333,7 @@ def _over_terms(
         tuple(Load("parameters", index[x]) if x in index else Constant(exact_number(x)) for x in column)
         for column in group.values
     )
-    return RolledKernel.over_rows(kernel, group.places, coefficients, targets)
+    return RolledKernel.over_rows(kernel, reads or group.places, coefficients, targets, derivatives)
 
 
 def reach_of(arrays: Iterable[Array], term_groups: Iterable[RolledKernel]) -> int:

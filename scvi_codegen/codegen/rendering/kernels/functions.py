@@ -291,6 +291,8 @@ def _text(kernel: Kernel, target: Target, lanes: Lanes | None, printed: Printed,
         arrays = [[declared[name] for name in filter(part.uses, ARRAYS)] for part in cut]
         texts = [_function(PART, *of, printed(of[0])) for of in zip(cut, arrays, strict=True)]
     statements = [*printed(kernel)]
+    if kernel.cleared:
+        statements.insert(0, f"memset(derivative, 0, {kernel.cleared} * sizeof *derivative);")
     for loop in kernel.sums:
         texts += _text(loop.kernel, target, lanes, printed), *_tables(loop, target)
         statements += _Rows(loop, real, parameter).lines()
@@ -332,7 +334,9 @@ class _Rows(Nest):
 
     def lines(self) -> list[str]:
         call = f"{self.rolled.kernel.name}(slot, t, parameters, term);"
-        added = (f"value[{self.place(target)}] += term[{k}];" for k, target in enumerate(self.rolled.writes))
+        added = (
+            f"{target.array.name}[{self.place(target)}] += term[{k}];" for k, target in enumerate(self.rolled.writes)
+        )
         return self.text(innermost=[call, *added])
 
     def known(self, depth_of: int) -> Iterator[str]:
