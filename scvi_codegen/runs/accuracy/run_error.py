@@ -327,9 +327,7 @@ class _Replay:
         reason = self._replayed()
         errors, rounding = self.results.reshape(2, 2, self.m, -1)
         if not reason and len(self.run) > 1 and np.isnan(errors[0, 0, 1:]).all():
-            reason = (
-                "errors are unknown: events change all states after the first (give max_step, to save others between)"
-            )
+            reason = "errors are unknown: events change all states after the first (max_step= saves others)"
         return _described(self.run, errors, rounding, reason)
 
     def _replayed(self) -> str:
