@@ -418,7 +418,7 @@ SPRUNG: Any = {"q": [1, 0, 0, 0, 0], "velocity": [0, 0, 0.1, 0.1, 0.1], "t_end":
 
 
 ROUNDING_DECIDES = pytest.mark.xfail(
-    reason="rounding of the gaps of straight legs decides which foot carries, by second rates", strict=False
+    reason="rounding of the gaps of straight legs decides which foot carries, by second rates", strict=True
 )
 
 

@@ -101,48 +101,19 @@ static int rank_of(const contact_terms *of, const contact_mode *mode)
   return rank;
 }
 
-/* Marks the contacts whose rows the imposed ones determine: open ones carry no load, slips that begin rest. */
+/* Marks the contacts without load whose gaps the imposed rows determine. */
 static void hold_contacts(const contact_terms *of, const contact_roles *in, contact_mode *mode)
 {
   const int rank = rank_of(of, mode);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const contact_mode now = mode[k];
-    if (now.closed ? now.sticks || !in->is_slow[k] : in->is_free[k])
+    if (now.closed || in->is_free[k])
       continue;
-    mode[k] = now.closed ? CONTACT_STICKS : CONTACT_SLIPS;
+    mode[k] = CONTACT_SLIPS;
     const int held = rank_of(of, mode) == rank;
     mode[k] = now;
     mode[k].held = held;
   }
-}
-
-/* Opens a contact, if other forces give the same rates of the imposed rows but not of all, as of several supports that
- * slide in different directions: the first of those that carry no load along such forces. Whether there is one. */
-static int unload(const contact_terms *of, const contact_mode *mode, const real *force, contact_roles *in)
-{
-  contact_unknowns unknown;
-  const real still[CONTACT_ROWS] = {0.0};
-  real line[CONTACT_ROWS][CONTACT_ROWS + 1], none[CONTACT_ROWS], least = INFINITY;
-  int independent[CONTACT_ROWS], first = -1;
-  find_unknowns(of, mode, &unknown, none);
-  if (!reduce_equations(of, &unknown, of->second, none, line, independent))
-    return 0;
-  for (int d = 0; d < unknown.count && first < 0; d++) {
-    real moved[CONTACT_ROWS] = {0.0};
-    for (int i = 0; i < unknown.count && !independent[d]; i++)
-      for (int r = 0; r < CONTACT_ROWS; r++)
-        moved[r] += unknown.column[i][r] * (independent[i] ? -line[i][d] / line[i][i] : i == d);
-    for (int k = 0; k < EVENT_CONTACTS && discord_of(of, still, moved, still, still, moved) > CONTACT_ROUNDING; k++) {
-      const int normal = CONTACTS[k].normal;
-      if (normal < 0 || !mode[k].closed || !(fabs(force[normal]) < least * fabs(moved[normal])))
-        continue;
-      least = fabs(force[normal] / moved[normal]);
-      first = k;
-    }
-  }
-  if (first >= 0)
-    in->role[first] = CONTACT_IS_OPEN;
-  return first >= 0;
 }
 
 /* Modes that a contact may have beside the best one, of which the first ones stick: only those that static friction
@@ -226,24 +197,22 @@ static contact_mode mode_by_rates(const contact_terms *of, const contact_roles *
   return slides;
 }
 
-/* Modes: of several those in which all is closed and sticks, else by the rates of the contact problem, of fewer contacts
- * if forces do not determine the rates. Returns whether it is solved. */
-static int solve_modes(const contact_terms *of, contact_roles *in, real *force, contact_mode *mode)
+/* Modes: of several those in which all is closed and sticks, else by the rates of the contact problem. Returns whether
+ * it is solved. */
+static int solve_modes(const contact_terms *of, const contact_roles *in, real *force, contact_mode *mode)
 {
   cone_problem problem;
   real exact[CONTACT_ROWS], after[CONTACT_ROWS];
   memcpy(mode, in->role, sizeof in->role);
   if (!in->any_begins && is_consistent(of, in, mode, exact, after))
     return 1;
-  do {
-    pose_forces(of, in, force, &problem);
-    if (!solve_cone(&problem))
-      return 0;
-    memcpy(force, problem.f, sizeof problem.f);
-    for (int k = 0; k < EVENT_CONTACTS; k++)
-      mode[k] = mode_by_rates(of, in, &problem, k);
-    hold_contacts(of, in, mode);
-  } while (!is_consistent(of, in, mode, exact, after) && unload(of, mode, force, in));
+  pose_forces(of, in, force, &problem);
+  if (!solve_cone(&problem))
+    return 0;
+  memcpy(force, problem.f, sizeof problem.f);
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    mode[k] = mode_by_rates(of, in, &problem, k);
+  hold_contacts(of, in, mode);
   return 1;
 }
 

@@ -21,8 +21,8 @@ enum {
 };
 
 /* A contact without gap is always closed; one without friction does not stick, and has direction 0. Slip in space that
- * begins has a direction to be found, 0 until then. Bit i of `sticks` imposes slip i. A contact is held where the
- * rows of others determine its own: open, it carries no load; closed, it rests with sliding friction.
+ * begins has a direction to be found, 0 until then. Bit i of `sticks` imposes slip i. An open contact is held where the
+ * rows of others determine its gap: it carries no load.
  * Of closed and sticking contacts a step imposes independent rows; `held` then has bits for those of others. */
 typedef struct {
   int closed, sticks, held;

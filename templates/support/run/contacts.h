@@ -326,14 +326,6 @@ static int end_held_modes(const event_step *step, const event_sample *right)
   return OK;
 }
 
-/* Value below which a gap is negative by more than rounding. */
-static real least_gap(const event_step *step, const contact_terms *of, int transition)
-{
-  const int e = EVENT_FIRST[FIRST_TRANSITION + transition], row = CONTACTS[TRANSITION[transition][0]].normal;
-  return -CONTACT_MISSED * values_at(step, EVENT_DEGREE + 2)[e] - step->watch->history[e].slack -
-      (row < 0 ? 0.0 : CONTACT_ROUNDING * of->size[row]);
-}
-
 /* Fails if friction is impossible at a node of a part of a step after its start, before its first transition. */
 static int check_friction(const event_step *step)
 {
@@ -356,28 +348,12 @@ static int check_friction(const event_step *step)
   return OK;
 }
 
-/* Ends modes at the start of a step whose forces or gaps are negative there within rounding, and more at its end: their
- * functions have no zero. Of gaps in steps to whose end the present modes last. */
-static int end_modes_at_start(const event_step *step, const event_sample *right)
+/* Value below which a gap is negative by more than rounding. */
+static real least_gap(const event_step *step, const contact_terms *of, int transition)
 {
-  contact_terms of;
-  const int lasts = isinf(step->horizon->fraction);
-  int outside[EVENT_CONTACTS], has_terms = 0;
-  TRY(check_friction(step));
-  for (int i = 0; i < TRANSITIONS; i++) {
-    const int e = EVENT_FIRST[FIRST_TRANSITION + i];
-    const real before = values_at(step, 0)[e], after = values_at(step, EVENT_DEGREE)[e];
-    if (!((is_of_forces(i) || (lasts && is_kept(i))) && before < 0.0 && after < before))
-      continue;
-    if (!has_terms) {
-      TRY(terms_at(step, right, &of));
-      find_outside(step, &of, CONTACT_OUTSIDE, outside);
-    }
-    has_terms = 1;
-    if (is_of_forces(i) ? outside[TRANSITION[i][0]] : after < least_gap(step, &of, i))
-      TRY(add_transition(step, i, CONTACT_START));
-  }
-  return end_held_modes(step, right);
+  const int e = EVENT_FIRST[FIRST_TRANSITION + transition], row = CONTACTS[TRANSITION[transition][0]].normal;
+  return -CONTACT_MISSED * values_at(step, EVENT_DEGREE + 2)[e] - step->watch->history[e].slack -
+      (row < 0 ? 0.0 : CONTACT_ROUNDING * of->size[row]);
 }
 
 /* Fails if a gap is negative at the end of a step without a transition, or forces are outside of their cone. */
