@@ -20,7 +20,7 @@ class ContactMode(StrEnum):
 class Dependence(IntFlag):
     """Rows that other contacts impose, in the mask ``held`` of a contact (contacts.h)."""
 
-    HELD = 1  # open, without load
+    HELD = 1
     LOADED = 2
     STUCK = 4
 
@@ -62,7 +62,7 @@ class ContactRows(NamedTuple):
         if self.closed and not (parameters[self.closed] or Dependence.LOADED in depends):
             return ContactMode.OPEN
         slides = not self.slips or any(parameters[name] for name in self.directions)
-        return ContactMode.SLIP if slides else ContactMode.STICK
+        return ContactMode.SLIP if slides and Dependence.HELD not in depends else ContactMode.STICK
 
     @property
     def stepped(self) -> ContactRows:

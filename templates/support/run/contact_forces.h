@@ -290,7 +290,7 @@ static void modes_at(const contact_terms *of, const real *modes, contact_mode *m
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const real *const w = of->rate + CONTACTS[k].tangential, *const start = modes + CONTACTS[k].direction + 1;
     mode[k] = mode_of(modes, k);
-    if (CONTACTS[k].slips < 2 || start[-1] == 0.0)
+    if (CONTACTS[k].slips < 2 || start[-1] == 0.0 || mode[k].held)
       continue;
     const real along = start[2] * w[0] + start[3] * w[1], x[2] = {along * w[0] + start[0], along * w[1] + start[1]};
     for (int i = 0; i < 2 && length_of(x, 2) > 0.0; i++)

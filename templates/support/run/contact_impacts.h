@@ -160,6 +160,21 @@ static int push(const event_step *step, event_sample *at, contact_terms *of, con
   return terms_at(step, at, of);
 }
 
+/* Removes the rates of low rebounds from contacts that touch, with slips that rest: slips that remain have the
+ * direction of their friction. */
+static int settle(const event_step *step, event_sample *at, contact_terms *of, const contact_change *now)
+{
+  contact_mode mode[EVENT_CONTACTS];
+  real impulse[CONTACT_ROWS], after[CONTACT_ROWS];
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    mode[k] = now->rests[k] ? CONTACT_STICKS : CONTACT_SLIPS;
+    if (CONTACTS[k].normal >= 0 && !now->touches[k])
+      mode[k] = CONTACT_IS_OPEN;
+  }
+  const real discord = solve_rows(of, mode, of->rate, of->rate, impulse, after, NULL);
+  return discord > CONTACT_ROUNDING ? OK : push(step, at, of, impulse);
+}
+
 /* Whether a contact meets: its gap closes, or is 0 within rounding and it was open. */
 static int is_met(const contact_terms *of, const contact_change *now, const int *closed, int k)
 {
@@ -200,7 +215,7 @@ static int collide(const event_step *step, event_sample *at, contact_terms *of, 
       now->touches[k] = 1;
     step->watch->accumulates[k] = 0;
   }
-  return status;
+  return status == OK ? settle(step, at, of, now) : status;
 }
 
 /* Impact without collision (F. Genot & B. Brogliato, Eur. J. Mech. A 18, 1999) at a state whose forces have no

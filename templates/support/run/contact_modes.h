@@ -62,7 +62,7 @@ static int satisfies(const contact_terms *of, const contact_roles *in, int k, co
 {
   const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
   const real small = rounding_at_row(of, after, normal < 0 ? slip : normal), *const d = mode.direction;
-  real begin = 0.0;
+  real begin = 0.0, moves = 0.0;
   if (in->is_free[k])
     return 1;
   const real load = normal < 0 ? 1.0 : force[normal] * of->W[normal * (CONTACT_ROWS + 1)];
@@ -70,13 +70,15 @@ static int satisfies(const contact_terms *of, const contact_roles *in, int k, co
     return 0;
   if (!mode.closed || !in->is_slow[k])
     return 1;
-  for (int i = 0; i < slips; i++)
+  for (int i = 0; i < slips; i++) {
     begin += d[i] * after[slip + i];
+    moves = fmax(moves, fabs(after[slip + i]));
+  }
   const real aside = slips == 2 ? d[0] * after[slip + 1] - d[1] * after[slip] : 0.0;
-  const real limit = friction_limit(of, k, mode.sticks != 0, force);
+  const real limit = friction_limit(of, k, mode.sticks || mode.held, force);
   const real beyond = (length_of(force + slip, slips) - limit) * of->W[slip * (CONTACT_ROWS + 1)];
-  if (mode.sticks)
-    return beyond <= small;
+  if (mode.sticks || mode.held)
+    return beyond <= small && (mode.sticks || moves <= small);
   return begin >= -small && fabs(aside) <= fmax(small, CONTACT_ASIDE * begin);
 }
 
@@ -101,19 +103,53 @@ static int rank_of(const contact_terms *of, const contact_mode *mode)
   return rank;
 }
 
-/* Marks the contacts without load whose gaps the imposed rows determine. */
-static void hold_contacts(const contact_terms *of, const contact_roles *in, contact_mode *mode)
+/* Marks the contacts whose rows the imposed ones determine: open ones carry no load, and friction of slips that begin
+ * keeps its ratio to the normal force. */
+static void hold_contacts(const contact_terms *of, const contact_roles *in, const cone_problem *solved,
+    contact_mode *mode)
 {
   const int rank = rank_of(of, mode);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const contact_mode now = mode[k];
-    if (now.closed || in->is_free[k])
+    const real limit = friction_limit(of, k, 0, solved->f);
+    if (now.closed ? now.sticks || !solved->mode[k].sticks : in->is_free[k])
       continue;
-    mode[k] = CONTACT_SLIPS;
+    mode[k] = now.closed ? CONTACT_STICKS : CONTACT_SLIPS;
     const int held = rank_of(of, mode) == rank;
     mode[k] = now;
     mode[k].held = held;
+    for (int i = 0; i < CONTACTS[k].slips && held && now.closed && limit > 0.0; i++)
+      mode[k].direction[i] = -solved->f[CONTACTS[k].tangential + i] / limit;
   }
+}
+
+/* Opens a contact, if other forces give the same rates of the imposed rows but not of all, as of several supports that
+ * slide in different directions: the first of those that carry no load along such forces. Whether there is one. */
+static int unload(const contact_terms *of, const contact_mode *mode, const real *force, contact_roles *in)
+{
+  contact_unknowns unknown;
+  const real still[CONTACT_ROWS] = {0.0};
+  real line[CONTACT_ROWS][CONTACT_ROWS + 1], none[CONTACT_ROWS], least = INFINITY;
+  int independent[CONTACT_ROWS], first = -1;
+  find_unknowns(of, mode, &unknown, none);
+  if (!reduce_equations(of, &unknown, of->second, none, line, independent))
+    return 0;
+  for (int d = 0; d < unknown.count && first < 0; d++) {
+    real moved[CONTACT_ROWS] = {0.0};
+    for (int i = 0; i < unknown.count && !independent[d]; i++)
+      for (int r = 0; r < CONTACT_ROWS; r++)
+        moved[r] += unknown.column[i][r] * (independent[i] ? -line[i][d] / line[i][i] : i == d);
+    for (int k = 0; k < EVENT_CONTACTS && discord_of(of, still, moved, still, still, moved) > CONTACT_ROUNDING; k++) {
+      const int normal = CONTACTS[k].normal;
+      if (normal < 0 || !mode[k].closed || !(fabs(force[normal]) < least * fabs(moved[normal])))
+        continue;
+      least = fabs(force[normal] / moved[normal]);
+      first = k;
+    }
+  }
+  if (first >= 0)
+    in->role[first] = CONTACT_IS_OPEN;
+  return first >= 0;
 }
 
 /* Modes that a contact may have beside the best one, of which the first ones stick: only those that static friction
@@ -135,10 +171,11 @@ static int list_modes(const contact_terms *of, const contact_roles *in, int k, c
   return count;
 }
 
-/* Whether a motion beside that of the best modes is consistent, whose rates differ; 0 if too many modes are to try. */
-static int is_ambiguous(const contact_terms *of, const contact_roles *in, const contact_mode *best, const real *rates)
+/* First consistent modes beside the best ones, of which given rates, if there are any, differ from theirs; 0 if there
+ * are none, or too many to try. */
+static int find_others(const contact_terms *of, const contact_roles *in, const contact_mode *best, const real *rates,
+    contact_mode *mode)
 {
-  contact_mode mode[EVENT_CONTACTS];
   real force[CONTACT_ROWS], after[CONTACT_ROWS], size = 0.0;
   contact_mode list[EVENT_CONTACTS][4];
   int count[EVENT_CONTACTS], total = 1;
@@ -149,12 +186,12 @@ static int is_ambiguous(const contact_terms *of, const contact_roles *in, const 
   for (int r = 0; r < CONTACT_ROWS; r++)
     size = fmax(size, fabs(of->second[r]));
   for (int number = 0; total <= CONTACT_OTHERS && number < total; number++) {
-    int differs = 0;
+    int differs = !rates;
     for (int k = 0, rest = number; k < EVENT_CONTACTS; rest /= count[k++])
       mode[k] = list[k][rest % count[k]];
     if (!is_consistent(of, in, mode, force, after))
       continue;
-    for (int r = 0; r < CONTACT_ROWS; r++)
+    for (int r = 0; r < CONTACT_ROWS && rates; r++)
       differs |= fabs(after[r] - rates[r]) > CONTACT_APART * fmax(size, fabs(after[r])) + rounding_at_row(of, after, r);
     if (differs)
       return 1;
@@ -179,15 +216,16 @@ static void pose_forces(const contact_terms *of, const contact_roles *in, const 
   }
 }
 
-/* Mode of a contact by the rates of a solution: closed while it pushes, it sticks while that of its slip is 0. Slips
- * that begin have no rate yet: those with friction at its limit, which of redundant contacts reach it together
- * (theorems of limit analysis). */
-static contact_mode mode_by_rates(const contact_terms *of, const contact_roles *in, const cone_problem *solved, int k)
+/* Mode of a contact by the rates of a solution: closed while that of its gap is 0, and it pushes if others lift; it
+ * sticks while that of its slip is. Slips that begin have no rate yet: those with friction at its limit, which of
+ * redundant contacts reach it together (theorems of limit analysis). */
+static contact_mode mode_by_rates(const contact_terms *of, const contact_roles *in, const cone_problem *solved, int k,
+    int lifts)
 {
   const cone_mode mode = solved->mode[k];
   const int slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
   contact_mode slides = CONTACT_SLIPS;
-  if (!in->role[k].closed || !mode.pushes)
+  if (!in->role[k].closed || !(lifts ? mode.pushes : mode.is_closed))
     return CONTACT_IS_OPEN;
   const int may_begin = in->begins[k] || (in->any_begins && solved->mu[k] == solved->mu_static[k]);
   const real least = (1.0 - CONTACT_OUTSIDE) * friction_limit(of, k, 0, solved->f);
@@ -197,22 +235,33 @@ static contact_mode mode_by_rates(const contact_terms *of, const contact_roles *
   return slides;
 }
 
-/* Modes: of several those in which all is closed and sticks, else by the rates of the contact problem. Returns whether
- * it is solved. */
-static int solve_modes(const contact_terms *of, const contact_roles *in, real *force, contact_mode *mode)
+/* Consistent modes: of several those in which all is closed and sticks, else by the rates of the contact problem; where
+ * forces in them pull, as of rows that nearly depend, those of contacts that push, of fewer if forces do not determine
+ * the rates, else others. Returns whether the problem is solved. */
+static int solve_modes(const contact_terms *of, contact_roles *in, real *force, contact_mode *mode)
 {
   cone_problem problem;
+  contact_mode last[EVENT_CONTACTS];
   real exact[CONTACT_ROWS], after[CONTACT_ROWS];
   memcpy(mode, in->role, sizeof in->role);
   if (!in->any_begins && is_consistent(of, in, mode, exact, after))
     return 1;
-  pose_forces(of, in, force, &problem);
-  if (!solve_cone(&problem))
-    return 0;
-  memcpy(force, problem.f, sizeof problem.f);
-  for (int k = 0; k < EVENT_CONTACTS; k++)
-    mode[k] = mode_by_rates(of, in, &problem, k);
-  hold_contacts(of, in, mode);
+  do {
+    pose_forces(of, in, force, &problem);
+    if (!solve_cone(&problem))
+      return 0;
+    memcpy(force, problem.f, sizeof problem.f);
+    for (int pushes = in->lifts; pushes <= 1; pushes++) {
+      for (int k = 0; k < EVENT_CONTACTS; k++)
+        mode[k] = mode_by_rates(of, in, &problem, k, pushes);
+      hold_contacts(of, in, &problem, mode);
+      if (is_consistent(of, in, mode, exact, after))
+        return 1;
+    }
+  } while (unload(of, mode, force, in));
+  memcpy(last, mode, sizeof last);
+  if (!find_others(of, in, last, NULL, mode))
+    memcpy(mode, last, sizeof last);
   return 1;
 }
 
@@ -262,7 +311,7 @@ static int allow_present(const event_step *step, const contact_terms *of, const 
   const int reason = in->is_free[k] ? 0 : impossible_reason(of, k, is_still, 0, &impossible);
   if (reason)
     return refuse(step, reason, k, impossible);
-  *directed = slips == 2 && in->role[k].closed && !in->is_slow[k] && start[-1] != 0.0 &&
+  *directed = slips == 2 && in->role[k].closed && !in->is_slow[k] && start[-1] != 0.0 && !present->held &&
       keeps_direction(start, of->rate + slip);
   for (int i = 0; *directed && i < 2; i++)
     in->role[k].direction[i] = d[i] / length_of(d, 2);
@@ -291,7 +340,7 @@ static contact_mode mode_by_rows(const contact_terms *of, contact_mode mode, int
 static int choose_modes(const event_step *step, const contact_terms *of, const contact_change *now, real *force)
 {
   contact_roles in = {.lifts = now->lifts};
-  contact_mode present[EVENT_CONTACTS], best[EVENT_CONTACTS];
+  contact_mode present[EVENT_CONTACTS], best[EVENT_CONTACTS], other[EVENT_CONTACTS];
   real second[CONTACT_ROWS];
   int imposed[CONTACT_ROWS] = {0}, directed[EVENT_CONTACTS] = {0};
   modes_at(of, step->watch->mode, present);
@@ -300,7 +349,7 @@ static int choose_modes(const event_step *step, const contact_terms *of, const c
   if (!solve_modes(of, &in, force, best))
     return refuse(step, CONTACT_WITHOUT_MODE, -1, 0.0);
   solve_contacts(of, best, of->second, force, second, imposed);
-  step->watch->ambiguous |= is_ambiguous(of, &in, best, second);
+  step->watch->ambiguous |= find_others(of, &in, best, second, other);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int slip = CONTACTS[k].tangential, is_slow = in.is_slow[k];
     real speed = slip < 0 ? 0.0 : of->speed[slip]; /* and that by forces that cancel */

@@ -21,8 +21,8 @@ enum {
 };
 
 /* A contact without gap is always closed; one without friction does not stick, and has direction 0. Slip in space that
- * begins has a direction to be found, 0 until then. Bit i of `sticks` imposes slip i. An open contact is held where the
- * rows of others determine its gap: it carries no load.
+ * begins has a direction to be found, 0 until then. Bit i of `sticks` imposes slip i. A contact is held where the rows
+ * of others determine its own: open, it carries no load; closed, its friction is -mu d times the normal force at rest.
  * Of closed and sticking contacts a step imposes independent rows; `held` then has bits for those of others. */
 typedef struct {
   int closed, sticks, held;
@@ -48,11 +48,13 @@ static const contact_mode CONTACT_SLIPS = {1, 0, 0, {0.0, 0.0}};
  * ahead.w < 0, with the direction `ahead` at an earlier step; the second term keeps the direction of slow slips. */
 static void put_ahead(contact_mode mode, const real *w, real speed, real *slides)
 {
-  const real slow = length_of(w, 2) > CONTACT_SLOW * speed ? 0.0 : pow(CONTACT_FAST * speed, 2.0);
-  slides[0] = mode.closed && !mode.sticks && !(mode.held & CONTACT_STUCK);
+  const int held = mode.held & CONTACT_HELD, slips = mode.closed && !mode.sticks && !(mode.held & CONTACT_STUCK);
+  const real size = length_of(mode.direction, 2), fast = pow(CONTACT_FAST * speed, 2.0);
+  const real slow = length_of(w, 2) > CONTACT_SLOW * speed ? 0.0 : fast;
+  slides[0] = held ? size : slips;
   for (int i = 0; i < 2; i++) {
-    slides[1 + i] = slow * mode.direction[i];
-    slides[3 + i] = mode.direction[i];
+    slides[1 + i] = (held && size > 0.0 ? fast / size : slow) * mode.direction[i];
+    slides[3 + i] = held ? 0.0 : mode.direction[i];
   }
 }
 #else

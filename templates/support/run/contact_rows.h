@@ -32,7 +32,7 @@ static contact_mode mode_of(const real *mode, int k)
     now.sticks |= (mode[at->sticks + i] != 0.0 || (held & CONTACT_STUCK)) << i;
     now.direction[i] = slides[0];
     if (at->slips == 2)
-      now.direction[i] *= slides[3 + i];
+      now.direction[i] *= now.held ? slides[1 + i] / fmax(length_of(slides + 1, 2), DBL_MIN) : slides[3 + i];
   }
   return now;
 }

@@ -48,7 +48,7 @@ static int slips_at(const event_step *step, const event_sample *at, contact_term
   const real *const modes = step->watch->mode;
   *any = 0;
   for (int k = 0; k < EVENT_CONTACTS; k++)
-    *any |= CONTACTS[k].slips == 2 && modes[CONTACTS[k].direction] != 0.0;
+    *any |= CONTACTS[k].slips == 2 && modes[CONTACTS[k].direction] != 0.0 && !mode_of(modes, k).held;
   if (!*any)
     return OK;
   TRY(terms_at(step, at, of));
@@ -243,7 +243,7 @@ static slip_pace pace_of(const event_step *step, const contact_terms *of, int k,
   const int slip = CONTACTS[k].tangential;
   const real *const start = step->watch->mode + CONTACTS[k].direction + 1, *const w = of->rate + slip;
   const real *const d = mode->direction, size = length_of(w, 2);
-  slip_pace pace = {.moves = CONTACTS[k].slips == 2 && start[-1] != 0.0};
+  slip_pace pace = {.moves = CONTACTS[k].slips == 2 && start[-1] != 0.0 && !mode->held};
   if (!pace.moves)
     return pace;
   real *const fastest = step->watch->fastest + k;

@@ -42,6 +42,93 @@ static int find_outside(const event_step *step, const contact_terms *of, real pa
   return first;
 }
 
+/* Notes that the gaps of open contacts which were closed, or are 0 within rounding, are at a zero of their functions:
+ * negative ones, too, as the projection of others moves them, but not those that were negative `before` it. */
+static void note_opening(const event_step *step, const contact_terms *of, const real *before, const int *closed)
+{
+  for (int i = 0; i < TRANSITIONS; i++) {
+    const int k = TRANSITION[i][0], row = CONTACTS[k].normal;
+    const int e = EVENT_FIRST[FIRST_TRANSITION + i];
+    NAME(event_history) *const history = step->watch->history + e;
+    if (TRANSITION[i][1] != CONTACT_CLOSES || mode_of(step->watch->mode, k).closed ||
+        !(closed[k] || of->value[row] <= of->rounding[row]) || (of->absent[k] && of->value[row] < -of->rounding[row]) ||
+        !(closed[k] || before[row] >= -of->rounding[row] - history->slack))
+      continue;
+    if (closed[k] || !JUST_CHANGED(step->watch, e))
+      *history = (NAME(event_history)){.last = step->watch->time, .hits = 1};
+    history->slack = fmax(history->slack, fabs(of->value[row]) + of->rounding[row]);
+  }
+}
+
+#ifdef CONTACTS_IN_SPACE
+/* Slips of a body on several feet end together (Z. Farkas et al., Phys. Rev. Lett. 90, 248302, 2003): where one stops,
+ * so do slow ones that brake. The projection that removes its rate would turn them, with friction along them. */
+static int stop_together(const event_step *step, event_sample *at, contact_terms *of, contact_change *now)
+{
+  contact_mode mode[EVENT_CONTACTS];
+  real force[CONTACT_ROWS], second[CONTACT_ROWS];
+  int any = 0;
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    any |= CONTACTS[k].slips == 2 && now->stops[k] && now->rests[k];
+  if (any)
+    TRY(slips_at(step, at, of, mode, force, second, &any));
+  if (!any)
+    return OK;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const real *const d = mode[k].direction, *const w = second + CONTACTS[k].tangential;
+    now->rests[k] |= CONTACTS[k].slips == 2 && d[0] * w[0] + d[1] * w[1] < 0.0 && stops_at(step, of, k);
+  }
+  return settle(step, at, of, now);
+}
+#endif
+
+/* Closes contacts that touch within rounding and separate by no more than that: those of two feet alternate without end
+ * where each opens until slips stop, which begin with the impact of the other. With others they stop together. */
+static int rest_low(const event_step *step, event_sample *at, contact_terms *of, const real *force, const int *closed,
+    contact_change *now)
+{
+  int any = 0;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int row = CONTACTS[k].normal;
+    const int rests = is_met(of, now, closed, k) && fabs(of->value[row]) <= CONTACT_LOWEST * of->rounding[row] &&
+        of->rate[row] > CONTACT_ROUNDING * of->speed[row] && is_low(step, of, force, 0.0, k);
+    now->touches[k] |= rests;
+    any |= rests;
+  }
+  if (any)
+    TRY(settle(step, at, of, now));
+#ifdef CONTACTS_IN_SPACE
+  TRY(stop_together(step, at, of, now));
+#endif
+  return OK;
+}
+
+/* First contact whose friction acts along its slip in the present modes, -1: none; it would supply energy. */
+static int find_driven(const event_step *step, const contact_terms *of)
+{
+  contact_mode mode[EVENT_CONTACTS];
+  modes_at(of, step->watch->mode, mode);
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const real *const d = mode[k].direction, *const w = of->rate + CONTACTS[k].tangential;
+    real along = 0.0;
+    for (int i = 0; i < CONTACTS[k].slips && mode[k].closed && !mode[k].sticks && !mode[k].held; i++)
+      along += d[i] * w[i];
+    if (along < 0.0 && along < -CONTACT_ROUNDING * of->speed[CONTACTS[k].tangential])
+      return k;
+  }
+  return -1;
+}
+
+/* Removes residuals of slips that stop against the directions in which they begin, where they would stop again. */
+static int remove_residuals(const event_step *step, event_sample *at, contact_terms *of, const contact_change *now)
+{
+  int any = 0;
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    any |= now->rests[k] && CONTACTS[k].slips == 1 &&
+        step->watch->mode[CONTACTS[k].direction] * of->rate[CONTACTS[k].tangential] < 0.0;
+  return any ? settle(step, at, of, now) : OK;
+}
+
 /* Notes which contacts were closed, and by their modes and transitions which touch and rest, and whether a contact that
  * meets approaches, also one that just does not close yet. Fails where a coefficient is impossible. */
 static int begin_change(const event_step *step, const contact_terms *of, contact_change *now, int *closed,
@@ -55,7 +142,7 @@ static int begin_change(const event_step *step, const contact_terms *of, contact
       step->watch->fastest[k] = fmax(step->watch->fastest[k], of->speed[CONTACTS[k].tangential]);
     closed[k] = CONTACTS[k].normal >= 0 && mode.closed && !now->leaves[k];
     now->touches[k] |= closed[k];
-    now->rests[k] = mode.sticks || (now->stops[k] && stops_at(step, of, k));
+    now->rests[k] = mode.sticks || (mode.closed && mode.held) || (now->stops[k] && stops_at(step, of, k));
     now->rests[k] &= !now->begins[k];
     const int meets = is_met(of, now, closed, k), acts = meets || (mode.closed && !now->leaves[k]);
     const int reason = acts ? impossible_reason(of, k, 0, meets, &impossible) : 0;
@@ -74,23 +161,29 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
   contact_terms of;
   contact_mode present[EVENT_CONTACTS];
   const real none[CONTACT_ROWS] = {0.0};
-  real force[CONTACT_ROWS];
+  real force[CONTACT_ROWS], before[CONTACT_ROWS];
   int closed[EVENT_CONTACTS], outside[EVENT_CONTACTS], approach, first = 0;
   step->report->t = at->t;
   TRY(terms_at(step, at, &of));
+  memcpy(before, of.value, sizeof before);
   TRY(begin_change(step, &of, now, closed, &approach));
   forces_at(at->t, at->q, at->p, step->own, present, force, step->workspace);
   if (approach)
     TRY(collide(step, at, &of, closed, none, now));
+  else
+    TRY(rest_low(step, at, &of, force, closed, now));
   for (int pass = 0; first >= 0 && pass <= EVENT_CONTACTS; pass++) {
     const int status = choose_modes(step, &of, now, force);
     if (status != OK && step->watch->refusal == CONTACT_WITHOUT_MODE && pass < EVENT_CONTACTS &&
         jump(step, at, &of, now))
       continue;
     TRY(status);
+    TRY(remove_residuals(step, at, &of, now));
     TRY(satisfy_constraints(step, at->t, at->q, at->p, 1));
     TRY(terms_at(step, at, &of));
     first = find_outside(step, &of, CONTACT_ROUNDING, outside);
+    if (first < 0)
+      first = find_driven(step, &of);
   }
   if (first >= 0)
     first = find_outside(step, &of, CONTACT_OUTSIDE, outside);
@@ -98,6 +191,7 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
     return refuse(step, CONTACT_WITHOUT_MODE, -1, 0.0);
   else if (first >= 0)
     return refuse(step, CONTACT_LEAVES_CONE, first, 0.0);
+  note_opening(step, &of, before, closed);
   return OK;
 }
 
@@ -326,6 +420,14 @@ static int end_held_modes(const event_step *step, const event_sample *right)
   return OK;
 }
 
+/* Value below which a gap is negative by more than rounding. */
+static real least_gap(const event_step *step, const contact_terms *of, int transition)
+{
+  const int e = EVENT_FIRST[FIRST_TRANSITION + transition], row = CONTACTS[TRANSITION[transition][0]].normal;
+  return -CONTACT_MISSED * values_at(step, EVENT_DEGREE + 2)[e] - step->watch->history[e].slack -
+      (row < 0 ? 0.0 : CONTACT_ROUNDING * of->size[row]);
+}
+
 /* Fails if friction is impossible at a node of a part of a step after its start, before its first transition. */
 static int check_friction(const event_step *step)
 {
@@ -348,12 +450,28 @@ static int check_friction(const event_step *step)
   return OK;
 }
 
-/* Value below which a gap is negative by more than rounding. */
-static real least_gap(const event_step *step, const contact_terms *of, int transition)
+/* Ends modes at the start of a step whose forces or gaps are negative there within rounding, and more at its end: their
+ * functions have no zero. Of gaps in steps to whose end the present modes last. */
+static int end_modes_at_start(const event_step *step, const event_sample *right)
 {
-  const int e = EVENT_FIRST[FIRST_TRANSITION + transition], row = CONTACTS[TRANSITION[transition][0]].normal;
-  return -CONTACT_MISSED * values_at(step, EVENT_DEGREE + 2)[e] - step->watch->history[e].slack -
-      (row < 0 ? 0.0 : CONTACT_ROUNDING * of->size[row]);
+  contact_terms of;
+  const int lasts = isinf(step->horizon->fraction);
+  int outside[EVENT_CONTACTS], has_terms = 0;
+  TRY(check_friction(step));
+  for (int i = 0; i < TRANSITIONS; i++) {
+    const int e = EVENT_FIRST[FIRST_TRANSITION + i];
+    const real before = values_at(step, 0)[e], after = values_at(step, EVENT_DEGREE)[e];
+    if (!((is_of_forces(i) || (lasts && is_kept(i))) && before < 0.0 && after < before))
+      continue;
+    if (!has_terms) {
+      TRY(terms_at(step, right, &of));
+      find_outside(step, &of, CONTACT_OUTSIDE, outside);
+    }
+    has_terms = 1;
+    if (is_of_forces(i) ? outside[TRANSITION[i][0]] : after < least_gap(step, &of, i))
+      TRY(add_transition(step, i, CONTACT_START));
+  }
+  return end_held_modes(step, right);
 }
 
 /* Fails if a gap is negative at the end of a step without a transition, or forces are outside of their cone. */

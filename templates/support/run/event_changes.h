@@ -603,8 +603,7 @@ static int takes_again(const event_step *step, event_sample *left, int status, r
 static int settle_part(const event_step *step, long long first, const event_sample *right)
 {
 #ifdef EVENT_CONTACTS
-  TRY(check_friction(step));
-  TRY(end_held_modes(step, right));
+  TRY(end_modes_at_start(step, right));
 #endif
   (void)right;
   return settle_crossings(step, first);
