@@ -223,11 +223,12 @@ static int collide(const event_step *step, event_sample *at, contact_terms *of, 
  * the limits Lambda of h f for h -> 0, f the forces of a time step of J. J. Moreau's (CISM 302, 1988), with
  * r + h (b + W f) for the rates after it. They vanish where forces are bounded, else energy decreases: normal rates
  * with impulses are 0 and friction opposes the slip after it, so that
- * T+ - T- = Lambda r+ - Lambda W Lambda / 2 < 0. Returns whether there are any. */
+ * T+ - T- = Lambda r+ - Lambda W Lambda / 2 < 0. The step is so long that rates change by more than their rounding.
+ * Returns whether there are any. */
 static int jump(const event_step *step, event_sample *at, contact_terms *of, contact_change *now)
 {
   cone_problem in;
-  real rate[CONTACT_ROWS], speed = 0.0, approach = 0.0, largest = 0.0, size;
+  real rate[CONTACT_ROWS], speed = 0.0, approach = 0.0, rounding = 0.0, largest = 0.0, size;
   int closed[EVENT_CONTACTS], first = -1;
   const int none[EVENT_CONTACTS] = {0};
   memcpy(rate, of->rate, sizeof rate);
@@ -236,14 +237,16 @@ static int jump(const event_step *step, event_sample *at, contact_terms *of, con
     closed[k] = is_met(of, now, none, k) || (normal >= 0 && !is_open(of, now, k)); /* also one that separates */
     if (closed[k] && rate[normal] <= CONTACT_ROUNDING * of->speed[normal])
       rate[normal] = 0.0;
-    if (closed[k])
+    if (closed[k]) {
       approach = fmax(approach, -of->second[normal]);
+      rounding = fmax(rounding, CONTACT_ROUNDING * of->speed[normal]);
+    }
     if (closed[k] && slips > 0)
       speed = fmax(speed, length_of(of->rate + CONTACTS[k].tangential, slips));
   }
   if (!(speed > 0.0 && approach > 0.0))
     return 0;
-  pose_impulses(of, rate, CONTACT_AHEAD * speed / approach, &in);
+  pose_impulses(of, rate, fmax(CONTACT_AHEAD * speed, CONTACT_RESIDUALS * rounding) / approach, &in);
   for (int k = 0; k < EVENT_CONTACTS; k++)
     in.takes_part[k] = closed[k] || (CONTACTS[k].normal < 0 && !is_open(of, now, k));
   if (!solve_cone(&in) || !impulses_of(of, closed, NULL, of->rate, in.f) ||
