@@ -7,8 +7,9 @@ For the saved states x_k of a run and the steps phi of a finer method, which hav
 is the error of x_k, up to that of phi (E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I,
 II.4). As delta_{k+1} = x_{k+1} - phi(x_k - delta_k) it follows from any sequence of states: phi is one step where all
 states are saved, else a run at round-off from one state to the next, over events, so that no interval ends at one.
-Samples of the rounding errors of the states, u |x| with a random sign for each step of the run, are transported by the
-derivatives of its steps.
+Samples rho of rounding errors are transported by the derivatives of steps. Sums have low words, forces are those at
+rounded positions: rho' = D phi (rho + d) - d + r, d = .42 u |q| and r = u |x' - x| with random signs; in steps that
+constraints, events or Newton's method take, rho' = D phi rho + u |x|.
 """
 
 from __future__ import annotations

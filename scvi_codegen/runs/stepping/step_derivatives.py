@@ -407,7 +407,8 @@ class LinearisedMethod(StateFunctions):
             deviations: (2m, n) root mean squares of the vectors after each step, a view of rows of contiguous numbers.
             parameters: as of :meth:`_propagate`.
             left: relative change of vectors that the iterations of a step leave.
-            rounding: rounding errors relative to the states, which the vectors receive with random signs.
+            rounding: relative rounding errors of positions at which forces are evaluated and of increments, which the
+                vectors receive with random signs.
             seed: of the signs.
 
         Returns:
