@@ -125,8 +125,8 @@ static inline real estimate(const run_memory *run, const trial *now, real least)
   ((error) > error_at(shorter, (up) / 2) && (error) < error_at(shorter, (up) + (up) / 2 + 1))
 #define LEVELS_INSIDE 0 /* no predictor from a rejected step */
 
-/* Returns 1 if the rounding of positions by which rows of constraints and contacts are solved is an admitted part of
- * the displacement in a trial: shorter ones show nothing, since that rounding, divided by h, is a velocity. */
+/* Returns 1 if the rounding of positions, by which rows of constraints and contacts are solved, is small beside the
+ * displacement in a trial: shorter ones show nothing, since that rounding, divided by h, is a velocity. */
 static int resolves_motion(const trial *now)
 {
   real moved = 0, farthest = 0;
@@ -134,7 +134,7 @@ static int resolves_motion(const trial *now)
     moved = larger(moved, MATH(fabs)(now->dq[i]));
     farthest = larger(farthest, MATH(fabs)(now->step.q0[i]));
   }
-  return SITES == M || rounding_of_displacement(farthest) <= now->limits.most * moved;
+  return SITES == M || rounding_of_displacement(farthest) <= SPURIOUS * moved;
 }
 
 /* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
