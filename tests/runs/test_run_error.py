@@ -85,6 +85,30 @@ POWERS = {
 """Powers of the units of length and time that the parameters of ``random_system`` have, for masses of 1."""
 
 
+@pytest.mark.parametrize("method", ["svi:4", "svi:8"])
+def test_bounds_of_default_runs_contain_rounding(method):
+    """Random orbits in units that are powers of two: no bound is below the error, half of them within 40 times it."""
+    random, ratios = np.random.default_rng(4), []
+    for _ in range(12):
+        e, (length, time) = random.uniform(0.0, 0.9), 2.0 ** random.integers(-10, 10, 2)
+        run = kepler(method).integrate(**start_of(e, length, time), t_end=time * random.uniform(3.0, 60.0))
+        sizes = run.error.sizes / [[length], [length / time]]
+        true = np.abs(truth(run, np.arange(1, len(run)), length, time) / sizes.ravel()).max()
+        ratios.append(run.error.relative[-1] / true)
+    assert min(ratios) >= 1.0
+    assert np.median(ratios) < 40.0
+
+
+def test_errors_are_known_at_rest_and_unknown_without_states_between_events():
+    spring = sc.compile_stepper(lagrange("spring", "x", "x_dot**2/2 - 50*(x - 1000)**2"), "svi:6")
+    assert spring.integrate([1000.0], velocity=[0.0], t_end=20.0, h=0.5).error.relative[-1] < 1e-13
+    ball, floor = sc.compile_stepper(lagrange("ball", "y", "y_dot**2/2 - 9.81*y")), sc.impact("y", restitution=0.8)
+    start = {"q": [1.0], "velocity": [0.0], "t_end": math.sqrt(2.0 / 9.81), "events": [floor]}
+    unknown, known = ball.integrate(**start), ball.integrate(**start, max_step=0.1)
+    assert "max_step" in unknown.error.reason or np.isfinite(unknown.error.q[1:]).any()
+    assert known.error.relative[-1] < 1e-12
+
+
 @cache
 def random_system(method):
     """Return the stepper of a mass matrix, a magnetic field, a potential, damping and a force, all by parameters."""
